@@ -1,0 +1,55 @@
+# `make help` lists the targets. Every target makes the virtual environment it needs.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help demo paper test test-fast lint format bench clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.installed  ## align a set of sample models and show the result in demo/index.html
+	$(BIN)/cadalign demo --out demo
+
+paper: $(VENV)/.installed  ## make every table and figure of the AEPnP paper anew, in paper/ (QUICK=1: two minutes)
+	$(BIN)/python scripts/reproduce_paper.py --out paper$(if $(QUICK),-quick --quick) $(if $(CADALIGN_DATA),--root $(CADALIGN_DATA)/keypointnet)
+
+test: $(VENV)/.installed-dev  ## run the whole test suite
+	$(BIN)/python -m pytest
+
+test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones
+	$(BIN)/python -m pytest -m "not slow"
+
+bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers and renderers
+	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
+	$(BIN)/python -m pytest tests/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
+	$(BIN)/python scripts/benchmark_render.py
+ifneq ($(CADALIGN_DATA),)
+	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello
+endif
+
+lint: $(VENV)/.installed-dev  ## check style (ruff) and types (mypy)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev  ## format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove the virtual environment and everything built
+	rm -rf $(VENV) build *.egg-info demo bench .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "cadalign needs Python 3.11 or newer; name it with: make PYTHON=/path/to/python" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	@touch $@ $(VENV)/.installed

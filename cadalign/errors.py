@@ -1,0 +1,87 @@
+"""The errors of cadalign: one family, each saying what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class CadalignError(Exception):
+    """Base class of every error that cadalign raises on purpose.
+
+    Parameters
+    ----------
+    what : str
+        What is wrong, in words a user understands.
+    where : str, optional
+        The argument, file, model id or field that it is wrong in.
+    fix : str, optional
+        What to do about it.
+
+    Examples
+    --------
+    >>> print(CadalignError("4 points", where="points_3d", fix="give at least 6"))
+    points_3d: 4 points; give at least 6
+    """
+
+    def __init__(self, what: str, *, where: str | None = None, fix: str | None = None) -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.fix = fix
+
+    def __str__(self) -> str:
+        text = self.what if self.where is None else f"{self.where}: {self.what}"
+        return text if self.fix is None else f"{text}; {self.fix}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Worker processes pickle errors, and keyword-only arguments don't survive that by default.
+        return _rebuild, (type(self), self.what, self.where, self.fix)
+
+
+def _rebuild(
+    kind: type[CadalignError], what: str, where: str | None, fix: str | None
+) -> CadalignError:
+    return kind(what, where=where, fix=fix)
+
+
+class InputError(CadalignError, ValueError):
+    """An argument has the wrong shape, type or value."""
+
+
+class DegenerateError(CadalignError):
+    """The keypoints do not determine the alignment: too few, in one plane, all the same."""
+
+
+class NoConsensusError(CadalignError):
+    """No alignment has more keypoints to support it than chance gives.
+
+    Attributes
+    ----------
+    score : float
+        The best truncated score that was reached, sum of squared errors [px^2].
+    inliers : int
+        How many keypoints supported it.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        fix: str | None = None,
+        score: float = float("inf"),
+        inliers: int = 0,
+    ) -> None:
+        super().__init__(what, where=where, fix=fix)
+        self.score = score
+        self.inliers = inliers
+
+    def __reduce__(self) -> tuple[object, ...]:
+        rebuild, arguments = super().__reduce__()
+        return rebuild, arguments, {"score": self.score, "inliers": self.inliers}
+
+
+class DataError(CadalignError):
+    """A file is missing, malformed or contradicts itself."""
+
+
+class RenderError(CadalignError):
+    """Something cannot be drawn: an empty mesh, an image size out of bounds, no view found."""

@@ -1,0 +1,206 @@
+"""Observations: one image's keypoints with their model points, as a JSON file.
+
+The file holds one object::
+
+    {
+      "camera": {"model": "PINHOLE", "width": 640, "height": 480,
+                 "params": [935.0, 935.0, 320.0, 240.0]},
+      "keypoints": [
+        {"xyz": [0.11, 0.42, -0.08], "uv": [351.2, 204.9], "sigma": 1.0, "semantic_id": 3},
+        ...
+      ],
+      "image": "photo.png",
+      "model": "chair.obj"
+    }
+
+``camera`` is COLMAP's form, principal point in COLMAP's convention (the top-left corner of the
+image is (0, 0)), see `cadalign.Camera.from_dict`. ``xyz`` is in model units, ``uv`` in pixels with
+integers at pixel centres. ``sigma`` [px] and ``semantic_id`` are optional, given for all keypoints
+or for none. ``image`` and ``model`` are optional paths, relative to the file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.camera import Camera
+from cadalign.errors import CadalignError, DataError
+from cadalign.validation import FloatArray, IntArray, as_floats, as_points
+
+_FIELDS = {"camera", "keypoints", "image", "model"}
+_KEYPOINT_FIELDS = {"xyz", "uv", "sigma", "semantic_id"}
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Keypoints on a model and in one image.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Model points [model units].
+    points_2d : (n, 2) float
+        Image points [px].
+    camera : Camera
+    sigma : (n,) float, optional
+        Standard deviation of each image point [px].
+    semantic_ids : (n,) int, optional
+        What each keypoint means; the same number on all models of a category.
+    image, model : Path, optional
+        The photo and the CAD model.
+    """
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    camera: Camera
+    sigma: FloatArray | None = None
+    semantic_ids: IntArray | None = None
+    image: Path | None = None
+    model: Path | None = None
+
+    def __post_init__(self) -> None:
+        points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
+        points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
+        object.__setattr__(self, "points_3d", points_3d)
+        object.__setattr__(self, "points_2d", points_2d)
+        if self.sigma is not None:
+            sigma = as_floats(self.sigma, name="sigma", shape=(len(points_3d),))
+            object.__setattr__(self, "sigma", sigma)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Observation:
+        """Read an observation file.
+
+        Raises
+        ------
+        DataError
+            If the file is missing, is not JSON, or a field is missing, unknown or invalid; the
+            message names file and field.
+        """
+        path = Path(path)
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise DataError("no such file", where=str(path)) from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"cannot be read ({error})", where=str(path)) from None
+        except json.JSONDecodeError as error:
+            raise DataError(
+                f"not valid JSON: {error.msg}", where=f"{path}, line {error.lineno}"
+            ) from None
+        try:
+            return cls.from_dict(data, folder=path.parent)
+        except CadalignError as error:
+            where = f"{path}: {error.where}" if error.where else str(path)
+            raise DataError(error.what, where=where, fix=error.fix) from None
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
+        """Read the parsed form of an observation file; paths are relative to ``folder``."""
+        if not isinstance(data, Mapping):
+            raise DataError(f"expected an object, got {type(data).__name__}")
+        _refuse_unknown(data, _FIELDS, where="top level")
+        for name in ("camera", "keypoints"):
+            if name not in data:
+                raise DataError("missing", where=name)
+        keypoints = data["keypoints"]
+        if not isinstance(keypoints, list) or not keypoints:
+            raise DataError("expected a list of at least one keypoint", where="keypoints")
+        for i, keypoint in enumerate(keypoints):
+            _check_keypoint(keypoint, where=f"keypoints[{i}]")
+        return cls(
+            points_3d=np.array([keypoint["xyz"] for keypoint in keypoints], dtype=float),
+            points_2d=np.array([keypoint["uv"] for keypoint in keypoints], dtype=float),
+            camera=Camera.from_dict(data["camera"]),
+            sigma=_column(keypoints, "sigma", np.float64),
+            semantic_ids=_column(keypoints, "semantic_id", np.int64),
+            image=_path(data, "image", folder),
+            model=_path(data, "model", folder),
+        )
+
+    def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
+        """The parsed form of an observation file, its paths relative to ``folder``."""
+        keypoints: list[dict[str, Any]] = [
+            {"xyz": xyz, "uv": uv}
+            for xyz, uv in zip(self.points_3d.tolist(), self.points_2d.tolist(), strict=True)
+        ]
+        for name, values in (("sigma", self.sigma), ("semantic_id", self.semantic_ids)):
+            if values is not None:
+                for keypoint, value in zip(keypoints, values.tolist(), strict=True):
+                    keypoint[name] = value
+        data: dict[str, Any] = {"camera": self.camera.to_dict(), "keypoints": keypoints}
+        for name, path in (("image", self.image), ("model", self.model)):
+            if path is not None:
+                data[name] = _relative(path, folder)
+        return data
+
+    def save(self, path: str | Path) -> None:
+        """Write an observation file; paths are written relative to it."""
+        data = self.to_dict(folder=Path(path).parent)
+        Path(path).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def _refuse_unknown(data: Mapping[str, Any], known: set[str], *, where: str) -> None:
+    unknown = sorted(set(data) - known)
+    if unknown:
+        raise DataError(
+            f"unknown field {unknown[0]!r}",
+            where=where,
+            fix=f"known are {', '.join(sorted(known))}",
+        )
+
+
+def _check_keypoint(keypoint: Any, *, where: str) -> None:
+    """Refuse a keypoint that lacks a field or holds something else than finite numbers."""
+    if not isinstance(keypoint, Mapping):
+        raise DataError(f"expected an object, got {type(keypoint).__name__}", where=where)
+    _refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
+    for name, length in (("xyz", 3), ("uv", 2)):
+        if name not in keypoint:
+            raise DataError("missing", where=f"{where}.{name}")
+        as_floats(keypoint[name], name=f"{where}.{name}", shape=(length,))
+    if (
+        "sigma" in keypoint
+        and not as_floats(keypoint["sigma"], name=f"{where}.sigma", shape=()) > 0
+    ):
+        raise DataError("is not positive", where=f"{where}.sigma")
+    identity = keypoint.get("semantic_id", 0)
+    if not isinstance(identity, int) or isinstance(identity, bool):
+        raise DataError(f"{identity!r} is not a whole number", where=f"{where}.semantic_id")
+
+
+def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | None:
+    """One optional field of all keypoints."""
+    present = [name in keypoint for keypoint in keypoints]
+    if not any(present):
+        return None
+    if not all(present):
+        raise DataError(
+            "missing, though other keypoints have it",
+            where=f"keypoints[{present.index(False)}].{name}",
+            fix="give it for all keypoints or for none",
+        )
+    return np.array([keypoint[name] for keypoint in keypoints], dtype=kind)
+
+
+def _relative(path: Path, folder: Path | None) -> str:
+    """A path as it is written: without the folder that it is read relative to."""
+    if folder is None or not path.is_relative_to(folder):
+        return str(path)
+    return str(path.relative_to(folder))
+
+
+def _path(data: Mapping[str, Any], name: str, folder: Path | None) -> Path | None:
+    value = data.get(name)
+    if value is None:
+        return None
+    if not isinstance(value, str):
+        raise DataError(f"{value!r} is not a path", where=name)
+    return folder / value if folder is not None else Path(value)

@@ -1,0 +1,76 @@
+"""Checks of array arguments, shared by all public types and functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+    """Convert to a float array of the given shape and refuse NaN and infinity.
+
+    Parameters
+    ----------
+    value : array_like
+        What the caller passed.
+    name : str
+        The argument's name, for the message.
+    shape : tuple of int or None
+        The required shape; ``None`` stands for any length.
+
+    Returns
+    -------
+    (*shape) float
+        A C-contiguous array; the input itself where it already is one.
+
+    Raises
+    ------
+    InputError
+        If it is not numeric, has another shape, or holds NaN or infinite values.
+    """
+    try:
+        array = np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"not an array of numbers ({error})", where=name) from None
+    if np.ndim(value) == 0:
+        array = array.reshape(())
+    if array.ndim != len(shape) or any(
+        wanted is not None and wanted != actual
+        for wanted, actual in zip(shape, array.shape, strict=True)
+    ):
+        wanted_text = ", ".join("n" if length is None else str(length) for length in shape)
+        raise InputError(f"shape {array.shape}, expected ({wanted_text})", where=name)
+    if not np.isfinite(array).all():
+        raise InputError(describe_non_finite(array), where=name, fix="remove or repair these")
+    return array
+
+
+def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:
+    """Check an (n, dimension) array of points; see `as_floats`."""
+    return as_floats(value, name=name, shape=(None, dimension))
+
+
+def describe_non_finite(array: FloatArray) -> str:
+    """Say which rows of an array hold NaN or infinite values."""
+    bad = ~np.isfinite(array)
+    if array.ndim == 0:
+        return f"is {array}"
+    rows = np.flatnonzero(bad.reshape(len(array), -1).any(axis=1))
+    listed = ", ".join(str(row) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    return f"NaN or infinite values in row{'s' if len(rows) > 1 else ''} {listed}"
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return an array of the same values that cannot be written to, for frozen types."""
+    if array.flags.writeable:
+        array = array.copy()
+        array.flags.writeable = False
+    return array

@@ -1,0 +1,196 @@
+"""The alignment: its algebra, what it refuses, and its way through dictionaries."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cadalign import Alignment
+from cadalign.errors import InputError
+
+
+def rotation_matrix(vector: list[float]) -> np.ndarray:
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+# Turns of every size, those near none and near half a turn on purpose.
+ANGLES = st.sampled_from([0.0, 1e-12, 1e-7, 1e-3, np.pi - 1e-7, np.pi]) | st.floats(0.0, np.pi)
+AXES = st.sampled_from([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]) | st.integers(0, 2**32 - 1).map(
+    lambda seed: (v := np.random.default_rng(seed).standard_normal(3)) / np.linalg.norm(v)
+)
+ROTATIONS = st.builds(lambda axis, angle: rotation_matrix(np.multiply(axis, angle)), AXES, ANGLES)
+TRANSLATIONS = st.lists(st.floats(-10.0, 10.0), min_size=3, max_size=3)
+SCALES = st.lists(st.floats(0.1, 10.0), min_size=3, max_size=3)
+EQUAL_SCALES = st.floats(0.1, 10.0).map(lambda s: [s, s, s])
+ALIGNMENTS = st.builds(Alignment, ROTATIONS, TRANSLATIONS, SCALES)
+SIMILARITIES = st.builds(Alignment, ROTATIONS, TRANSLATIONS, EQUAL_SCALES)
+POINTS = np.random.default_rng(0).uniform(-2, 2, (20, 3))
+
+
+def assert_close(first: Alignment, second: Alignment) -> None:
+    np.testing.assert_allclose(first.rotation, second.rotation, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(first.translation, second.translation, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(first.scale, second.scale, rtol=1e-12)
+
+
+@given(alignment=ALIGNMENTS)
+def test_apply_is_rotation_times_stretch_plus_translation(alignment: Alignment) -> None:
+    expected = [
+        alignment.rotation @ np.diag(alignment.scale) @ x + alignment.translation for x in POINTS
+    ]
+    np.testing.assert_allclose(alignment.apply(POINTS), expected, rtol=0, atol=1e-11)
+
+
+@given(alignment=ALIGNMENTS)
+def test_matrix_does_what_apply_does(alignment: Alignment) -> None:
+    homogeneous = np.column_stack([POINTS, np.ones(len(POINTS))])
+    moved = homogeneous @ alignment.cam_from_model.T
+    np.testing.assert_allclose(moved[:, :3], alignment.apply(POINTS), rtol=0, atol=1e-11)
+    assert (moved[:, 3] == 1).all()
+    assert (alignment.linear == alignment.cam_from_model[:3, :3]).all()
+
+
+@given(alignment=ALIGNMENTS)
+def test_inverse_undoes_apply_on_either_side(alignment: Alignment) -> None:
+    np.testing.assert_allclose(alignment.inverse(alignment.apply(POINTS)), POINTS, atol=1e-11)
+    np.testing.assert_allclose(alignment.apply(alignment.inverse(POINTS)), POINTS, atol=1e-11)
+
+
+@given(similarity=SIMILARITIES, alignment=ALIGNMENTS)
+def test_identity_is_neutral_on_either_side(similarity: Alignment, alignment: Alignment) -> None:
+    assert_close(similarity @ Alignment.identity(), similarity)
+    assert_close(Alignment.identity() @ alignment, alignment)
+
+
+@given(outer=SIMILARITIES, inner=ALIGNMENTS)
+def test_composition_applies_the_inner_first(outer: Alignment, inner: Alignment) -> None:
+    np.testing.assert_allclose(
+        (outer @ inner).apply(POINTS), outer.apply(inner.apply(POINTS)), rtol=1e-11, atol=1e-9
+    )
+
+
+@given(first=SIMILARITIES, second=SIMILARITIES, third=ALIGNMENTS)
+def test_composition_is_associative(first: Alignment, second: Alignment, third: Alignment) -> None:
+    assert_close((first @ second) @ third, first @ (second @ third))
+
+
+@given(similarity=SIMILARITIES)
+def test_every_similarity_has_an_inverse_among_similarities(similarity: Alignment) -> None:
+    size = similarity.scale[0]
+    turned = similarity.rotation.T
+    inverse = Alignment(turned, -turned @ similarity.translation / size, np.full(3, 1 / size))
+    np.testing.assert_allclose((inverse @ similarity).cam_from_model, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose((similarity @ inverse).cam_from_model, np.eye(4), atol=1e-9)
+
+
+@given(outer=ALIGNMENTS.filter(lambda a: np.ptp(a.scale) > 1e-9), inner=ALIGNMENTS)
+def test_an_uneven_stretch_cannot_follow_another_alignment(
+    outer: Alignment, inner: Alignment
+) -> None:
+    with pytest.raises(InputError) as caught:
+        outer @ inner
+    assert str(caught.value) == (
+        f"second @ first: the outer alignment has the stretch {outer.scale.tolist()}; "
+        "only an alignment with equal scales can follow another one"
+    )
+
+
+def test_composition_with_something_else_is_a_type_error() -> None:
+    with pytest.raises(TypeError):
+        Alignment.identity() @ "alignment"
+
+
+@given(alignment=ALIGNMENTS)
+def test_from_dict_undoes_to_dict_exactly_even_through_json(alignment: Alignment) -> None:
+    again = Alignment.from_dict(json.loads(json.dumps(alignment.to_dict())))
+    assert again == alignment
+    assert hash(again) == hash(alignment)
+
+
+def test_equality_looks_at_every_part() -> None:
+    base = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
+    assert base == Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
+    assert base != Alignment(np.eye(3), [0, 0, 4], [1, 2, 3.1])
+    assert base != Alignment(np.eye(3), [0, 1, 4], [1, 2, 3])
+    assert base != Alignment(np.diag([1.0, -1, -1]), [0, 0, 4], [1, 2, 3])
+    assert base != "alignment"
+
+
+def test_arrays_cannot_be_written_and_are_not_the_callers() -> None:
+    translation = np.array([0.0, 0.0, 4.0])
+    alignment = Alignment(np.eye(3), translation, np.ones(3))
+    translation[2] = 5.0
+    assert alignment.translation[2] == 4.0
+    for array in (alignment.rotation, alignment.translation, alignment.scale):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 7.0
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda a: pickle.loads(pickle.dumps(a))])
+def test_copies_and_pickles_are_equal(duplicate: Any) -> None:
+    alignment = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
+    assert duplicate(alignment) == alignment
+
+
+NOT_A_ROTATION = "not a rotation matrix; its rows must be orthonormal and its determinant +1"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((np.eye(4), [0, 0, 0], [1, 1, 1]), "rotation: shape (4, 4), expected (3, 3)"),
+        ((np.eye(3), [0, 0], [1, 1, 1]), "translation: shape (2,), expected (3)"),
+        ((np.eye(3), [0, 0, 0], [[1, 1, 1]]), "scale: shape (1, 3), expected (3)"),
+        ((np.diag([1, 1, -1]), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
+        ((1.01 * np.eye(3), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
+        ((np.zeros((3, 3)), [0, 0, 0], [1, 1, 1]), f"rotation: {NOT_A_ROTATION}"),
+        (
+            (np.full((3, 3), np.nan), [0, 0, 0], [1, 1, 1]),
+            "rotation: NaN or infinite values in rows 0, 1, 2; remove or repair these",
+        ),
+        (
+            (np.eye(3), [0, np.nan, 0], [1, 1, 1]),
+            "translation: NaN or infinite values in row 1; remove or repair these",
+        ),
+        (
+            (np.eye(3), [0, 0, 0], [1, 1, np.inf]),
+            "scale: NaN or infinite values in row 2; remove or repair these",
+        ),
+        ((np.eye(3), [0, 0, 0], [1, 0, 1]), "scale: [1.0, 0.0, 1.0] is not positive"),
+        ((np.eye(3), [0, 0, 0], [1, -2, 1]), "scale: [1.0, -2.0, 1.0] is not positive"),
+    ],
+)
+def test_alignment_refuses_wrong_values(arguments: tuple[Any, ...], text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Alignment(*arguments)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        ({"rotation": np.eye(3).tolist()}, "alignment: missing translation, scale"),
+        ("text", "alignment: expected an object, got str"),
+        (None, "alignment: expected an object, got NoneType"),
+    ],
+)
+def test_from_dict_refuses_malformed_alignments(data: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Alignment.from_dict(data)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize("method", ["apply", "inverse"])
+def test_points_are_checked(method: str) -> None:
+    with pytest.raises(InputError, match=r"points.*: shape \(3,\), expected \(n, 3\)"):
+        getattr(Alignment.identity(), method)([1.0, 2.0, 3.0])
+    with pytest.raises(InputError, match="NaN or infinite values in row 0"):
+        getattr(Alignment.identity(), method)([[1.0, np.nan, 3.0]])

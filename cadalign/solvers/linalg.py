@@ -1,0 +1,176 @@
+"""Small dense linear algebra for the compiled kernels: fixed sizes, no allocation in loops."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.solvers.jit import kernel
+from cadalign.validation import FloatArray
+
+
+@kernel
+def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
+    """Replace the lower triangle of a symmetric matrix by its Cholesky factor.
+
+    Returns False where a pivot falls under ``floor`` times its diagonal entry: the matrix is then
+    not positive definite to that accuracy.
+    """
+    for i in range(size):
+        diagonal = matrix[i, i]
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if not total > floor * diagonal:
+                    return False
+                matrix[i, i] = np.sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+    return True
+
+
+@kernel
+def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
+    """Solve in place, with the factor that `cholesky` left."""
+    for i in range(size):
+        total = right[i]
+        for k in range(i):
+            total -= factor[i, k] * right[k]
+        right[i] = total / factor[i, i]
+    for i in range(size - 1, -1, -1):
+        total = right[i]
+        for k in range(i + 1, size):
+            total -= factor[k, i] * right[k]
+        right[i] = total / factor[i, i]
+
+
+@kernel
+def multiply_3(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The product of two 3 x 3 matrices."""
+    product = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            product[i, j] = (
+                first[i, 0] * second[0, j] + first[i, 1] * second[1, j] + first[i, 2] * second[2, j]
+            )
+    return product
+
+
+@kernel
+def eigenvectors_4(matrix: FloatArray, vectors: FloatArray) -> None:
+    """Diagonalise a symmetric 4 x 4 matrix in place by Jacobi's method.
+
+    On return the diagonal of ``matrix`` holds the eigenvalues, in no order, and the columns of
+    ``vectors`` the eigenvectors.
+    """
+    for i in range(4):
+        for j in range(4):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(12):
+        off = 0.0
+        for p in range(3):
+            for q in range(p + 1, 4):
+                off += matrix[p, q] * matrix[p, q]
+        trace = 0.0
+        for p in range(4):
+            trace += matrix[p, p] * matrix[p, p]
+        if off <= 1e-36 * trace:
+            return
+        for p in range(3):
+            for q in range(p + 1, 4):
+                apq = matrix[p, q]
+                if apq == 0.0:
+                    continue
+                theta = (matrix[q, q] - matrix[p, p]) / (2.0 * apq)
+                if theta >= 0:
+                    t = 1.0 / (theta + np.sqrt(1.0 + theta * theta))
+                else:
+                    t = -1.0 / (-theta + np.sqrt(1.0 + theta * theta))
+                c = 1.0 / np.sqrt(1.0 + t * t)
+                s = t * c
+                matrix[p, p] -= t * apq
+                matrix[q, q] += t * apq
+                matrix[p, q] = 0.0
+                matrix[q, p] = 0.0
+                for k in range(4):
+                    if k not in (p, q):
+                        akp = matrix[k, p]
+                        akq = matrix[k, q]
+                        matrix[k, p] = c * akp - s * akq
+                        matrix[p, k] = matrix[k, p]
+                        matrix[k, q] = s * akp + c * akq
+                        matrix[q, k] = matrix[k, q]
+                    vkp = vectors[k, p]
+                    vkq = vectors[k, q]
+                    vectors[k, p] = c * vkp - s * vkq
+                    vectors[k, q] = s * vkp + c * vkq
+
+
+@kernel
+def rotation_from_quaternion(w: float, x: float, y: float, z: float, rotation: FloatArray) -> None:
+    """Write the rotation matrix of a quaternion of any length into ``rotation`` (3, 3)."""
+    norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * norm, x * norm, y * norm, z * norm
+    rotation[0, 0] = 1 - 2 * (y * y + z * z)
+    rotation[0, 1] = 2 * (x * y - w * z)
+    rotation[0, 2] = 2 * (x * z + w * y)
+    rotation[1, 0] = 2 * (x * y + w * z)
+    rotation[1, 1] = 1 - 2 * (x * x + z * z)
+    rotation[1, 2] = 2 * (y * z - w * x)
+    rotation[2, 0] = 2 * (x * z - w * y)
+    rotation[2, 1] = 2 * (y * z + w * x)
+    rotation[2, 2] = 1 - 2 * (x * x + y * y)
+
+
+@kernel
+def nearest_rotation(
+    matrix: FloatArray, rotation: FloatArray, work: FloatArray, vectors: FloatArray
+) -> None:
+    """Write the rotation R that maximises trace(R' matrix) into ``rotation``.
+
+    Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987: the
+    quaternion is the dominant eigenvector of a symmetric 4 x 4 matrix. The determinant is always
+    +1. ``work`` and ``vectors`` are (4, 4) scratch space.
+    """
+    m = matrix
+    work[0, 0] = m[0, 0] + m[1, 1] + m[2, 2]
+    work[1, 1] = m[0, 0] - m[1, 1] - m[2, 2]
+    work[2, 2] = m[1, 1] - m[0, 0] - m[2, 2]
+    work[3, 3] = m[2, 2] - m[0, 0] - m[1, 1]
+    work[0, 1] = work[1, 0] = m[2, 1] - m[1, 2]
+    work[0, 2] = work[2, 0] = m[0, 2] - m[2, 0]
+    work[0, 3] = work[3, 0] = m[1, 0] - m[0, 1]
+    work[1, 2] = work[2, 1] = m[0, 1] + m[1, 0]
+    work[1, 3] = work[3, 1] = m[0, 2] + m[2, 0]
+    work[2, 3] = work[3, 2] = m[1, 2] + m[2, 1]
+    eigenvectors_4(work, vectors)
+    best = 0
+    for k in range(1, 4):
+        if work[k, k] > work[best, best]:
+            best = k
+    rotation_from_quaternion(
+        vectors[0, best], vectors[1, best], vectors[2, best], vectors[3, best], rotation
+    )
+
+
+@kernel
+def polish_rotation(matrix: FloatArray, rotation: FloatArray) -> None:
+    """Write the rotation nearest to a matrix that is one but for small errors.
+
+    Newton-Schulz: R (3 I - R' R) / 2 squares the error; two steps take 1e-4 to rounding.
+    """
+    gram = np.empty((3, 3))
+    rotation[:] = matrix
+    for _ in range(2):
+        for i in range(3):
+            for j in range(3):
+                gram[i, j] = (1.5 if i == j else 0.0) - 0.5 * (
+                    rotation[0, i] * rotation[0, j]
+                    + rotation[1, i] * rotation[1, j]
+                    + rotation[2, i] * rotation[2, j]
+                )
+        for i in range(3):
+            a, b, c = rotation[i, 0], rotation[i, 1], rotation[i, 2]
+            for j in range(3):
+                rotation[i, j] = a * gram[0, j] + b * gram[1, j] + c * gram[2, j]

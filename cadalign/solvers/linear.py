@@ -1,0 +1,320 @@
+"""The linear solver: anisotropic PnP as one 4 x 4 eigenproblem, one pass over the points."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import DegenerateError
+from cadalign.solvers.jit import fast_sums, kernel
+from cadalign.solvers.linalg import (
+    cholesky,
+    eigenvectors_4,
+    multiply_3,
+    nearest_rotation,
+    rotation_from_quaternion,
+    solve_cholesky,
+)
+from cadalign.solvers.status import DEGENERATE, OK
+from cadalign.validation import FloatArray
+
+MIN_POINTS = 6
+_CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error
+_FLATNESS = 1e-7  # smallest over largest spread of points that still span a volume
+_NEWTON_STEPS = 10
+_BLOCK = 64
+_LEAST_COSINE = 0.05  # between a column of the linear block and the axis it is split into
+
+
+def aepnp(
+    points_3d: npt.ArrayLike, rays: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Solve anisotropic PnP linearly, without checking the input's values.
+
+    Let ``a = (1, x)`` for a point x, and let its camera-frame coordinates be linear in a:
+    ``(c_x . a, c_y . a, c_z . a)``. Minimising the sum of
+    ``(c_x . a - u c_z . a)^2 + (c_y . a - v c_z . a)^2`` over c_x and c_y in closed form leaves a
+    generalised symmetric 4 x 4 eigenproblem in c_z. Its metric, the points' own second moments,
+    removes the leading bias of noise in (u, v), so the estimate is consistent. Rotation and
+    stretch follow from the 3 x 3 block by alternating nearest rotations and column scales.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Model points, at least 6 and not in one plane.
+    rays : (n, 2) or (n, 3) float
+        Normalised image coordinates (u, v), or directions (x, y, z) with z > 0.
+
+    Returns
+    -------
+    rotation : (3, 3) float
+    translation : (3,) float
+    scale : (3,) float
+        (1, s_y, s_z)
+
+    Raises
+    ------
+    DegenerateError
+        If there are fewer than 6 points, or they lie in one plane.
+    """
+    points = np.ascontiguousarray(points_3d, dtype=np.float64)
+    directions = np.ascontiguousarray(rays, dtype=np.float64)
+    rotation, translation, scale, status = aepnp_kernel(points, directions)
+    if status != OK:
+        raise aepnp_error(points)
+    return rotation, translation, scale
+
+
+def aepnp_error(points_3d: FloatArray) -> DegenerateError:
+    """The error for points that `aepnp_kernel` calls degenerate."""
+    if len(points_3d) < MIN_POINTS:
+        return DegenerateError(
+            f"{len(points_3d)} points are too few for a linear solver",
+            where="points_3d",
+            fix=f"give at least {MIN_POINTS}",
+        )
+    return DegenerateError(
+        describe_plane(points_3d) or "the points lie nearly in one plane",
+        where="points_3d",
+        fix="a linear solver needs keypoints that span a volume",
+    )
+
+
+def describe_plane(points_3d: FloatArray) -> str | None:
+    """Say in words how the points fail to span a volume; None where they span one."""
+    mean = points_3d.mean(axis=0)
+    rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
+    _, spread, axes = np.linalg.svd(rows, full_matrices=False)
+    if spread[0] <= 1e-14 * np.abs(points_3d).max(initial=0.0):
+        return "all points are the same"
+    if spread[1] < 1e-6 * spread[0]:
+        return "the points lie on one line"
+    if spread[2] > 1e-6 * spread[0]:
+        return None
+    normal = axes[2] * np.sign(axes[2][np.argmax(np.abs(axes[2]))])
+    axis = int(np.argmax(np.abs(normal)))
+    if normal[axis] > 1 - 1e-6:
+        return f"the points lie in the plane {'xyz'[axis]} = {mean[axis]:.4g}"
+    words = ", ".join(f"{value:.3g}" for value in normal)
+    return f"the points lie in one plane, with the normal ({words})"
+
+
+@fast_sums
+def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
+    """Add up the 40 sums into which all data enter.
+
+    Row k of ``products`` (10, 4) is the k-th of the products 11, 1x, 1y, 1z, xx, xy, xz, yy, yz,
+    zz of a = (1, x - mean), summed with the weights 1, u, v, u^2 + v^2. ``mean`` (5,) receives the
+    means of the points and of u, v, which keep the sums well-conditioned.
+    """
+    n = points.shape[0]
+    homogeneous = rays.shape[1] == 3
+    sx = sy = sz = su = sv = 0.0
+    for i in range(n):
+        inverse = 1.0 / rays[i, 2] if homogeneous else 1.0
+        sx += points[i, 0]
+        sy += points[i, 1]
+        sz += points[i, 2]
+        su += rays[i, 0] * inverse
+        sv += rays[i, 1] * inverse
+    mx, my, mz, mu, mv = sx / n, sy / n, sz / n, su / n, sv / n
+    mean[0], mean[1], mean[2], mean[3], mean[4] = mx, my, mz, mu, mv
+    monomials = np.empty((10, _BLOCK))
+    weights = np.empty((4, _BLOCK))
+    monomials[0] = 1.0
+    weights[0] = 1.0
+    products[:] = 0.0
+    for start in range(0, n, _BLOCK):
+        size = min(_BLOCK, n - start)
+        for b in range(size):
+            i = start + b
+            inverse = 1.0 / rays[i, 2] if homogeneous else 1.0
+            x = points[i, 0] - mx
+            y = points[i, 1] - my
+            z = points[i, 2] - mz
+            u = rays[i, 0] * inverse - mu
+            v = rays[i, 1] * inverse - mv
+            monomials[1, b], monomials[2, b], monomials[3, b] = x, y, z
+            monomials[4, b], monomials[5, b], monomials[6, b] = x * x, x * y, x * z
+            monomials[7, b], monomials[8, b], monomials[9, b] = y * y, y * z, z * z
+            weights[1, b], weights[2, b], weights[3, b] = u, v, u * u + v * v
+        for k in range(10):
+            for j in range(4):
+                total = 0.0
+                for b in range(size):
+                    total += monomials[k, b] * weights[j, b]
+                products[k, j] += total
+
+
+@kernel
+def _unpack(products: FloatArray, column: int, matrix: FloatArray) -> None:
+    """Write one column of the sums as a symmetric 4 x 4 matrix."""
+    k = 0
+    for i in range(4):
+        for j in range(i, 4):
+            matrix[i, j] = matrix[j, i] = products[k, column]
+            k += 1
+
+
+@kernel
+def _whiten(factor: FloatArray, matrix: FloatArray) -> None:
+    """Replace a symmetric matrix A by L^-1 A L^-T in place, for the Cholesky factor L."""
+    for _ in range(2):  # L^-1 A, transposed, and the same once more
+        for column in range(4):
+            for i in range(4):
+                total = matrix[i, column]
+                for k in range(i):
+                    total -= factor[i, k] * matrix[k, column]
+                matrix[i, column] = total / factor[i, i]
+        for i in range(4):
+            for j in range(i):
+                matrix[i, j], matrix[j, i] = matrix[j, i], matrix[i, j]
+
+
+@kernel
+def _to_points_basis(factor: FloatArray, vector: FloatArray) -> None:
+    """Replace a vector c by L^-T c in place."""
+    for i in range(3, -1, -1):
+        total = vector[i]
+        for k in range(i + 1, 4):
+            total -= factor[k, i] * vector[k]
+        vector[i] = total / factor[i, i]
+
+
+@kernel
+def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Find rotation and column scales d so that ``rotation @ diag(d)`` is close to ``linear``.
+
+    With n_j the columns of ``linear``, weighted by the points' spread along their axis, the best
+    scale for a given rotation is r_j . n_j, so what is left is to maximise the sum of
+    (r_j . n_j)^2 over rotations: Newton's method from the rotation nearest to the directions n_j.
+    Returns d (3,), always positive: a mirrored ``linear``, which noise on few points can give,
+    gets the least wrong rotation.
+    """
+    columns = np.empty((3, 3))
+    for j in range(3):
+        for i in range(3):
+            columns[i, j] = linear[i, j] * spread[j]
+    nearest_rotation(columns, rotation, np.empty((4, 4)), np.empty((4, 4)))
+    curvature = np.empty((3, 3))
+    slope = np.empty(3)
+    torque = np.empty(3)
+    turned = np.empty((3, 3))
+    for _ in range(_NEWTON_STEPS):
+        curvature[:] = 0.0
+        slope[:] = 0.0
+        for j in range(3):
+            cosine = 0.0
+            for i in range(3):
+                a, b = (i + 1) % 3, (i + 2) % 3
+                torque[i] = rotation[a, j] * columns[b, j] - rotation[b, j] * columns[a, j]
+                cosine += rotation[i, j] * columns[i, j]
+            for a in range(3):
+                slope[a] += cosine * torque[a]
+                curvature[a, a] += cosine * cosine
+                for b in range(3):
+                    mixed = columns[a, j] * rotation[b, j] + columns[b, j] * rotation[a, j]
+                    curvature[a, b] -= torque[a] * torque[b] + 0.5 * cosine * mixed
+        if not cholesky(curvature, 3, 1e-12):
+            break
+        solve_cholesky(curvature, 3, slope)
+        rotation_from_quaternion(1.0, slope[0] / 2, slope[1] / 2, slope[2] / 2, turned)
+        rotation[:] = multiply_3(turned, rotation)
+        if slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2 < 1e-18:
+            break
+    scale = np.empty(3)
+    for j in range(3):
+        length = cosine = 0.0
+        for i in range(3):
+            length += linear[i, j] ** 2
+            cosine += rotation[i, j] * linear[i, j]
+        scale[j] = max(cosine, _LEAST_COSINE * np.sqrt(length))
+    return scale
+
+
+@kernel
+def aepnp_kernel(
+    points: FloatArray, rays: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """Compiled `aepnp`: rotation, translation, scale and a status."""
+    rotation = np.empty((3, 3))
+    translation = np.empty(3)
+    scale = np.empty(3)
+    if points.shape[0] < MIN_POINTS:
+        return rotation, translation, scale, DEGENERATE
+    mean = np.empty(5)
+    products = np.empty((10, 4))
+    _moments(points, rays, mean, products)
+    status = aepnp_from_moments(mean, products, rotation, translation, scale)
+    return rotation, translation, scale, status
+
+
+@kernel
+def aepnp_from_moments(
+    mean: FloatArray,
+    products: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    scale: FloatArray,
+) -> int:
+    """Solve from the sums alone; fills the last three arguments and returns a status."""
+    factor = np.empty((4, 4))
+    _unpack(products, 0, factor)
+    spread = np.empty(3)
+    largest = 0.0
+    for k in range(3):
+        spread[k] = np.sqrt(factor[k + 1, k + 1])
+        largest = max(largest, spread[k])
+    if not cholesky(factor, 4, _CANCELLATION):
+        return DEGENERATE
+    for k in range(1, 4):
+        if not factor[k, k] > _FLATNESS * largest:
+            return DEGENERATE
+
+    # In the basis that whitens a, P is the identity and S = Q - U U - V V.
+    u_matrix = np.empty((4, 4))
+    v_matrix = np.empty((4, 4))
+    system = np.empty((4, 4))
+    _unpack(products, 1, u_matrix)
+    _unpack(products, 2, v_matrix)
+    _unpack(products, 3, system)
+    _whiten(factor, u_matrix)
+    _whiten(factor, v_matrix)
+    _whiten(factor, system)
+    for i in range(4):
+        for j in range(i, 4):
+            total = system[i, j]
+            for k in range(4):
+                total -= u_matrix[i, k] * u_matrix[k, j] + v_matrix[i, k] * v_matrix[k, j]
+            system[i, j] = system[j, i] = total
+    vectors = np.empty((4, 4))
+    eigenvectors_4(system, vectors)
+    best = 0
+    for k in range(1, 4):
+        if system[k, k] < system[best, best]:
+            best = k
+
+    rows = np.empty((3, 4))
+    for i in range(4):
+        rows[2, i] = vectors[i, best]
+        rows[0, i] = 0.0
+        rows[1, i] = 0.0
+        for k in range(4):
+            rows[0, i] += u_matrix[i, k] * vectors[k, best]
+            rows[1, i] += v_matrix[i, k] * vectors[k, best]
+    for i in range(3):
+        _to_points_basis(factor, rows[i])
+    if rows[2, 0] < 0:  # the depth of the points' mean
+        rows *= -1.0
+    for i in range(4):
+        rows[0, i] += mean[3] * rows[2, i]
+        rows[1, i] += mean[4] * rows[2, i]
+
+    lengths = _split_scale(rows[:, 1:], spread, rotation)
+    for j in range(3):
+        scale[j] = lengths[j] / lengths[0]
+    for i in range(3):
+        translation[i] = rows[i, 0] / lengths[0]
+        for j in range(3):
+            translation[i] -= rotation[i, j] * scale[j] * mean[j]
+    return OK

@@ -1,0 +1,73 @@
+"""The solver of the AEPnP paper, as published: the yardstick for the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import DegenerateError
+from cadalign.solvers.linear import MIN_POINTS, aepnp_error, describe_plane
+from cadalign.validation import FloatArray
+
+_FIX = "a linear solver needs keypoints that span a volume"
+
+
+def aepnp_paper(
+    points_3d: npt.ArrayLike, rays: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Solve anisotropic PnP with the linear null-space solver of the AEPnP paper.
+
+    Wei, Leutenegger, Kneip, "AEPnP: A Less-constrained EPnP Solver for Pose Estimation with
+    Anisotropic Scaling": four control points at the unit axes' ends and the origin; a point's
+    weights on them are (x, y, z, 1 - x - y - z), which the stretch leaves valid. Every point gives
+    two equations that are linear in the 12 camera-frame coordinates of the control points; their
+    null vector, up to its scale, holds the stretched axes. Axes are normalised one by one, so
+    noise leaves them not quite orthogonal: the returned rotation is the nearest one.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Model points, at least 6 and not in one plane.
+    rays : (n, 2) float
+        Normalised image coordinates.
+
+    Returns
+    -------
+    rotation : (3, 3) float
+    translation : (3,) float
+    scale : (3,) float
+        (1, s_y, s_z)
+
+    Raises
+    ------
+    DegenerateError
+        If there are fewer than 6 points, or an axis comes out with no length.
+    """
+    points = np.asarray(points_3d, dtype=float)
+    count = len(points)
+    if count < MIN_POINTS or describe_plane(points) is not None:
+        raise aepnp_error(points)
+    u, v = np.asarray(rays, dtype=float).T
+    weights = np.column_stack([points, 1 - points.sum(axis=1)])
+    system = np.zeros((2 * count, 4, 3))
+    system[0::2, :, 0] = weights
+    system[0::2, :, 2] = -u[:, None] * weights
+    system[1::2, :, 1] = weights
+    system[1::2, :, 2] = -v[:, None] * weights
+    matrix = system.reshape(2 * count, 12)
+    _, vectors = np.linalg.eigh(matrix.T @ matrix)
+    control_points = vectors[:, 0].reshape(4, 3)
+    if (weights @ control_points[:, 2]).sum() < 0:
+        control_points = -control_points
+    origin = control_points[3]
+    axes = (control_points[:3] - origin).T
+    lengths = np.linalg.norm(axes, axis=0)
+    if not (lengths > 1e-12 * np.abs(control_points).max()).all():
+        raise DegenerateError(
+            "an axis of the model came out with no length",
+            where="points_3d",
+            fix=_FIX,
+        )
+    left, _, right = np.linalg.svd(axes / lengths)
+    rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation, origin / lengths[0], lengths / lengths[0]

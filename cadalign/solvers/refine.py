@@ -1,0 +1,111 @@
+"""Non-linear refinement by Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.solvers.jit import kernel
+from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate
+from cadalign.validation import FloatArray
+
+_RELATIVE_DECREASE = 1e-12
+_ABSOLUTE_DECREASE = 1e-16
+_FIRST_DAMPING = 1e-4
+_LARGEST_DAMPING = 1e12
+_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
+
+
+@kernel
+def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
+    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
+    angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
+    angle = np.sqrt(angle2)
+    if angle > 1e-4:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle2
+    else:
+        a = 1.0 - angle2 / 6.0
+        b = 0.5 - angle2 / 24.0
+    x, y, z = step[0], step[1], step[2]
+    for c in range(3):
+        p, q, r = pose[c], pose[3 + c], pose[6 + c]
+        # Rodrigues: v + a (w x v) + b (w x (w x v))
+        dot = x * p + y * q + z * r
+        moved[c] = p + a * (y * r - z * q) + b * (x * dot - p * angle2)
+        moved[3 + c] = q + a * (z * p - x * r) + b * (y * dot - q * angle2)
+        moved[6 + c] = r + a * (x * q - y * p) + b * (z * dot - r * angle2)
+    for c in range(3):
+        moved[9 + c] = pose[9 + c] + step[3 + c]
+    moved[12] = pose[12]
+    moved[13] = pose[13] * np.exp(min(max(step[6], -2.0), 2.0))
+    moved[14] = pose[14] * np.exp(min(max(step[7], -2.0), 2.0))
+
+
+@kernel
+def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple[float, int, bool]:
+    """Improve ``pose`` (15,) in place.
+
+    Returns
+    -------
+    cost : float
+        At the final pose; infinite if a point lies behind the camera at the start.
+    iterations : int
+    converged : bool
+    """
+    hessian = np.empty((UNKNOWNS, UNKNOWNS))
+    gradient = np.empty(UNKNOWNS)
+    next_hessian = np.empty((UNKNOWNS, UNKNOWNS))
+    next_gradient = np.empty(UNKNOWNS)
+    factor = np.empty((UNKNOWNS, UNKNOWNS))
+    step = np.zeros(UNKNOWNS)
+    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
+    trial = pose.copy()
+    cost = np.inf
+    damping = _FIRST_DAMPING
+    growth = 4.0
+    expected = 0.0  # decrease of the cost by the step, on the quadratic model
+    done = False
+    iterations = 0
+    while True:
+        trial_cost = evaluate(objective, trial, rows, next_hessian, next_gradient)
+        accepted = trial_cost <= cost or (done and trial_cost <= cost * (1 + 1e-9))
+        if accepted and trial_cost < np.inf:
+            pose[:] = trial
+            hessian, next_hessian = next_hessian, hessian
+            gradient, next_gradient = next_gradient, gradient
+            if cost < np.inf:
+                iterations += 1
+                gain = (cost - trial_cost) / expected if expected > 0 else 1.0
+                damping = max(damping * (0.1 if gain > 0.5 else 0.5 if gain > 0.1 else 2.0), 1e-12)
+            growth = 4.0
+            cost = trial_cost
+        else:
+            damping *= growth
+            growth *= 2.0
+        if not cost < np.inf or done or iterations >= max_iterations:
+            return cost, iterations, done
+        # Holds unknowns that the points tell nothing about where they are.
+        floor = 1e-300
+        for k in range(UNKNOWNS):
+            floor = max(floor, _LEAST_INFORMATION * hessian[k, k])
+        solved = False
+        while not solved:
+            if damping > _LARGEST_DAMPING:
+                return cost, iterations, False
+            for k in range(UNKNOWNS):
+                step[k] = -gradient[k]
+                for m in range(k + 1):
+                    factor[k, m] = hessian[k, m]
+                factor[k, k] += damping * hessian[k, k] + floor
+            solved = cholesky(factor, UNKNOWNS, 0.0)
+            if not solved:
+                damping *= growth
+                growth *= 2.0
+        solve_cholesky(factor, UNKNOWNS, step)
+        expected = 0.0
+        for k in range(UNKNOWNS):
+            expected -= gradient[k] * step[k]
+        # A small step counts as the end only where it is not the damping that made it small.
+        done = damping < 1e-2 and expected <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost
+        move_pose(pose, step, trial)

@@ -1,0 +1,178 @@
+"""Where refinement starts: every alignment that some of the keypoints suggest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.solvers.jit import kernel
+from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
+from cadalign.solvers.linear import aepnp_kernel
+from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
+from cadalign.solvers.status import OK
+from cadalign.validation import FloatArray, IntArray
+
+_DRAWS_PER_SUBSET = 4
+
+
+@kernel
+def linear_start(points: FloatArray, rays: FloatArray, pose: FloatArray) -> bool:
+    """Write the linear solver's pose; False where it has none."""
+    rotation, translation, scale, status = aepnp_kernel(points, rays)
+    if status != OK:
+        return False
+    for c in range(3):
+        pose[9 + c] = translation[c]
+        pose[12 + c] = scale[c]
+        for j in range(3):
+            pose[3 * c + j] = rotation[c, j]
+    return True
+
+
+@kernel
+def minimal_starts(
+    points: FloatArray, rays: FloatArray, subsets: IntArray, count: int, poses: FloatArray
+) -> int:
+    """Write every solution of the minimal solver on the given subsets; returns their number.
+
+    ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
+    """
+    chosen = np.empty((4, 3))
+    directions = np.ones((4, 3))
+    found = 0
+    for s in range(count):
+        for i in range(4):
+            k = subsets[s, i]
+            for c in range(3):
+                chosen[i, c] = points[k, c]
+            directions[i, 0] = rays[k, 0]
+            directions[i, 1] = rays[k, 1]
+        found += ap4p_kernel(chosen, directions, poses[found : found + MAX_SOLUTIONS])
+    return found
+
+
+@kernel
+def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
+    """Fill ``subsets`` (k, 4) with 4-subsets of the points that span large volumes.
+
+    All of them where there are no more than k, otherwise the best of a fixed sequence of draws.
+    Returns how many rows were filled.
+    """
+    n = points.shape[0]
+    wanted = subsets.shape[0]
+    total = n * (n - 1) * (n - 2) * (n - 3) // 24
+    if total <= wanted:
+        row = 0
+        for a in range(n - 3):
+            for b in range(a + 1, n - 2):
+                for c in range(b + 1, n - 1):
+                    for d in range(c + 1, n):
+                        subsets[row, 0], subsets[row, 1] = a, b
+                        subsets[row, 2], subsets[row, 3] = c, d
+                        row += 1
+        return int(total)
+    volumes = np.full(wanted, -1.0)
+    draw = np.empty(4, dtype=np.int64)
+    state = np.uint64(88172645463325252)
+    for _ in range(_DRAWS_PER_SUBSET * wanted):
+        k = 0
+        while k < 4:  # xorshift: a fixed sequence, the same for every problem
+            state ^= state << np.uint64(13)
+            state ^= state >> np.uint64(7)
+            state ^= state << np.uint64(17)
+            index = np.int64((state >> np.uint64(11)) % np.uint64(n))
+            fresh = True
+            for m in range(k):
+                fresh = fresh and draw[m] != index
+            if fresh:
+                draw[k] = index
+                k += 1
+        volume = _volume(points, draw)
+        worst = 0
+        for m in range(1, wanted):
+            if volumes[m] < volumes[worst]:
+                worst = m
+        if volume > volumes[worst]:
+            volumes[worst] = volume
+            for m in range(4):
+                subsets[worst, m] = draw[m]
+    return int(wanted)
+
+
+@kernel
+def _volume(points: FloatArray, chosen: IntArray) -> float:
+    """Six times the volume of a tetrahedron."""
+    a, b, c, d = chosen[0], chosen[1], chosen[2], chosen[3]
+    ux, uy, uz = (
+        points[b, 0] - points[a, 0],
+        points[b, 1] - points[a, 1],
+        points[b, 2] - points[a, 2],
+    )
+    vx, vy, vz = (
+        points[c, 0] - points[a, 0],
+        points[c, 1] - points[a, 1],
+        points[c, 2] - points[a, 2],
+    )
+    wx, wy, wz = (
+        points[d, 0] - points[a, 0],
+        points[d, 1] - points[a, 1],
+        points[d, 2] - points[a, 2],
+    )
+    return float(
+        abs(ux * (vy * wz - vz * wy) - uy * (vx * wz - vz * wx) + uz * (vx * wy - vy * wx))
+    )
+
+
+@kernel
+def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
+    """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
+
+    The rotations are a super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-
+    discrepancy sampling of SO(3)", 2022). Given a rotation, the equations are linear in the
+    translation. These starts need no volume, so they serve coplanar points.
+    """
+    wanted = poses.shape[0]
+    rotation = np.empty((3, 3))
+    matrix = np.empty((3, 3))
+    right = np.empty(3)
+    found = 0
+    for k in range(wanted):
+        s = (k + 0.5) / wanted
+        alpha = 2.0 * np.pi * (k + 0.5) / np.sqrt(2.0)
+        beta = 2.0 * np.pi * (k + 0.5) / 1.533751168755204288118041
+        low, high = np.sqrt(s), np.sqrt(1.0 - s)
+        rotation_from_quaternion(
+            low * np.sin(alpha),
+            low * np.cos(alpha),
+            high * np.sin(beta),
+            high * np.cos(beta),
+            rotation,
+        )
+        matrix[:] = 0.0
+        right[:] = 0.0
+        for i in range(points.shape[0]):
+            u, v = rays[i, 0], rays[i, 1]
+            x = y = z = 0.0
+            for j in range(3):
+                x += rotation[0, j] * points[i, j]
+                y += rotation[1, j] * points[i, j]
+                z += rotation[2, j] * points[i, j]
+            # t_x - u t_z = u z - x and t_y - v t_z = v z - y
+            p, q = u * z - x, v * z - y
+            matrix[0, 0] += 1.0
+            matrix[1, 1] += 1.0
+            matrix[2, 0] -= u
+            matrix[2, 1] -= v
+            matrix[2, 2] += u * u + v * v
+            right[0] += p
+            right[1] += q
+            right[2] -= u * p + v * q
+        if not cholesky(matrix, 3, 1e-12):
+            continue
+        solve_cholesky(matrix, 3, right)
+        for c in range(3):
+            poses[found, 9 + c] = right[c]
+            poses[found, 12 + c] = 1.0
+            for j in range(3):
+                poses[found, 3 * c + j] = rotation[c, j]
+        found += 1
+    return found

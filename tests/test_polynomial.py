@@ -1,0 +1,83 @@
+"""Real roots of polynomials: those that were put in come out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial import polynomial as P
+
+from cadalign.solvers.polynomial import multiply_add, real_roots
+
+
+def roots_of(
+    coefficients: np.ndarray, *, start: float = -1.0, end: float = 1.0, touching: float = 1e-7
+) -> np.ndarray:
+    degree = len(coefficients) - 1
+    found = np.empty(2 * degree)
+    count = real_roots(np.asarray(coefficients, dtype=float), degree, start, end, touching, found)
+    return np.sort(found[:count])
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 8))
+def test_roots_inside_the_interval_are_found(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    # At least 0.05 apart, some of them outside of (-1, 1).
+    roots = -1.5 + np.cumsum(rng.uniform(0.05, 3 / count, count))
+    coefficients = rng.uniform(0.5, 2) * P.polyfromroots(roots)
+    expected = roots[(roots > -1) & (roots < 1)]
+    found = roots_of(coefficients)
+    assert len(found) == len(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+@given(seed=st.integers(0, 2**32 - 1), pairs=st.integers(1, 3))
+def test_complex_pairs_are_no_roots(seed: int, pairs: int) -> None:
+    rng = np.random.default_rng(seed)
+    real = np.sort(rng.uniform(-0.9, 0.9, 2))
+    if real[1] - real[0] < 0.05:
+        return
+    coefficients = P.polyfromroots(real)
+    for _ in range(pairs):
+        center, height = rng.uniform(-0.8, 0.8), rng.uniform(0.2, 1)
+        coefficients = P.polymul(coefficients, [center**2 + height**2, -2 * center, 1])
+    np.testing.assert_allclose(roots_of(coefficients), real, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("lift", [0.0, 1e-12, -1e-12])
+def test_double_root_is_found_even_where_rounding_lifts_it_off_zero(lift: float) -> None:
+    coefficients = P.polyfromroots([0.3, 0.3, -0.6])
+    coefficients[0] += lift
+    found = roots_of(coefficients)
+    np.testing.assert_allclose(found[np.abs(found + 0.6).argmin()], -0.6, atol=1e-9)
+    others = found[np.abs(found - 0.3) < 1e-4]
+    assert len(others) >= 1
+    assert len(found) == 1 + len(others)
+
+
+def test_extremum_above_the_threshold_is_no_root() -> None:
+    coefficients = P.polyfromroots([0.3, 0.3, -0.6])
+    coefficients[0] += 1e-3
+    np.testing.assert_allclose(roots_of(coefficients), [-0.6], atol=1e-2)
+
+
+def test_quadratic_without_real_roots_has_none() -> None:
+    assert len(roots_of(np.array([1.0, 0.0, 1.0]))) == 0
+
+
+@pytest.mark.parametrize("size", [1e-150, 1e-6, 1e6, 1e150])
+def test_roots_do_not_depend_on_the_polynomials_size(size: float) -> None:
+    roots = np.array([-0.7, -0.2, 0.1, 0.4, 0.8])
+    found = roots_of(size * P.polyfromroots(roots))
+    np.testing.assert_allclose(found, roots, rtol=0, atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1), factor=st.floats(-3, 3))
+def test_multiply_add_is_polynomial_multiplication(seed: int, factor: float) -> None:
+    rng = np.random.default_rng(seed)
+    first, second, base = rng.normal(size=4), rng.normal(size=3), rng.normal(size=6)
+    target = base.copy()
+    multiply_add(target, first, second, factor)
+    expected = base + factor * P.polymul(first, second)
+    np.testing.assert_allclose(target, expected, rtol=0, atol=1e-12)

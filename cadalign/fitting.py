@@ -1,0 +1,356 @@
+"""`fit` and `fit_batch`: from keypoints on models and in images to the models' alignments."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.alignment import Alignment
+from cadalign.batch import BatchResult
+from cadalign.camera import Camera
+from cadalign.errors import CadalignError, InputError
+from cadalign.estimation import Solutions, solve, unpack
+from cadalign.options import Options
+from cadalign.problems import Problems, pack_many, pack_one
+from cadalign.result import Alternative, FitResult, FitStats
+from cadalign.robust import RansacOptions, find_consensus, residuals_of
+from cadalign.validation import BoolArray, FloatArray
+from cadalign.whitening import Sigma
+
+LEAST_LIKELIHOOD = 1e-3
+"""Relative likelihood above which another minimum is reported as an alternative."""
+_INLIER_ROUNDS = 5
+
+
+def fit(
+    points_3d: npt.ArrayLike,
+    points_2d: npt.ArrayLike,
+    camera: Camera,
+    *,
+    method: str = "optimal",
+    sigma: Sigma | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    ransac: RansacOptions | None = None,
+    confidences: npt.ArrayLike | None = None,
+) -> FitResult:
+    """Find rotation, translation and stretch of a model from its keypoints in one image.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Keypoints on the model, in the model's own coordinates.
+    points_2d : (n, 2) float
+        The same keypoints in the image [px]; integers are pixel centres.
+    camera : Camera
+        The calibrated camera. Lens distortion is honoured.
+    method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
+        - ``optimal``: the maximum-likelihood alignment, searched for globally. From 5 points up;
+          4 points give every alignment that reprojects exactly, that with the least stretch
+          first.
+        - ``aepnp``: the linear solver, see `cadalign.solvers.aepnp`; at least 6 points.
+        - ``aepnp-paper``: the solver of the AEPnP paper, as published; at least 6 points.
+        - ``epnp``: OpenCV's EPnP, which does not stretch the model; at least 4 points.
+    sigma : float, (n,) float, (n, 2, 2) float or None
+        Standard deviation of the keypoints, of each keypoint, or covariance of each [px]. None
+        estimates it from the residuals: the choice for a model that is only similar to the object,
+        where shapes differ by more than the pixels' noise.
+    loss : {"linear", "huber", "cauchy"}
+        How the length of a residual counts: squared, or less once it exceeds ``loss_scale``.
+    loss_scale : float
+        Where a robust loss begins to bend [sigma].
+    stretch : str, optional
+        The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
+        or ``"none"``. The others keep the scale 1.
+    scale_prior_sigma : float, optional
+        Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
+        It keeps keypoints in one plane, or seen end-on, solvable.
+    known_axis : {"x", "y", "z"}
+        The model's axis whose length is right. One image alone does not tell size from distance.
+    ransac : RansacOptions, optional
+        Search for the alignment that the most keypoints support, and fit to these: for keypoints of
+        which some are wrong. ``result.inliers`` tells which were kept.
+    confidences : (n,) float, optional
+        How much each keypoint is trusted, for ``ransac``: samples are drawn from the highest first.
+
+    Returns
+    -------
+    FitResult
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, or an option is invalid.
+    DegenerateError
+        If the points are too few or don't determine the alignment (the message says which part of
+        it), or no solution has them all in front of the camera.
+    NoConsensusError
+        With ``ransac``: if no alignment has more support than chance gives.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.simulation import simulate_problem
+    >>> problem = simulate_problem(np.random.default_rng(1), points=10, noise_px=0.0)
+    >>> result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    >>> bool(np.allclose(result.alignment.scale, problem.alignment.scale))
+    True
+    """
+    start = time.perf_counter()
+    options = Options(method, sigma, loss, loss_scale, stretch, scale_prior_sigma, known_axis)
+    problems = pack_one(points_3d, points_2d, camera)
+    if ransac is None:
+        _refuse_confidences(confidences)
+        return _fit_all(problems, options, start)
+    return fit_robustly(problems, options, ransac, confidences, start)
+
+
+def fit_batch(
+    points_3d: Sequence[npt.ArrayLike] | FloatArray,
+    points_2d: Sequence[npt.ArrayLike] | FloatArray,
+    camera: Camera | Sequence[Camera],
+    *,
+    method: str = "optimal",
+    sigma: Sigma | Sequence[Sigma] | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    ransac: RansacOptions | None = None,
+    confidences: Sequence[npt.ArrayLike] | None = None,
+    workers: int = 1,
+) -> BatchResult:
+    """Solve many independent problems in one call; each as `fit` does, bit for bit.
+
+    Parameters
+    ----------
+    points_3d : (B, n, 3) float or sequence of B (n_b, 3) float
+        Model points of every problem.
+    points_2d : (B, n, 2) float or sequence of B (n_b, 2) float
+        Image points of every problem [px].
+    camera : Camera or sequence of B Camera
+        One for all problems, or one each.
+    sigma : float, None, or sequence of B
+        As for `fit`, for all problems; a sequence gives each problem its own.
+    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, ransac
+        As for `fit`.
+    confidences : sequence of B (n_b,) float, optional
+        As for `fit`, for each problem.
+    workers : int
+        How many threads share the problems; -1 for as many as there are cores.
+
+    Returns
+    -------
+    BatchResult
+        Arrays over the problems; a problem without solution has its error there, and does not stop
+        the others.
+
+    Raises
+    ------
+    InputError
+        If the arguments of any problem, or an option, are invalid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.simulation import simulate_problem
+    >>> rng = np.random.default_rng(1)
+    >>> problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (8, 20)]
+    >>> batch = fit_batch(
+    ...     [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
+    ... )
+    >>> batch.scale.shape
+    (2, 3)
+    """
+    per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
+    options = Options(
+        method,
+        1.0 if per_problem else sigma,  # type: ignore[arg-type]
+        loss,
+        loss_scale,
+        stretch,
+        scale_prior_sigma,
+        known_axis,
+    )
+    problems = pack_many(points_3d, points_2d, camera)
+    sigmas: Sequence[Sigma] | None = None
+    if per_problem:
+        sigmas = list(sigma)  # type: ignore[arg-type]
+        if len(sigmas) != len(problems):
+            raise InputError(f"{len(problems)} problems but {len(sigmas)} values", where="sigma")
+    if workers == -1:
+        workers = os.cpu_count() or 1
+    if workers < 1:
+        raise InputError(f"{workers} is not a number of threads", where="workers", fix="or -1")
+    bounds = np.linspace(0, len(problems), workers + 1).astype(int).tolist()
+    parts = [(a, b) for a, b in pairwise(bounds) if a < b]
+
+    def run(part: tuple[int, int]) -> BatchResult:
+        some = problems.part(*part)
+        own = None if sigmas is None else sigmas[part[0] : part[1]]
+        if ransac is None and not options.estimates_in_rounds:
+            return BatchResult.of_solutions(some, solve(some, options, own))
+        trusted = None if confidences is None else confidences[part[0] : part[1]]
+        return BatchResult.of_fits(some, _fits(some, options, ransac, own, trusted))
+
+    if len(parts) < 2:
+        return run((0, len(problems)))
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return BatchResult.joined(list(pool.map(run, parts)))
+
+
+def _refuse_confidences(confidences: object) -> None:
+    if confidences is not None:
+        raise InputError(
+            "given without ransac",
+            where="confidences",
+            fix="give ransac=RansacOptions(...), or the keypoints' sigma instead",
+        )
+
+
+def _fits(
+    problems: Problems,
+    options: Options,
+    ransac: RansacOptions | None,
+    sigmas: Sequence[Sigma] | None,
+    confidences: Sequence[npt.ArrayLike] | None,
+) -> list[FitResult | CadalignError]:
+    """Fits of all problems, one by one; an error takes the place of a result."""
+    fits: list[FitResult | CadalignError] = []
+    for b in range(len(problems)):
+        own = options if sigmas is None else replace(options, sigma=sigmas[b])
+        trusted = None if confidences is None else confidences[b]
+        start = time.perf_counter()
+        one = problems.part(b, b + 1)
+        try:
+            if ransac is None:
+                fits.append(_fit_all(one, own, start))
+            else:
+                fits.append(fit_robustly(one, own, ransac, trusted, start))
+        except CadalignError as error:
+            fits.append(error)
+    return fits
+
+
+def fit_robustly(
+    problems: Problems,
+    options: Options,
+    ransac: RansacOptions,
+    confidences: npt.ArrayLike | None,
+    start: float,
+) -> FitResult:
+    """Fit the only problem to the keypoints that support its best alignment."""
+    if options.method != "optimal":
+        raise InputError(
+            f"the method {options.method!r} does not go with ransac",
+            where="method",
+            fix="leave the method alone; RansacOptions(minimal=...) names the minimal solver",
+        )
+    consensus = find_consensus(problems, options, ransac, confidences)
+    inliers = consensus.inliers
+    if not ransac.refine:
+        result = _unrefined(problems, options, consensus.alignment)
+    else:
+        result = _fit_inliers(problems, options, inliers, start)
+        for _ in range(_INLIER_ROUNDS):
+            residuals = residuals_of(problems, result.alignment)
+            kept = np.linalg.norm(residuals, axis=1) < ransac.max_reproj_error
+            if (kept == inliers).all() or kept.sum() < inliers.sum():
+                break
+            inliers = kept
+            result = _fit_inliers(problems, options, inliers, start)
+    residuals = residuals_of(problems, result.alignment)
+    return replace(
+        result,
+        points_3d=problems.points_3d.copy(),
+        residuals=residuals,
+        inliers=inliers,
+        method=f"ransac-{ransac.minimal}" if not ransac.refine else "ransac-optimal",
+        stats=FitStats(
+            iterations=consensus.iterations,
+            hypotheses=consensus.hypotheses,
+            seconds=time.perf_counter() - start,
+            inlier_ratio=float(inliers.mean()),
+            score=consensus.score,
+        ),
+    )
+
+
+def _fit_inliers(
+    problems: Problems, options: Options, inliers: BoolArray, start: float
+) -> FitResult:
+    """The optimum for some of the only problem's keypoints."""
+    sigma = options.sigma
+    if sigma is not None and np.ndim(sigma) > 0:
+        sigma = np.asarray(sigma)[inliers]
+    some = Problems(
+        problems.points_3d[inliers],
+        problems.points_2d[inliers],
+        np.array([0, int(inliers.sum())]),
+        problems.cameras,
+    )
+    return _fit_all(some, replace(options, sigma=sigma), start)
+
+
+def _unrefined(problems: Problems, options: Options, alignment: Alignment) -> FitResult:
+    """The best hypothesis as the minimal solver left it."""
+    count = len(problems.points_3d)
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d,
+        residuals=np.zeros((count, 2)),
+        inliers=np.ones(count, dtype=bool),
+        method=options.method,
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+    )
+
+
+def _fit_all(problems: Problems, options: Options, start: float) -> FitResult:
+    """Fit the only problem to all its keypoints."""
+    solutions = solve(problems, options)
+    if solutions.errors:
+        raise solutions.errors[0]
+    alignment = Alignment.from_solver(*unpack(solutions.poses[0, 0]))
+    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
+    count = len(problems.points_3d)
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
+        residuals=solutions.residuals,
+        inliers=np.ones(count, dtype=bool),
+        method=options.method,
+        sigma=None if solutions.sigmas is None else float(solutions.sigmas[0]),
+        covariance=None if solutions.covariances is None else solutions.covariances[0],
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+        alternatives=_alternatives(solutions, minima, options, count) if minima > 1 else (),
+        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
+    )
+
+
+def _alternatives(
+    solutions: Solutions, minima: int, options: Options, count: int
+) -> tuple[Alternative, ...]:
+    """The other minima that are likely enough."""
+    costs = solutions.costs[0, :minima]
+    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
+        ratios = (max(costs[0], 1e-300) / np.maximum(costs, 1e-300)) ** count
+    else:
+        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    return tuple(
+        Alternative(Alignment.from_solver(*unpack(solutions.poses[0, k])), float(ratios[k]))
+        for k in range(1, minima)
+        if ratios[k] >= LEAST_LIKELIHOOD
+    )

@@ -1,0 +1,37 @@
+"""Loaders: annotated CAD models (KeypointNet, ShapeNet, mesh files), and correspondences."""
+
+from cadalign.datasets.blind_pnp import BlindPnP
+from cadalign.datasets.bundler import Bundler
+from cadalign.datasets.categories import SYNSETS
+from cadalign.datasets.colmap import Colmap
+from cadalign.datasets.correspondences import Correspondences, CorrespondenceSet
+from cadalign.datasets.formats import CORRESPONDENCE_FORMATS, open_correspondences
+from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
+from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
+from cadalign.datasets.meshes import check_solid, flat_axes, load_mesh
+from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
+from cadalign.datasets.shapenet import ShapeNet, ShapeNetModel
+
+__all__ = [
+    "CORRESPONDENCE_FORMATS",
+    "SYNSETS",
+    "AnnotatedModel",
+    "BlindPnP",
+    "Bundler",
+    "Circle",
+    "Colmap",
+    "CorrespondenceSet",
+    "Correspondences",
+    "KeypointNet",
+    "Keypoints",
+    "RotationalSymmetry",
+    "ShapeNet",
+    "ShapeNetModel",
+    "Symmetries",
+    "check_solid",
+    "flat_axes",
+    "load_mesh",
+    "open_correspondences",
+    "sample_models",
+    "write_sample_dataset",
+]

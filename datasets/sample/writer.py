@@ -1,0 +1,301 @@
+"""The sample data set: its models, and writing them in KeypointNet's layout."""
+
+from __future__ import annotations
+
+import colorsys
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.datasets.sample.bottle import build_bottle, draw_bottle
+from cadalign.datasets.sample.car import build_car
+from cadalign.datasets.sample.car_style import draw_car
+from cadalign.datasets.sample.chair import build_chair
+from cadalign.datasets.sample.chair_style import draw_chair
+from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
+from cadalign.datasets.sample.vessel import build_vessel
+from cadalign.datasets.sample.vessel_style import draw_vessel
+from cadalign.errors import DataError, InputError
+from cadalign.mesh import Mesh
+
+_SYNSETS = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
+_CATEGORIES = ("chair", "bottle", "car", "vessel")
+_SPLITS = ("train", "train", "train", "train", "val", "test")  # take turns by number
+_MARKER = "sample_dataset.json"
+_LARGEST_OFFSET = 0.08
+
+
+def sample_models(
+    *, per_category: int = 12, categories: Sequence[str] | None = None, seed: int = 0
+) -> Iterator[SampleModel]:
+    """Make the models of the sample data set, one after the other.
+
+    Each depends on the seed, its category and its number alone: asking for more models, or for
+    fewer categories, does not change any of them.
+
+    Parameters
+    ----------
+    per_category : int
+        How many models of each category, at least 1.
+    categories : sequence of str, optional
+        Some of chair, bottle, car, vessel; by default all.
+    seed : int
+        Not negative.
+
+    Yields
+    ------
+    SampleModel
+        The mesh and its keypoints; KeypointNet's axes, diagonal 1, the front at -z.
+
+    Raises
+    ------
+    InputError
+        If a number is out of range or a category is unknown or named twice.
+
+    Examples
+    --------
+    >>> model = next(sample_models(categories=["bottle"], per_category=1))
+    >>> model.model_id, len(model.keypoints)
+    ('sample_bottle_000', 17)
+    """
+    names = _check_arguments(per_category, categories, seed)
+    return (_make(category, index, seed) for category in names for index in range(per_category))
+
+
+def write_sample_dataset(
+    root: str | os.PathLike[str],
+    *,
+    per_category: int = 12,
+    categories: Sequence[str] | None = None,
+    seed: int = 0,
+) -> Path:
+    """Write the sample data set in KeypointNet's layout.
+
+    That is ``annotations/<category>.json``, ``ShapeNetCore.v2.ply/<synset>/<model id>.ply`` and
+    ``splits/{train,val,test}.txt``. The same arguments give the same bytes. Everything is written
+    beside ``root`` first and then renamed, so that an interrupted run leaves no half a data set.
+
+    Parameters
+    ----------
+    root : path
+        The folder to make. It may exist if it is empty or holds an earlier sample data set and
+        nothing else: that is replaced.
+    per_category : int
+        How many models of each category, at least 1.
+    categories : sequence of str, optional
+        Some of chair, bottle, car, vessel; by default all.
+    seed : int
+        Not negative.
+
+    Returns
+    -------
+    Path
+        ``root``.
+
+    Raises
+    ------
+    InputError
+        If a number is out of range or a category is unknown or named twice.
+    DataError
+        If ``root`` is a file or holds anything else, or cannot be written.
+    """
+    target = Path(root)
+    names = _check_arguments(per_category, categories, seed)
+    _check_replaceable(target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Not a plain folder name beside it: two runs at once must not share one.
+        partial = Path(
+            tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent)
+        )
+    except OSError as error:
+        raise DataError(f"cannot be written ({error})", where=str(target)) from error
+    try:
+        partial.chmod(0o755)
+        data = partial / "data"
+        data.mkdir()
+        _write(data, names, per_category, seed)
+        if target.exists():
+            target.rename(partial / "replaced")
+        data.rename(target)
+    except OSError as error:
+        raise DataError(
+            f"cannot be written ({error})",
+            where=str(target),
+            fix="give a folder with room to write",
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def _check_arguments(
+    per_category: int, categories: Sequence[str] | None, seed: int
+) -> tuple[str, ...]:
+    for name, value, least in (("per_category", per_category, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+            raise InputError(
+                f"{value!r} is not possible", where=name, fix=f"give a whole number from {least} up"
+            )
+    if categories is None:
+        return _CATEGORIES
+    if isinstance(categories, str):
+        raise InputError(
+            "a single text, not a sequence", where="categories", fix=f"give [{categories!r}]"
+        )
+    unknown = [name for name in categories if name not in _SYNSETS]
+    if unknown or not categories or len(set(categories)) < len(categories):
+        what = f"unknown category {unknown[0]!r}" if unknown else f"{list(categories)!r}"
+        raise InputError(
+            what, where="categories", fix=f"give some of {', '.join(_CATEGORIES)}, each once"
+        )
+    return tuple(categories)
+
+
+def _draft(category: str, index: int, rng: np.random.Generator) -> Draft:
+    makers: dict[str, Callable[[], Draft]] = {
+        "chair": lambda: build_chair(draw_chair(rng, index)),
+        "bottle": lambda: build_bottle(draw_bottle(rng, index)),
+        "car": lambda: build_car(draw_car(rng, index)),
+        "vessel": lambda: build_vessel(draw_vessel(rng, index)),
+    }
+    return makers[category]()
+
+
+def _make(category: str, index: int, seed: int) -> SampleModel:
+    rng = np.random.default_rng([seed, int(_SYNSETS[category]), index])
+    # Real models are not centred either; x stays, so that x = 0 remains the mirror plane.
+    offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
+    if category == "bottle":
+        offset[2] = 0.0
+    model_id = f"sample_{category}_{index:03d}"
+    draft = _draft(category, index, rng)
+    return finish(draft, category=category, model_id=model_id, offset=offset)
+
+
+def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
+    splits: dict[str, list[str]] = {"train": [], "val": [], "test": []}
+    annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for name in names:
+        (root / "ShapeNetCore.v2.ply" / _SYNSETS[name]).mkdir(parents=True)
+    for model in sample_models(per_category=per_category, categories=names, seed=seed):
+        synset = _SYNSETS[model.category]
+        path = root / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply"
+        path.write_bytes(ply_bytes(model.mesh))
+        number = len(annotations[model.category])
+        splits[_SPLITS[number % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
+        annotations[model.category].append(annotation(model))
+    (root / "annotations").mkdir()
+    for name, records in annotations.items():
+        text = json.dumps(records, separators=(",", ":"))
+        (root / "annotations" / f"{name}.json").write_text(text, encoding="utf-8")
+    (root / "splits").mkdir()
+    for split, lines in splits.items():
+        (root / "splits" / f"{split}.txt").write_text(
+            "".join(lines), encoding="utf-8", newline="\n"
+        )
+    marker = {
+        "made_by": "cadalign.datasets.sample",
+        "categories": list(names),
+        "per_category": int(per_category),
+        "seed": int(seed),
+    }
+    (root / _MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
+
+
+def annotation(model: SampleModel) -> dict[str, Any]:
+    """A model's entry in KeypointNet's ``annotations/<category>.json``."""
+    position = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
+    rotation = []
+    for group in model.turned:
+        members = [position[semantic_id] for semantic_id in group]
+        circle = _circle(model, members) if model.round else {}
+        rotation.append({"kp_indexes": members, "is_circle": model.round, "circle": circle})
+    return {
+        "class_id": _SYNSETS[model.category],
+        "model_id": model.model_id,
+        "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
+        "symmetries": {
+            "reflection": [{"kp_indexes": [position[a], position[b]]} for a, b in model.mirrored],
+            "rotation": rotation,
+        },
+    }
+
+
+def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
+    return {
+        "xyz": keypoint.xyz.tolist(),
+        "rgb": _distinct_color(keypoint.semantic_id),
+        "semantic_id": keypoint.semantic_id,
+        "pcd_info": {"point_index": keypoint.vertex_index},
+        "mesh_info": {
+            "face_index": keypoint.face_index,
+            "face_uv": keypoint.barycentric.tolist(),
+        },
+    }
+
+
+def _distinct_color(semantic_id: int) -> list[int]:
+    # Steps of the golden ratio around the colour circle never come back to a colour.
+    rgb = colorsys.hsv_to_rgb(semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
+    return [round(255 * value) for value in rgb]
+
+
+def _circle(model: SampleModel, members: Sequence[int]) -> dict[str, Any]:
+    points = np.array([model.keypoints[i].xyz for i in members])
+    # The axis is that of the model, not the mean of a few points on a polygon.
+    center = model.mesh.bounds.mean(axis=0)
+    center[1] = points[:, 1].mean()
+    radius = float(np.linalg.norm(points - center, axis=1).mean())
+    return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
+
+
+def ply_bytes(mesh: Mesh) -> bytes:
+    """A mesh with vertex colours as a binary PLY file, positions in single precision."""
+    vertices = np.empty(len(mesh.vertices), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"] = mesh.vertices
+    colors = mesh.vertex_colors
+    vertices["rgb"] = 178 if colors is None else np.round(colors[:, :3] * 255)
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"] = 3
+    faces["corners"] = mesh.faces
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+        f"element face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    return header.encode("ascii") + vertices.tobytes() + faces.tobytes()
+
+
+def _check_replaceable(target: Path) -> None:
+    """Refuse to overwrite anything but an earlier sample data set."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise DataError("is a file", where=str(target), fix="give a folder")
+    present = sorted(path for path in target.rglob("*") if not path.is_dir())
+    if not present:
+        return
+    ours = (target / _MARKER).is_file()
+    foreign = [path for path in present if not ours or not _is_ours(path.relative_to(target))]
+    if foreign:
+        raise DataError(
+            f"holds files that are not of a sample data set, such as {foreign[0].name}",
+            where=str(target),
+            fix="give a new or an empty folder",
+        )
+
+
+def _is_ours(path: Path) -> bool:
+    known = {_MARKER, *(f"splits/{split}.txt" for split in ("train", "val", "test"))}
+    known |= {f"annotations/{category}.json" for category in _CATEGORIES}
+    return path.as_posix() in known or path.match("ShapeNetCore.v2.ply/*/sample_*.ply")

@@ -1,0 +1,184 @@
+"""Pickles of NumPy arrays and plain containers, loaded without running code.
+
+A pickle is a program: it may import and call anything. Here it gets nothing but what rebuilds
+arrays, NumPy scalars, sets and ordered dictionaries; asking for anything else is refused before it
+is imported. NumPy's own ``dtype`` and ``ndarray`` are not handed out either: their ``__setstate__``
+trusts flags and lengths in the pickle, and can be made to read bytes as addresses of objects.
+"""
+
+from __future__ import annotations
+
+import collections
+import math
+import os
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.errors import DataError
+
+# Numbers, text and objects; no records, whose fields can hide objects.
+_PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
+_FIX = (
+    "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
+)
+
+
+def load_pickle(path: str | os.PathLike[str]) -> Any:
+    """Load a pickle of NumPy arrays, numbers, text, and containers of these.
+
+    Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
+    Latin-1, the encoding that keeps its bytes.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+
+    Returns
+    -------
+    object
+        What it holds; arrays come as a subclass of ``numpy.ndarray``.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is no whole pickle, or asks for anything else; names what it
+        asked for.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return _PlainUnpickler(file, str(path)).load()
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror or error})", where=str(path)) from None
+    except Exception as error:  # damaged pickles make the unpickler raise what it likes
+        raise DataError(
+            f"not a whole pickle of arrays ({type(error).__name__}: {error})",
+            where=str(path),
+            fix="the file is cut short or damaged; get it again",
+        ) from None
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    def __init__(self, file: Any, where: str) -> None:
+        super().__init__(file, encoding="latin1")
+        self._where = where
+        self._allowed = _make_allowed()
+
+    def find_class(self, module: str, name: str) -> Any:
+        # Python 2 and NumPy 1 call the same modules otherwise.
+        current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
+        if (current, name) not in self._allowed:
+            raise DataError(
+                f"the pickle asks for {module}.{name}, which is refused",
+                where=self._where,
+                fix=_FIX,
+            )
+        return self._allowed[current, name]
+
+
+class _ArrayType:
+    """Stands for ``numpy.ndarray``, which pickles name but need not call."""
+
+    __slots__ = ()
+
+
+class _Dtype:
+    """Stands for ``numpy.dtype`` while a pickle is read."""
+
+    def __init__(self, code: str, align: Any = False, copy: Any = False) -> None:
+        if not isinstance(code, str) or not _PLAIN_DTYPE.fullmatch(code):
+            raise pickle.UnpicklingError(f"the dtype {code!r} is not one of plain values")
+        self._dtype = np.dtype(code)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        # (version, byte order, subdtype, names, fields, ...); the rest follows from the code.
+        self._dtype = self._dtype.newbyteorder(state[1])
+
+    @property
+    def value(self) -> np.dtype[Any]:
+        return self._dtype
+
+
+class _Array(np.ndarray[Any, Any]):
+    """An array that checks what it is rebuilt from."""
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, dtype, fortran_order, data = state
+        count = math.prod(_as_shape(shape))
+        values: np.dtype[Any] = dtype.value
+        if values.hasobject:
+            fits = isinstance(data, list) and len(data) == count
+        else:
+            fits = isinstance(data, bytes | str) and len(data) == count * values.itemsize
+        # Refilling an array would pull its memory away from whatever looks at it already.
+        if not fits or self.size:
+            raise pickle.UnpicklingError(f"an array of shape {shape} has other data than that")
+        # NumPy's stubs ask for a numpy.bool, which it doesn't take.
+        rebuilt: Any = (1, shape, values, bool(fortran_order), data)
+        super().__setstate__(rebuilt)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        # Pickled again, for a worker process, it is an array like any other.
+        return self.view(np.ndarray).__reduce_ex__(protocol)
+
+
+def _make_allowed() -> dict[tuple[str, str], Any]:
+    """All that a pickle may name.
+
+    Made anew for each file: a pickle can set attributes of the functions that it is given.
+    """
+    array_type = _ArrayType()
+
+    def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
+        if kind is not array_type:
+            raise pickle.UnpicklingError("only plain arrays can be loaded")
+        return np.empty(0).view(_Array)
+
+    def scalar(dtype: _Dtype, data: bytes | str) -> Any:
+        return np.frombuffer(_as_bytes(data), dtype=dtype.value, count=1)[0]
+
+    def from_buffer(
+        buffer: bytes | bytearray, dtype: _Dtype, shape: Any, order: str, axes: Any = None
+    ) -> Any:
+        flat = np.frombuffer(bytes(buffer), dtype=dtype.value)
+        if order == "K" and axes is not None:
+            return flat.reshape(_as_shape(shape)).transpose(axes)
+        return flat.reshape(_as_shape(shape), order="F" if order == "F" else "C")
+
+    def encode(text: str, encoding: str) -> bytes:
+        # How Python 3 writes bytes so that Python 2 can read them.
+        if encoding != "latin1":
+            raise pickle.UnpicklingError(f"the encoding {encoding!r} is not expected")
+        return text.encode("latin1")
+
+    def no_bytes() -> bytes:
+        return b""
+
+    return {
+        ("numpy", "ndarray"): array_type,
+        ("numpy", "dtype"): _Dtype,
+        ("numpy._core.multiarray", "_reconstruct"): reconstruct,
+        ("numpy._core.multiarray", "scalar"): scalar,
+        ("numpy._core.numeric", "_frombuffer"): from_buffer,
+        ("_codecs", "encode"): encode,
+        ("builtins", "bytes"): no_bytes,
+        ("builtins", "set"): set,
+        ("builtins", "frozenset"): frozenset,
+        ("collections", "OrderedDict"): collections.OrderedDict,
+    }
+
+
+def _as_bytes(data: bytes | str) -> bytes:
+    return data.encode("latin1") if isinstance(data, str) else bytes(data)
+
+
+def _as_shape(shape: Any) -> tuple[int, ...]:
+    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise pickle.UnpicklingError(f"{shape!r} is not a shape")
+    return shape

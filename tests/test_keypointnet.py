@@ -1,0 +1,376 @@
+"""KeypointNet: what the files say arrives, and one bad model spoils no other."""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import os
+import pickle
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cadalign.datasets import KeypointNet, load_mesh
+from cadalign.errors import DataError, InputError
+
+CHAIR, MUG = "03001627", "03797390"
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+FACES = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
+
+
+def entry(model_id: str, class_id: str = CHAIR) -> dict:
+    """An annotation of the tetrahedron with a keypoint on each face."""
+    weights = [0.2, 0.3, 0.5]
+    keypoints = [
+        {
+            "xyz": (np.array(weights) @ CORNERS[list(face)]).tolist(),
+            "rgb": [255, 0, 51],
+            "semantic_id": 2 * number,
+            "pcd_info": {"point_index": number},
+            "mesh_info": {"face_index": number, "face_uv": [w * 1.0005 for w in weights]},
+        }
+        for number, face in enumerate(FACES)
+    ]
+    circle = {"center": [0, 0, 0], "radius": 0.5, "normal": [0, -2, 0]}
+    return {
+        "class_id": class_id,
+        "model_id": model_id,
+        "keypoints": keypoints,
+        "symmetries": {
+            "reflection": [{"kp_indexes": [0, 1]}],
+            "rotation": [
+                {"kp_indexes": [0, 1, 2], "is_circle": True, "circle": circle},
+                {"kp_indexes": [2, 3], "is_circle": False, "circle": {}},
+            ],
+        },
+    }
+
+
+def write_json(path: Path, value: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value))
+
+
+def write_obj(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(TETRAHEDRON)
+    return path
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Two chairs (one with a mesh) and a mug."""
+    write_json(tmp_path / "annotations/mug.json", [entry("m", MUG)])
+    write_json(tmp_path / "annotations/chair.json", [entry("z"), entry("a")])
+    write_json(tmp_path / "annotations/all.json", "not to be read")
+    write_obj(tmp_path / f"models/{CHAIR}/a/models/model_normalized.obj")
+    (tmp_path / "splits").mkdir()
+    (tmp_path / "splits/train.txt").write_text(f"{CHAIR}-a\n{MUG}-m\n\n{CHAIR}-elsewhere\n")
+    (tmp_path / "splits/test.txt").write_text(f"{CHAIR}-z\n")
+    return tmp_path
+
+
+# --- what the files say
+
+
+def test_models_come_sorted_by_category_and_in_file_order(root):
+    dataset = KeypointNet(root)
+    assert dataset.categories == ("chair", "mug")
+    keys = [("chair", "z"), ("chair", "a"), ("mug", "m")]
+    assert [model.key for model in dataset] == keys == list(dataset.ids())
+    assert len(dataset) == 3
+    assert dataset["chair", "a"] is dataset["chair"][1]
+    assert dataset["03001627", "a"] is dataset["chair", "a"]
+
+
+def test_keypoints_and_symmetries_arrive(root):
+    model = KeypointNet(root)["chair", "a"]
+    assert model.class_id == CHAIR
+    keypoints = model.keypoints
+    assert len(keypoints) == 4
+    assert keypoints.semantic_ids.tolist() == [0, 2, 4, 6]
+    assert keypoints.face_index.tolist() == keypoints.point_index.tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(keypoints.barycentric.sum(axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(keypoints.colors[0], [1, 0, 0.2])
+    assert model.symmetries.reflections == ((0, 1),)
+    ring, pair = model.symmetries.rotations
+    assert ring.is_circle
+    assert ring.fold is None
+    assert ring.circle.radius == 0.5
+    np.testing.assert_allclose(ring.circle.normal, [0, -1, 0])
+    np.testing.assert_allclose(model.symmetries.axes, [[0, 1, 0]])
+    assert (pair.keypoints, pair.is_circle, pair.fold) == ((2, 3), False, 2)
+
+
+def test_records_are_read_only_and_picklable(root):
+    model = KeypointNet(root)["chair", "a"]
+    with pytest.raises(ValueError, match="read-only"):
+        model.keypoints.xyz[0, 0] = 1
+    again = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(again.keypoints.xyz, model.keypoints.xyz)
+
+
+def test_colors_and_point_indices_may_be_absent(root):
+    plain = entry("a")
+    for keypoint in plain["keypoints"]:
+        del keypoint["rgb"], keypoint["pcd_info"]
+    del plain["symmetries"]
+    write_json(root / "annotations/chair.json", [plain])
+    model = KeypointNet(root)["chair", "a"]
+    assert model.keypoints.point_index.tolist() == [-1] * 4
+    assert model.symmetries.rotations == ()
+
+
+def test_one_file_for_all_categories(tmp_path):
+    write_json(tmp_path / "annotations/all.json", [entry("a"), entry("m", MUG), entry("b")])
+    dataset = KeypointNet(tmp_path)
+    assert dataset.ids() == (("chair", "a"), ("chair", "b"), ("mug", "m"))
+
+
+def test_categories_are_read_when_asked_for(root):
+    (root / "annotations/mug.json").write_text("[\n{broken")
+    dataset = KeypointNet(root)
+    assert len(dataset["chair"]) == 2
+    with pytest.raises(DataError, match=r"mug\.json, line 2: not JSON"):
+        dataset["mug"]
+
+
+# --- splits and subsets
+
+
+def test_splits(root):
+    dataset = KeypointNet(root)
+    assert dataset.splits == ("test", "train")
+    assert dataset.split("test") == {("chair", "z")}
+    assert [model.key for model in dataset.subset(split="train")] == [("chair", "a"), ("mug", "m")]
+    with pytest.raises(InputError, match="unknown split 'val'; known are test, train"):
+        KeypointNet(root).split("val")
+    (root / "splits/test.txt").write_text(f"{CHAIR}-z\nchair\n")
+    with pytest.raises(DataError, match=r"test\.txt, line 2"):
+        dataset.split("test")
+
+
+def test_subsets_narrow_each_other(root):
+    dataset = KeypointNet(root)
+    chairs = dataset.subset(categories=["chair"])
+    assert chairs.categories == ("chair",)
+    assert [model.model_id for model in chairs.subset(with_mesh=True)] == ["a"]
+    assert len(chairs.subset(split="train").subset(split="test")) == 0
+    assert len(dataset) == 3
+    with pytest.raises(InputError, match="no model 'z' of 'chair'"):
+        chairs.subset(split="train")["chair", "z"]
+    with pytest.raises(InputError, match="known are chair"):
+        chairs["mug"]
+
+
+# --- meshes
+
+
+def test_mesh_is_loaded_and_matches(root):
+    model = KeypointNet(root)["chair", "a"]
+    np.testing.assert_allclose(model.keypoints.on_mesh(model.load_mesh()), model.keypoints.xyz)
+
+
+def test_model_without_mesh_says_so(root):
+    model = KeypointNet(root)["chair", "z"]
+    assert model.mesh_path is None
+    with pytest.raises(DataError, match="chair, model z: there is no mesh"):
+        model.load_mesh()
+
+
+def test_meshes_of_every_layout_are_found(root, tmp_path):
+    ply = tmp_path / f"ShapeNetCore.v2.ply/{CHAIR}/a.ply"
+    ply.parent.mkdir(parents=True)
+    load_mesh(KeypointNet(root)["chair", "a"].mesh_path).to_trimesh().export(ply)
+    other = write_obj(tmp_path / f"elsewhere/{CHAIR}/a/model.obj")
+    below = root / f"models/{CHAIR}/a/models/model_normalized.obj"
+    assert KeypointNet(root).mesh_paths("chair", "a") == (ply, below)
+    dataset = KeypointNet(root, shapenet_root=tmp_path / "elsewhere")
+    assert dataset.mesh_paths("chair", "a") == (other, ply, below)
+    assert dataset["chair", "a"].mesh_path == other
+    for path in dataset.mesh_paths("chair", "a"):
+        assert len(load_mesh(path).faces) == 4
+
+
+def test_mesh_that_does_not_belong_to_the_annotation_is_refused(root):
+    path = root / f"models/{CHAIR}/a/models/model_normalized.obj"
+    model = KeypointNet(root)["chair", "a"]
+    path.write_text(TETRAHEDRON.replace("v 0 0 1", "v 0 0 2"))
+    with pytest.raises(DataError, match=r"model a: keypoints\[\d\] lies 0\.5 off"):
+        model.load_mesh()
+    assert model.load_mesh(check=False).bounds[1, 2] == 2
+    path.write_text("\n".join(TETRAHEDRON.splitlines()[:-1]))
+    with pytest.raises(DataError, match="face 3 is not in"):
+        model.load_mesh()
+
+
+# --- malformed annotations
+
+
+def _set(path: str, value: object):
+    """Change one field of an annotation: ``keypoints.1.xyz``."""
+
+    def change(annotation: dict) -> None:
+        *parents, last = path.split(".")
+        target = annotation
+        for name in parents:
+            target = target[int(name) if isinstance(target, list) else name]
+        if value is KeyError:
+            del target[last]
+        else:
+            target[int(last) if isinstance(target, list) else last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        ("keypoints", [], "keypoints: there are no keypoints"),
+        ("keypoints", KeyError, "'keypoints' is missing"),
+        ("keypoints", {}, "keypoints: {} is not a list"),
+        ("keypoints.1", None, "keypoints[1]: None is not an object"),
+        ("keypoints.1.xyz", KeyError, "keypoints[1]: the field 'xyz' is missing"),
+        ("keypoints.1.xyz", [0, float("nan"), 0], "keypoints[1].xyz: [0, nan, 0] is not 3 finite"),
+        ("keypoints.1.xyz", [0, 10**400, 0], "keypoints[1].xyz"),
+        ("keypoints.1.xyz", [0, "1", 0], "keypoints[1].xyz"),
+        ("keypoints.1.xyz", [0, True, 0], "keypoints[1].xyz"),
+        ("keypoints.1.xyz", [0, 1], "keypoints[1].xyz"),
+        ("keypoints.1.semantic_id", 0, "keypoints[1].semantic_id: 0 occurs twice"),
+        ("keypoints.1.semantic_id", 1.5, "keypoints[1].semantic_id"),
+        ("keypoints.1.semantic_id", None, "keypoints[1].semantic_id"),
+        ("keypoints.1.rgb", "red", "keypoints[1].rgb"),
+        ("keypoints.1.pcd_info", 3, "keypoints[1].pcd_info"),
+        ("keypoints.1.mesh_info", KeyError, "'mesh_info' is missing"),
+        ("keypoints.1.mesh_info.face_index", -1, "keypoints[1].mesh_info.face_index"),
+        ("keypoints.1.mesh_info.face_uv", [0, 0, 0], "sum to 0, not to 1"),
+        ("symmetries", 3, "symmetries: 3 is not an object"),
+        ("symmetries.reflection", None, "symmetries.reflection: None is not a list"),
+        (
+            "symmetries.reflection.0.kp_indexes",
+            [0, 4],
+            "reflection[0].kp_indexes: 4 is not the row",
+        ),
+        ("symmetries.reflection.0.kp_indexes", [0], "1 keypoints do not mirror"),
+        ("symmetries.rotation.0.circle", {}, "rotation[0].circle: the field 'normal' is missing"),
+        ("symmetries.rotation.0.circle.normal", [0, 0, 0], "circle.normal: has no length"),
+        ("symmetries.rotation.0.is_circle", "yes", "rotation[0].is_circle"),
+        ("class_id", 3001627, "class_id: 3001627 is not an id"),
+        ("class_id", "../../etc", "class_id"),
+    ],
+)
+def test_one_malformed_model_does_not_stop_the_others(root, caplog, path, value, told):
+    bad = copy.deepcopy(entry("bad"))
+    _set(path, value)(bad)
+    write_json(root / "annotations/chair.json", [entry("z"), bad, entry("a")])
+    dataset = KeypointNet(root)
+    with caplog.at_level(logging.WARNING, logger="cadalign"):
+        assert [model.model_id for model in dataset["chair"]] == ["z", "a"]
+    assert told in caplog.text
+    assert dataset.ids("chair") == (("chair", "z"), ("chair", "bad"), ("chair", "a"))
+    assert list(dataset.problems) == [("chair", "bad")]
+    with pytest.raises(DataError) as caught:
+        dataset["chair", "bad"]
+    assert str(caught.value).startswith("chair.json, model bad")
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [None, 7, "text", {"class_id": CHAIR}, {"model_id": ["x"]}])
+def test_entry_without_model_id_goes_by_its_position(root, value):
+    write_json(root / "annotations/chair.json", [entry("z"), value, entry("a")])
+    dataset = KeypointNet(root)
+    assert list(dataset.problems) == [("chair", "#1")]
+    assert len(dataset["chair"]) == 2
+
+
+def test_model_that_occurs_twice_counts_once(root):
+    write_json(root / "annotations/chair.json", [entry("z"), entry("a"), entry("z")])
+    dataset = KeypointNet(root)
+    assert [model.model_id for model in dataset["chair"]] == ["z", "a"]
+    assert "occurs twice" in str(dataset.problems["chair", "z#2"])
+
+
+def test_malformed_models_with_a_mesh_stay_in_a_subset_with_meshes(root):
+    bad = entry("a")
+    del bad["keypoints"]
+    write_json(root / "annotations/chair.json", [entry("z"), bad])
+    assert KeypointNet(root).subset(with_mesh=True).ids() == (("chair", "a"),)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "3", "[", "[{}", '"x"', "[\n1,\n]", "[" * 100_000])
+def test_file_that_is_no_annotation_is_named(root, text):
+    (root / "annotations/chair.json").write_text(text)
+    dataset = KeypointNet(root)
+    with pytest.raises(DataError, match=r"chair\.json"):
+        dataset["chair"]
+    assert len(dataset["mug"]) == 1
+
+
+def test_file_that_is_not_text_is_named(root):
+    (root / "annotations/chair.json").write_bytes(b"\xff\xfe\xfd" + bytes(range(256)))
+    with pytest.raises(DataError, match=r"chair\.json"):
+        KeypointNet(root)["chair"]
+
+
+def test_wrong_roots_are_told(root, tmp_path):
+    with pytest.raises(DataError, match="no such folder"):
+        KeypointNet(tmp_path / "gone")
+    with pytest.raises(DataError, match=r"no annotations/\*\.json"):
+        KeypointNet(root / "models")
+    with pytest.raises(DataError, match="no such folder"):
+        KeypointNet(root, shapenet_root=tmp_path / "gone")
+    with pytest.raises(InputError, match=r"did you mean 'mug'\?; known are chair, mug"):
+        KeypointNet(root)["mugg"]
+
+
+# --- real data
+
+
+@pytest.fixture(scope="module")
+def real():
+    folder = os.environ.get("CADALIGN_DATA")
+    if not folder:
+        pytest.skip("CADALIGN_DATA is not set: no real data to test on")
+    return KeypointNet(Path(folder) / "keypointnet")
+
+
+def test_real_annotations_load_quickly_and_whole(real):
+    start = time.process_time()
+    count = len(real)
+    # About 1 s; the margin is for busy machines.
+    assert time.process_time() - start < 4
+    assert count == 3234
+    assert not real.problems
+    assert len(real.subset(split="train")) + len(real.subset(split="val")) == count
+
+
+def test_real_keypoints_lie_where_their_faces_say(real):
+    paths = [path for key in real.ids() for path in real.mesh_paths(*key)]
+    assert sorted({path.suffix for path in paths}) == [".obj", ".ply"]
+    checked = 0
+    for model in real.subset(with_mesh=True):
+        for path in real.mesh_paths(*model.key):
+            rebuilt = model.keypoints.on_mesh(load_mesh(path))
+            assert np.abs(rebuilt - model.keypoints.xyz).max() < 1e-6, path
+            checked += 1
+    assert checked >= 11
+
+
+def test_real_meshes_load_quickly(real):
+    path = max((p for k in real.ids() for p in real.mesh_paths(*k)), key=lambda p: p.stat().st_size)
+    start = time.process_time()
+    mesh = load_mesh(path)
+    assert time.process_time() - start < 1.0
+    assert len(mesh.faces) > 60_000
+
+
+def test_real_textures_are_found(real):
+    key = ("chair", "88382b877be91b2a572f8e1c1caad99e")
+    path = next(path for path in real.mesh_paths(*key) if path.suffix == ".obj")
+    mesh = load_mesh(path)
+    assert all(material.texture is not None for material in mesh.materials)
+    assert mesh.corner_uv is not None

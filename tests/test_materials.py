@@ -1,0 +1,218 @@
+"""Files with every kind of material, drawn: colours end up where the file puts them."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+
+from cadalign import Camera
+from cadalign.datasets import load_mesh
+from cadalign.render import Scene, frame_object, look_at, make_renderer
+from cadalign.render.probe import probe_renderer
+
+CAMERA = Camera.from_fov(320, 240, fov_x=45)
+
+
+@pytest.fixture(params=["raycast", "open3d", "pyrender"])
+def renderer(request):
+    found = probe_renderer(request.param)
+    if not found.works:
+        pytest.skip(f"{request.param} does not work here: {found.detail}")
+    return make_renderer(request.param)
+
+
+def _moved(x, y, z, *, turn=0.0, mirror=False):
+    matrix = trimesh.transformations.rotation_matrix(np.radians(turn), [0, 1, 0])
+    if mirror:
+        matrix = matrix @ np.diag([-1.0, 1, 1, 1])
+    matrix[:3, 3] = (x, y, z)
+    return matrix
+
+
+def _plain(color):
+    return PBRMaterial(baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.8)
+
+
+def write_table_glb(path: Path) -> Path:
+    """A red table top on four blue legs of one mesh, each leg a node, two of them mirrored."""
+    top = trimesh.creation.box((2.0, 0.12, 1.2))
+    top.visual = trimesh.visual.TextureVisuals(material=_plain([230, 40, 40, 255]))
+    leg = trimesh.creation.cylinder(0.07, 1.0)
+    leg.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    leg.visual = trimesh.visual.TextureVisuals(material=_plain([40, 60, 230, 255]))
+    scene = trimesh.Scene()
+    scene.add_geometry(top, geom_name="top", transform=_moved(0, 0.56, 0))
+    for number, (x, z) in enumerate([(-0.9, -0.5), (0.9, -0.5), (-0.9, 0.5), (0.9, 0.5)]):
+        scene.add_geometry(
+            leg, geom_name="leg", node_name=f"leg{number}", transform=_moved(x, 0, z, mirror=x > 0)
+        )
+    scene.export(path)
+    return path
+
+
+def write_painted_ply(path: Path) -> Path:
+    """A ball whose vertices are red to the left, blue to the right and bright at the top."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    share = (ball.vertices + 1) / 2
+    colors = np.column_stack([1 - share[:, 0], 0.7 * share[:, 1], share[:, 0], np.ones(len(share))])
+    ball.visual = trimesh.visual.ColorVisuals(ball, vertex_colors=(255 * colors).astype(np.uint8))
+    ball.export(path)
+    return path
+
+
+def write_crate_obj(folder: Path, *, missing: bool = False) -> Path:
+    """A crate with stripes on its front, checks on its right side, and one plain green lid."""
+    stripes = np.full((32, 32, 3), (240, 220, 60), np.uint8)
+    stripes[:, ::8] = stripes[:, 1::8] = stripes[:, 2::8] = (150, 30, 30)
+    checks = np.kron(np.indices((4, 4)).sum(axis=0) % 2, np.ones((8, 8)))
+    checks = np.where(checks[:, :, None] > 0, (255, 255, 255), (20, 20, 120)).astype(np.uint8)
+    if not missing:
+        Image.fromarray(stripes).save(folder / "stripes.png")
+    Image.fromarray(checks).save(folder / "checks.png")
+    (folder / "crate.mtl").write_text(
+        "newmtl striped\nKd 1 1 1\nmap_Kd stripes.png\n"
+        "newmtl checked\nKd 1 1 1\nmap_Kd checks.png\n"
+        "newmtl lid\nKd 0.1 0.7 0.2\n"
+    )
+    path = folder / "crate.obj"
+    path.write_text(
+        "mtllib crate.mtl\n"
+        "v -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1\nv -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\n"
+        "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+        "usemtl striped\nf 1/1 2/2 3/3 4/4\nf 6/1 5/2 8/3 7/4\n"
+        "usemtl checked\nf 2/1 6/2 7/3 3/4\nf 5/1 1/2 4/3 8/4\n"
+        "usemtl lid\nf 4 3 7 8\nf 1 5 6 2\n"
+    )
+    return path
+
+
+def write_turned_stl(path: Path) -> Path:
+    """A ring of which every other face is turned inside out; STL knows no materials."""
+    ring = trimesh.creation.torus(1.0, 0.35, major_sections=64, minor_sections=32)
+    faces = np.array(ring.faces)
+    faces[::2] = faces[::2, ::-1]
+    trimesh.Trimesh(ring.vertices, faces, process=False).export(path)
+    return path
+
+
+def write_glass_glb(path: Path) -> Path:
+    """An orange ball in a bluish glass box, whose floor is a textured tile."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ball.visual = trimesh.visual.TextureVisuals(material=_plain([250, 130, 20, 255]))
+    box = trimesh.creation.box((1.6, 1.6, 1.6))
+    glass = PBRMaterial(baseColorFactor=[120, 170, 255, 70], alphaMode="BLEND")
+    box.visual = trimesh.visual.TextureVisuals(material=glass)
+    floor = trimesh.Trimesh(
+        [[-1, -0.85, 1], [1, -0.85, 1], [1, -0.85, -1], [-1, -0.85, -1]],
+        [[0, 1, 2], [0, 2, 3]],
+        process=False,
+    )
+    tiles = np.kron(np.indices((6, 6)).sum(axis=0) % 2, np.ones((8, 8)))
+    image = np.where(tiles[:, :, None] > 0, (235, 235, 235), (60, 60, 60)).astype(np.uint8)
+    floor.visual = trimesh.visual.TextureVisuals(
+        uv=np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]),
+        material=PBRMaterial(baseColorTexture=Image.fromarray(image), metallicFactor=0.0),
+    )
+    trimesh.Scene({"ball": ball, "box": box, "floor": floor}).export(path)
+    return path
+
+
+def _drawn(renderer, path, *, azimuth=30.0, elevation=20.0):
+    scene = Scene(load_mesh(path))
+    rotation = look_at(azimuth=azimuth, elevation=elevation, distance=3).rotation
+    pose = frame_object(scene.bounds, CAMERA, rotation=rotation, fill=0.9)
+    return scene, pose, renderer.render(scene, CAMERA, pose)
+
+
+def _color_at(frame, pose, point):
+    """The colour around where a model point is seen, (3,) int."""
+    column, row = np.rint(CAMERA.project(pose.apply([point]))[0]).astype(int)
+    part = frame.color[row - 1 : row + 2, column - 1 : column + 2]
+    assert (part[:, :, 3] == 255).all()
+    return part[:, :, :3].reshape(-1, 3).mean(axis=0)
+
+
+def test_nodes_of_a_glb_stand_where_their_transforms_put_them(renderer, tmp_path):
+    _, pose, frame = _drawn(renderer, write_table_glb(tmp_path / "table.glb"))
+    red = _color_at(frame, pose, (0, 0.62, 0))
+    assert red[0] > red[1:].max() + 60
+    for x in (-0.9, 0.9):
+        blue = _color_at(frame, pose, (x, 0.0, 0.57))
+        assert blue[2] > blue[:2].max() + 40
+
+
+def test_vertex_colours_of_a_ply_blend(renderer, tmp_path):
+    _, pose, frame = _drawn(renderer, write_painted_ply(tmp_path / "ball.ply"), azimuth=0)
+    left = _color_at(frame, pose, (-0.7, 0, 0.7))
+    right = _color_at(frame, pose, (0.7, 0, 0.7))
+    assert left[0] > left[2] + 60
+    assert right[2] > right[0] + 60
+
+
+def test_an_obj_with_several_textures_shows_each_on_its_faces(renderer, tmp_path):
+    _, pose, frame = _drawn(renderer, write_crate_obj(tmp_path))
+    stripe = _color_at(frame, pose, (-1 + 1.5 / 16, 0, 1))
+    assert stripe[0] > stripe[2] + 50
+    yellow = _color_at(frame, pose, (-1 + 5.5 / 16, 0, 1))
+    assert min(yellow[0], yellow[1]) > yellow[2] + 60
+    white = _color_at(frame, pose, (1, -0.75, 0.75))
+    blue = _color_at(frame, pose, (1, -0.75, 0.25))
+    assert white.min() > 110
+    assert blue[2] > blue[0] + 30
+    green = _color_at(frame, pose, (0, 1, 0))
+    assert green[1] > max(green[0], green[2]) + 60
+
+
+def test_turned_faces_of_an_stl_leave_no_patches(renderer, tmp_path):
+    scene, _, frame = _drawn(renderer, write_turned_stl(tmp_path / "ring.stl"))
+    normals = scene.mesh.faces[frame.face_id[frame.mask]]
+    assert len(normals) > 5000
+    inner = frame.mask.copy()
+    for _ in range(2):
+        inner[1:-1, 1:-1] &= inner[:-2, 1:-1] & inner[2:, 1:-1] & inner[1:-1, :-2] & inner[1:-1, 2:]
+    brightness = frame.color[:, :, 1].astype(int)
+    step = np.abs(np.diff(brightness, axis=1))[inner[:, 1:] & inner[:, :-1]]
+    assert np.percentile(step, 95) < 16
+
+
+def test_what_is_behind_glass_is_seen_through_it(renderer, tmp_path):
+    scene, pose, frame = _drawn(renderer, write_glass_glb(tmp_path / "glass.glb"))
+    assert not scene.surface.opaque
+    ball = _color_at(frame, pose, (0.1, 0.2, 0.4))
+    assert ball[0] > ball[2] + 20
+    corner = _color_at(frame, pose, (0.8, -0.7, 0.8))
+    assert corner[2] >= corner[0]
+
+
+def test_a_missing_texture_is_warned_of_by_name_and_drawn_plain(tmp_path, caplog):
+    path = write_crate_obj(tmp_path, missing=True)
+    with caplog.at_level(logging.WARNING, logger="cadalign"):
+        _, pose, frame = _drawn(make_renderer("raycast"), path)
+    assert "stripes.png" in caplog.text
+    plain = _color_at(frame, pose, (-0.3, 0, 1))
+    assert np.ptp(plain) < 12
+    assert plain.min() > 60
+
+
+def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
+    data = os.environ.get("CADALIGN_DATA")
+    if not data:
+        pytest.skip("set CADALIGN_DATA to the real data")
+    paths = sorted(Path(data, "keypointnet", "models").glob("*/*/models/model_normalized.obj"))
+    assert len(paths) == 10
+    truth = make_renderer("raycast")
+    for path in paths:
+        scene, pose, frame = _drawn(renderer, path)
+        expected = truth.render(scene, CAMERA, pose)
+        both = (frame.color[:, :, 3] == 255) & (expected.color[:, :, 3] == 255)
+        assert both.sum() > 500
+        difference = frame.color[both][:, :3].astype(int) - expected.color[both][:, :3]
+        # Lights without size and another filter of textures make some difference.
+        assert np.abs(difference).mean() < 20, path

@@ -1,0 +1,324 @@
+"""Mesh files: faces keep the order of the file, colours survive, damage is told."""
+
+from __future__ import annotations
+
+import logging
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from cadalign import Mesh
+from cadalign.datasets import check_solid, flat_axes, load_mesh
+from cadalign.errors import DataError
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a file of the given name and return its path."""
+
+    def write_file(content: str | bytes, name: str = "model.obj") -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return write_file
+
+
+# --- OBJ: geometry
+
+
+@pytest.mark.parametrize(
+    "face",
+    ["1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "1/1/1 2/2/1 3/3/1", "-4 -3 -2", "1/1 2 3//1"],
+)
+def test_obj_reads_every_form_of_corner(write, face):
+    mesh = load_mesh(write(f"{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\nf  {face}\n"))
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+
+
+def test_obj_texture_coordinates_go_with_the_corners(write):
+    text = f"{SQUARE}vt 0.1 0.2\nvt 0.3 0.4\nf 1/2 2/1 3/-1\nf 1 3 4\n"
+    uv = load_mesh(write(text)).corner_uv
+    np.testing.assert_allclose(uv[0], [[0.3, 0.4], [0.1, 0.2], [0.3, 0.4]])
+    np.testing.assert_array_equal(uv[1], 0)
+
+
+def test_obj_negative_indices_count_back_from_their_own_line(write):
+    text = (
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\nv 1 0 1\nv 0 1 1\nf -3 -2 -1\nf 1 2 -1\n"
+    )
+    assert load_mesh(write(text)).faces.tolist() == [[0, 1, 2], [3, 4, 5], [0, 1, 5]]
+
+
+def test_obj_faces_keep_file_order_across_materials(write):
+    lines = [f"v {i} {i * i} 0" for i in range(8)]
+    for i in range(6):
+        lines += [f"usemtl {'ab'[i % 2]}", f"f {i + 1} {i + 2} {i + 3}"]
+    mesh = load_mesh(write("\n".join(lines)))
+    assert mesh.faces.tolist() == [[i, i + 1, i + 2] for i in range(6)]
+    names = [mesh.materials[number].name for number in mesh.face_material]
+    assert names == ["a", "b", "a", "b", "a", "b"]
+
+
+def test_obj_polygons_keep_the_number_of_their_line(write):
+    text = f"{SQUARE}v 0 0 1\nf 1 2 3 4\nl 1 2\np 3\nf 1 2 5\nf 1 2 3 4 5\n"
+    mesh = load_mesh(write(text))
+    assert mesh.polygon.tolist() == [0, 0, 1, 2, 2, 2]
+    assert mesh.faces[:2].tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert mesh.faces[3:].tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
+    np.testing.assert_allclose(mesh.surface_points([1], [[0, 0, 1]]), [[0, 0, 1]])
+
+
+def test_obj_accepts_tabs_continued_lines_windows_ends_and_comments(write):
+    text = "# a\r\n\r\nv\t0 0\t0\r\nv 1 0 \\\r\n 0\r\nv 0 1 0 1.0\r\no x\r\ns off\r\n  f 1 2 3  "
+    mesh = load_mesh(write(text))
+    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(("color", "largest"), [("1 0.5 0", 1), ("255 127.5 0", 255)])
+def test_obj_vertex_colors(write, color, largest):
+    mesh = load_mesh(write(f"v 0 0 0 {color}\nv 1 0 0 {color}\nv 0 1 0 {color}\nf 1 2 3\n"))
+    np.testing.assert_allclose(mesh.vertex_colors, [[1, 0.5, 0, 1]] * 3)
+
+
+# --- OBJ: materials
+
+
+def test_obj_materials_and_textures(write, tmp_path):
+    write("", "images/texture0.jpg")
+    pixels = np.array([[[255, 0, 0], [0, 255, 0]]], dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "images" / "texture 0.png")
+    write(
+        "newmtl red\nKd 1 0 0\nd 0.5\nnewmtl glass\nKd 0 0 1\nTr 0.75\n"
+        "newmtl wood\nKd 0 0 0\nmap_Kd -s 1 1 1 ..\\images\\texture 0.png\n",
+        "models/model.mtl",
+    )
+    faces = "usemtl wood\nf 1 2 3\nusemtl red\nf 1 3 4\nusemtl glass\nf 1 2 4\nusemtl red\nf 2 3 4"
+    mesh = load_mesh(write(f"mtllib model.mtl\n{SQUARE}{faces}\n", "models/model.obj"))
+    assert [material.name for material in mesh.materials] == ["wood", "red", "glass"]
+    assert mesh.face_material.tolist() == [0, 1, 2, 1]
+    wood, red, glass = mesh.materials
+    assert red.color == (1, 0, 0, 0.5)
+    assert glass.color == (0, 0, 1, 0.25)
+    assert wood.color == (1, 1, 1, 1)
+    np.testing.assert_array_equal(wood.texture, pixels)
+
+
+@pytest.mark.parametrize(
+    ("library", "told"),
+    [
+        (None, "no material library"),
+        ("newmtl other\nKd 1 0 0\n", "'a' is not defined"),
+        ("newmtl a\nKd 1 0 0\nmap_Kd gone.png\n", "gone.png is missing"),
+        ("newmtl a\nKd 1 0 0\nmap_Kd bad.png\n", "bad.png cannot be read"),
+        ("\0\x01garbage\nKd\nmap_Kd x\nKd 1 1 1\n", "'a' is not defined"),
+    ],
+)
+def test_missing_materials_are_warned_of_and_become_plain(write, caplog, library, told):
+    write(b"\x89PNG cut short", "bad.png")
+    if library is not None:
+        write(library, "model.mtl")
+    with caplog.at_level(logging.WARNING, logger="cadalign"):
+        mesh = load_mesh(write(f"mtllib model.mtl\n{SQUARE}usemtl a\nf 1 2 3\n"))
+    assert told in caplog.text
+    assert mesh.materials[0].texture is None
+    assert len(mesh.materials[0].color) == 4
+
+
+# --- OBJ: damage
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (f"{SQUARE}f 1 2\n", "line 5: cannot read 'f 1 2'"),
+        (f"{SQUARE}f 1//1 2//\n", "line 5"),
+        (f"{SQUARE}f 1 2 3\nf 1 2 x\n", "line 6"),
+        (f"{SQUARE}f 1 2 3/1/1/1\n", "line 5"),
+        ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: cannot read 'v 1 0'"),
+        ("v 0 0 0\nv 1 0 0.1.2\nv 0 1 0\nf 1 2 3\n", "line 2"),
+        ("v 0 0 0\nv 1 0 zero\nv 0 1 0\nf 1 2 3\n", "line 2"),
+        ("f 1 2 3\n", "1 faces, but no vertices"),
+        (f"{SQUARE}f 1 2 5\n", "face 0 (counted from 0) names vertex 5, but there are 4"),
+        (f"{SQUARE}f 1 2 3\nf 1 2 0\n", "face 1 (counted from 0) names vertex 0"),
+        (f"{SQUARE}f 1 2 -5\n", "names vertex -5"),
+        (f"{SQUARE}vt 0 0\nf 1/1 2/2 3/1\n", "names texture coordinate 2"),
+        (f"{SQUARE}f 1/1 2/1 3/1\n", "names texture coordinate 1, but there are 0"),
+        (f"{SQUARE}l 1 2\n", "no faces; 4 vertices"),
+        ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite"),
+        (f"{SQUARE}f 1 2 3\n\0\0\0\0\n", "line 6: holds binary data"),
+        ("", "is empty"),
+    ],
+)
+def test_damaged_obj_says_file_and_line(write, text, told):
+    path = write(text)
+    with pytest.raises(DataError) as caught:
+        load_mesh(path)
+    assert str(path) in str(caught.value)
+    assert told in str(caught.value)
+
+
+def test_obj_of_assimp_cut_between_lines_is_noticed(write):
+    head = "# File produced by Open Asset Import Library (x)\n"
+    text = f"{head}{SQUARE}# Mesh 'a' with 3 faces\nf 1 2 3\nl 1 2\n"
+    with pytest.raises(DataError, match="announce 3 faces and lines, but only 2"):
+        load_mesh(write(text))
+    assert len(load_mesh(write(f"{text}f 2 3 4\n")).faces) == 2
+
+
+# --- any file
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.glb", "a.gltf", "a.stl", "a.off"])
+@pytest.mark.parametrize("content", [None, b"", bytes(range(256)) * 20, b"\n\n\n"])
+def test_missing_empty_and_garbage_files_are_data_errors(write, tmp_path, name, content):
+    path = tmp_path / name if content is None else write(content, name)
+    with pytest.raises(DataError, match=name):
+        load_mesh(path)
+
+
+def test_folder_and_unknown_format_are_data_errors(write, tmp_path):
+    (tmp_path / "folder.obj").mkdir()
+    with pytest.raises(DataError, match=r"folder\.obj"):
+        load_mesh(tmp_path / "folder.obj")
+    with pytest.raises(DataError, match=r"\.xyz is not a known mesh format"):
+        load_mesh(write("0 0 0", "points.xyz"))
+
+
+# --- PLY
+
+
+@pytest.fixture(scope="module")
+def colored_sphere():
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    colors = np.random.default_rng(0).integers(0, 256, (len(mesh.vertices), 4), dtype=np.uint8)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_ply_keeps_order_and_colors(write, colored_sphere, encoding):
+    mesh = load_mesh(write(colored_sphere.export(file_type="ply", encoding=encoding), "a.ply"))
+    np.testing.assert_array_equal(mesh.faces, colored_sphere.faces)
+    np.testing.assert_allclose(mesh.vertices, colored_sphere.vertices, atol=1e-6)
+    np.testing.assert_allclose(mesh.vertex_colors, colored_sphere.visual.vertex_colors / 255)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95])
+def test_ply_cut_short_is_noticed(write, colored_sphere, encoding, share):
+    content = colored_sphere.export(file_type="ply", encoding=encoding)
+    path = write(content[: int(share * len(content))], "a.ply")
+    with pytest.raises(DataError, match=r"a\.ply"):
+        load_mesh(path)
+
+
+def _ply(faces: list[list[int]], *, binary: bool) -> bytes:
+    points = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1]]
+    kind = "binary_little_endian" if binary else "ascii"
+    header = (
+        f"ply\nformat {kind} 1.0\nelement vertex 5\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    if binary:
+        body = b"".join(struct.pack("<3f", *point) for point in points)
+        return header + body + b"".join(struct.pack(f"<B{len(f)}i", len(f), *f) for f in faces)
+    rows = [*points, *([len(face), *face] for face in faces)]
+    return header + "\n".join(" ".join(map(str, row)) for row in rows).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    ("faces", "binary"),
+    [
+        ([[0, 1, 2, 3], [0, 1, 2, 4]], True),
+        ([[0, 1, 2, 3], [0, 1, 2, 4]], False),
+        ([[0, 1, 2, 3], [0, 1, 4], [0, 1, 2, 3, 4], [1, 2, 4]], False),
+    ],
+)
+def test_ply_polygons_keep_their_number(write, faces, binary):
+    mesh = load_mesh(write(_ply(faces, binary=binary), "a.ply"))
+    assert mesh.polygon.tolist() == [i for i, face in enumerate(faces) for _ in face[2:]]
+    for number, face in enumerate(faces):
+        first = mesh.faces[np.searchsorted(mesh.polygon, number)]
+        assert first.tolist() == face[:3]
+
+
+def test_ply_without_faces_is_a_data_error(write):
+    with pytest.raises(DataError, match="no faces"):
+        load_mesh(write(_ply([], binary=False), "a.ply"))
+
+
+# --- scenes
+
+
+def test_glb_nodes_are_placed_and_colored(write):
+    box = trimesh.creation.box(extents=(1, 1, 1))
+    red = trimesh.visual.material.PBRMaterial(name="red", baseColorFactor=[255, 0, 0, 255])
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=red)
+    scene = trimesh.Scene()
+    scene.add_geometry(box, node_name="a", transform=trimesh.transformations.scale_matrix(2))
+    moved = trimesh.transformations.translation_matrix([5, 0, 0])
+    mirrored = np.diag([-1.0, 1, 1, 1])
+    scene.add_geometry(box, node_name="b", transform=moved @ mirrored)
+    mesh = load_mesh(write(scene.export(file_type="glb"), "scene.glb"))
+    np.testing.assert_allclose(mesh.bounds, [[-1, -1, -1], [5.5, 1, 1]], atol=1e-6)
+    assert {mesh.materials[number].color for number in mesh.face_material} == {(1, 0, 0, 1)}
+    # Outward normals, of the mirrored box too: both volumes count positive.
+    assert mesh.to_trimesh().volume == pytest.approx(8 + 1)
+
+
+def test_glb_texture_is_kept(write):
+    pixels = np.zeros((2, 4, 3), dtype=np.uint8)
+    pixels[0] = (255, 128, 0)
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(pixels))
+    uv = np.array([[0, 0], [1, 0], [0, 1.0]])
+    square.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh = load_mesh(write(trimesh.Scene(square).export(file_type="glb"), "a.glb"))
+    np.testing.assert_array_equal(mesh.materials[0].texture, pixels)
+    np.testing.assert_allclose(mesh.corner_uv[0], uv, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["stl", "off"])
+def test_stl_and_off(write, colored_sphere, kind):
+    content = trimesh.Trimesh(colored_sphere.vertices, colored_sphere.faces).export(file_type=kind)
+    mesh = load_mesh(write(content, f"a.{kind}"))
+    np.testing.assert_allclose(mesh.triangles, colored_sphere.triangles, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["glb", "stl", "off"])
+def test_scenes_cut_short_are_noticed(write, colored_sphere, kind):
+    source = trimesh.Scene(colored_sphere) if kind == "glb" else colored_sphere
+    content = source.export(file_type=kind)
+    # At the end of a line, where this makes a difference.
+    end = content.index("\n", len(content) * 3 // 4) if kind == "off" else len(content) // 2
+    with pytest.raises(DataError, match=rf"a\.{kind}"):
+        load_mesh(write(content[:end], f"a.{kind}"))
+
+
+# --- thickness
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_flat_models_are_told_by_their_axis(axis):
+    box = trimesh.creation.box(extents=(1, 2, 3))
+    thin = np.array(box.vertices)
+    thin[:, axis] *= 1e-7
+    mesh = Mesh(thin, box.faces, source="bottle")
+    assert flat_axes(mesh) == ("xyz"[axis],)
+    with pytest.raises(
+        DataError, match=f"bottle: the model has zero thickness along {'xyz'[axis]}"
+    ):
+        check_solid(mesh)
+
+
+def test_thin_models_are_solid():
+    box = trimesh.creation.box(extents=(1, 1, 1e-3))
+    check_solid(Mesh(box.vertices, box.faces))

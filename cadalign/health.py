@@ -1,0 +1,80 @@
+"""What works on this machine: renderers, cores, and the cache of compiled solvers."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import cadalign
+from cadalign.render.probe import RENDERERS, Probe, probe_renderer
+from cadalign.render.remedy import remedy
+from cadalign.render.select import best_renderer
+
+
+@dataclass(frozen=True)
+class Health:
+    """What was found.
+
+    Parameters
+    ----------
+    renderers : tuple of Probe
+        Ray casting is the last.
+    best : str
+        The one that "auto" takes.
+    remedies : dict of str to str
+        For each renderer that does not work the command that would enable it.
+    cores, usable_cores : int
+        The machine's, and those that this process is allowed.
+    cache : str
+        Whether compiled solvers are kept, and where.
+    python, numpy, numba : str
+        Versions.
+    """
+
+    renderers: tuple[Probe, ...]
+    best: str
+    remedies: dict[str, str]
+    cores: int
+    usable_cores: int
+    cache: str
+    python: str
+    numpy: str
+    numba: str
+
+
+def examine() -> Health:
+    """Try every renderer in a process of its own, and look at the rest; takes some seconds."""
+    renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
+    return Health(
+        renderers=renderers,
+        best=best_renderer(),
+        remedies={found.name: command for found in renderers if (command := remedy(found))},
+        cores=os.cpu_count() or 1,
+        usable_cores=_usable_cores(),
+        cache=compiled_cache(),
+        python=platform.python_version(),
+        numpy=version("numpy"),
+        numba=version("numba"),
+    )
+
+
+def compiled_cache() -> str:
+    """Say whether Numba keeps compiled solvers on disk, and how many are there."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(chosen) if chosen else Path(cadalign.__file__).parent / "solvers" / "__pycache__"
+    count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
+    existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
+    if count:
+        return f"{count} functions kept in {folder}"
+    if os.access(existing, os.W_OK):
+        return f"none yet; they will be kept in {folder}"
+    return f"{folder} cannot be written to; set NUMBA_CACHE_DIR, or every process compiles anew"
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,54 @@
+"""Drawing: scenes, renderers, visibility, views, overlays and pictures."""
+
+from cadalign.render.frame import Frame, Geometry, Renderer
+from cadalign.render.movie import contact_sheet, write_movie
+from cadalign.render.overlay import draw_overlay
+from cadalign.render.pictures import (
+    depth_picture,
+    face_picture,
+    feature_lines,
+    keypoint_picture,
+    line_picture,
+    normal_picture,
+)
+from cadalign.render.probe import Probe, probe_renderer
+from cadalign.render.raycast import RaycastRenderer, cast_geometry
+from cadalign.render.scene import Scene
+from cadalign.render.select import make_renderer
+from cadalign.render.shading import Studio
+from cadalign.render.silhouette import silhouette_iou
+from cadalign.render.stills import Angles, draw_still, pose_in_view, turntable
+from cadalign.render.views import View, frame_object, look_at, sample_view
+from cadalign.render.visibility import visible_keypoints
+
+__all__ = [
+    "Angles",
+    "Frame",
+    "Geometry",
+    "Probe",
+    "RaycastRenderer",
+    "Renderer",
+    "Scene",
+    "Studio",
+    "View",
+    "cast_geometry",
+    "contact_sheet",
+    "depth_picture",
+    "draw_overlay",
+    "draw_still",
+    "face_picture",
+    "feature_lines",
+    "frame_object",
+    "keypoint_picture",
+    "line_picture",
+    "look_at",
+    "make_renderer",
+    "normal_picture",
+    "pose_in_view",
+    "probe_renderer",
+    "sample_view",
+    "silhouette_iou",
+    "turntable",
+    "visible_keypoints",
+    "write_movie",
+]

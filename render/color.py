@@ -1,0 +1,39 @@
+"""Linear light and sRGB, the encoding of image files (IEC 61966-2-1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+LinearArray = npt.NDArray[np.float32]
+ByteImage = npt.NDArray[np.uint8]
+
+_STEPS = 1 << 14
+
+
+def linear_from_srgb(encoded: LinearArray) -> LinearArray:
+    """Decode sRGB values (0 to 1, any shape) to linear light; float32."""
+    low = encoded / np.float32(12.92)
+    high = ((np.maximum(encoded, 0) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    return np.asarray(np.where(encoded <= 0.04045, low, high), dtype=np.float32)
+
+
+def srgb_from_linear(linear: LinearArray) -> LinearArray:
+    """Encode linear light (any shape) to sRGB values from 0 to 1; float32."""
+    value = np.clip(linear, 0, 1)
+    high = np.float32(1.055) * value ** np.float32(1 / 2.4) - np.float32(0.055)
+    return np.asarray(np.where(value <= 0.0031308, value * np.float32(12.92), high), np.float32)
+
+
+def bytes_from_linear(linear: LinearArray) -> ByteImage:
+    """Encode linear light (any shape) to sRGB bytes."""
+    # A table over the square root, which spreads the dark values about as sRGB does.
+    grid = (np.arange(_STEPS + 1, dtype=np.float32) / np.float32(_STEPS)) ** 2
+    table = (srgb_from_linear(grid) * 255 + np.float32(0.5)).astype(np.uint8)
+    index = (np.sqrt(np.clip(linear, 0, 1)) * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)
+    return np.asarray(table[index])
+
+
+def linear_from_bytes(image: ByteImage) -> LinearArray:
+    """Decode sRGB bytes (any shape) to linear light; float32."""
+    return np.asarray(linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))[image])

@@ -1,0 +1,148 @@
+"""A mesh prepared once for drawing: ray hierarchy, normals and surface colours."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.mesh import Mesh
+from cadalign.render.caster import RayCaster
+from cadalign.render.coincident import coincident_faces
+from cadalign.render.normals import corner_normals
+from cadalign.render.surface import Surface
+from cadalign.validation import FloatArray, IntArray
+
+
+class Scene:
+    """A mesh and everything that is derived from it for drawing, each made once, when first needed.
+
+    Poses and stretches need no preparation: rays are cast in the model's own frame, where a
+    camera ray through the normalised coordinates (u, v) is the line
+
+        x = -L^-1 t + depth * L^-1 (u, v, 1),    L = rotation @ diag(scale).
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh in model coordinates.
+    crease_angle : float
+        Neighbouring faces at a smaller angle than this [degrees] look like one smooth surface.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign import Mesh
+    >>> Scene(Mesh([[0, 0, 0], [3, 0, 0], [0, 4, 0]], [[0, 1, 2]])).diagonal
+    5.0
+    """
+
+    def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
+        self.mesh = mesh
+        self.crease_angle = float(crease_angle)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # The ray hierarchy cannot be pickled; worker processes build their own.
+        return _rebuild, (self.mesh, self.crease_angle)
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest model coordinates, (2, 3) float."""
+        return self.mesh.bounds
+
+    @property
+    def diagonal(self) -> float:
+        """The length of the bounding box's diagonal [model units]."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    @cached_property
+    def caster(self) -> RayCaster:
+        """The ray hierarchy."""
+        return RayCaster(self.mesh.vertices, self.mesh.faces)
+
+    @cached_property
+    def open3d_caster(self) -> RayCaster:
+        """The same built by Open3D, which must be importable."""
+        from cadalign.render.open3d_engine import Open3DEngine
+
+        return RayCaster(self.mesh.vertices, self.mesh.faces, engine=Open3DEngine)
+
+    @cached_property
+    def gl_meshes(self) -> tuple[Any, Any]:
+        """The front and back sides for OpenGL, both a `pyrender.Mesh`."""
+        from cadalign.render.gl_mesh import gl_meshes
+
+        return gl_meshes(self)
+
+    @cached_property
+    def used_vertices(self) -> FloatArray:
+        """The vertices that faces use, (n, 3) float."""
+        return np.asarray(self.mesh.vertices[np.unique(self.mesh.faces)])
+
+    @cached_property
+    def triangles(self) -> FloatArray:
+        """The corners of all triangles, (m, 3, 3) float."""
+        return self.mesh.triangles
+
+    @cached_property
+    def face_normals(self) -> FloatArray:
+        """Unit normals of the triangles, (m, 3) float; zero for one without area."""
+        corners = self.triangles
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray(normals / np.where(length > 0, length, 1.0))
+
+    @cached_property
+    def corner_normals(self) -> FloatArray:
+        """Smooth normals at the triangles' corners, (m, 3, 3) float, on their face's side."""
+        return corner_normals(
+            self.mesh.vertices,
+            self.mesh.faces,
+            self.face_normals,
+            crease_angle=self.crease_angle,
+        )
+
+    @cached_property
+    def single_corner_normals(self) -> npt.NDArray[np.float32]:
+        """`corner_normals` in single precision, for shading."""
+        return self.corner_normals.astype(np.float32)
+
+    @cached_property
+    def coincident_faces(self) -> tuple[IntArray, IntArray]:
+        """Which triangle to show of those in one place; see `coincident_faces`."""
+        return coincident_faces(self.mesh.vertices, self.mesh.faces)
+
+    @cached_property
+    def is_smooth(self) -> npt.NDArray[np.bool_]:
+        """Which triangles have corner normals that differ from their own, (m,) bool."""
+        difference = self.corner_normals - self.face_normals[:, None]
+        return np.asarray((np.abs(difference) > 1e-6).any(axis=(1, 2)))
+
+    @cached_property
+    def barycentric_gradients(self) -> FloatArray:
+        """How corners 1 and 2 gain weight along the triangle, (m, 2, 3) float.
+
+        The weight of corner i at x is ``gradient[i - 1] @ (x - corner 0)``.
+        """
+        corners = self.triangles
+        edges = corners[:, 1:] - corners[:, :1]
+        gram = edges @ edges.transpose(0, 2, 1)
+        a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+        determinant = a * c - b * b
+        # A triangle without area has no such gradients: its first corner stands for all of it.
+        solid = determinant > 1e-18 * a * c
+        inverse = np.divide(1.0, determinant, out=np.zeros_like(a), where=solid)
+        first = c[:, None] * edges[:, 0] - b[:, None] * edges[:, 1]
+        second = a[:, None] * edges[:, 1] - b[:, None] * edges[:, 0]
+        return np.asarray(np.stack([first, second], axis=1) * inverse[:, None, None])
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The colours of the mesh."""
+        return Surface(self.mesh)
+
+
+def _rebuild(mesh: Mesh, crease_angle: float) -> Scene:
+    return Scene(mesh, crease_angle=crease_angle)

@@ -1,0 +1,1 @@
+"""Evaluation: instances with a known answer, their errors, and tables of these."""

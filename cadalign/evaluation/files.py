@@ -1,0 +1,60 @@
+"""Files of a run: written whole or not at all, and errors that say what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cadalign.errors import DataError
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file such that, killed at any moment, it is there whole or as it was.
+
+    Parameters
+    ----------
+    path : Path
+    write : callable
+        Writes the file that it is given the name of, in the same folder.
+
+    Raises
+    ------
+    DataError
+        If that is not possible.
+    """
+    # The true ending stays last: some writers go by it.
+    unfinished = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
+    with writing(path):
+        try:
+            write(unfinished)
+            os.replace(unfinished, path)
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all; see `write_whole`."""
+    write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file whole or not at all; see `write_whole`."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn errors of the file system into ours."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"cannot be written ({error.strerror or error})",
+            where=str(path),
+            fix="make room or choose another folder; started again, the same run goes on",
+        ) from None

@@ -1,0 +1,147 @@
+"""What became of one instance under one method: its errors, or why it failed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from cadalign.alignment import Alignment
+from cadalign.errors import InputError
+from cadalign.evaluation.symmetry import SymmetryGroup
+from cadalign.metrics import (
+    alignment_box_iou,
+    rotation_error,
+    scale_error,
+    translation_error,
+)
+from cadalign.validation import FloatArray
+
+OK = "ok"
+FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One row of a result table.
+
+    Parameters
+    ----------
+    category, model_id : str
+    view : int
+        Which view of the model.
+    method : str
+    status : str
+        ``ok`` or ``failed``.
+    reason : str
+        Why it failed; empty otherwise.
+    visibility : str
+        How it was found out which keypoints are seen: ``rays`` or ``hull``; empty if it failed
+        before.
+    keypoints : int
+        How many keypoints the method was given.
+    rotation_error_deg : float
+        [degrees]
+    translation_error : float
+        [model units]
+    scale_y_error, scale_z_error : float
+        Relative errors, fractions.
+    box_iou : float
+        Of the stretched model's true and predicted box; None for a model without volume.
+    rms_px : float
+        Of the residuals [px].
+    symmetry : str
+        The model's: ``none``, ``circle``, or how many rotations map it onto itself.
+    sym_rotation_error_deg, sym_translation_error, sym_box_iou : float
+        The same errors from the nearest truth that looks the same; see
+        `cadalign.evaluation.symmetry`. Errors of the scale do not depend on it.
+    seconds : float
+        How long it took. Not part of a result table, since no two runs agree on it.
+
+    The numbers of a failed instance are None.
+    """
+
+    category: str
+    model_id: str
+    view: int
+    method: str
+    status: str
+    reason: str
+    visibility: str
+    keypoints: int | None
+    rotation_error_deg: float | None
+    translation_error: float | None
+    scale_y_error: float | None
+    scale_z_error: float | None
+    box_iou: float | None
+    rms_px: float | None
+    symmetry: str
+    sym_rotation_error_deg: float | None
+    sym_translation_error: float | None
+    sym_box_iou: float | None
+    seconds: float
+
+    @classmethod
+    def of_alignment(
+        cls,
+        est: Alignment,
+        *,
+        gt: Alignment,
+        bounds: FloatArray,
+        symmetry: SymmetryGroup,
+        rms_px: float,
+        **labels: Any,
+    ) -> Outcome:
+        """The errors of an estimate; ``labels`` are the fields that name and time the row."""
+        _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
+        errors = _pose_errors(est, gt, bounds)
+        truth = symmetry.nearest_truth(est=est, gt=gt)
+        sym_errors = errors if truth is gt else _pose_errors(est, truth, bounds)
+        return cls(
+            status=OK,
+            reason="",
+            rotation_error_deg=errors[0],
+            translation_error=errors[1],
+            scale_y_error=scale_y,
+            scale_z_error=scale_z,
+            box_iou=errors[2],
+            rms_px=rms_px,
+            symmetry=str(symmetry),
+            sym_rotation_error_deg=sym_errors[0],
+            sym_translation_error=sym_errors[1],
+            sym_box_iou=sym_errors[2],
+            **labels,
+        )
+
+    @classmethod
+    def of_failure(cls, reason: str, **labels: Any) -> Outcome:
+        """A failed instance; ``labels`` are the fields that are known of it."""
+        blank = {field.name: _BLANK.get(field.name) for field in fields(cls)}
+        return cls(**{**blank, "status": FAILED, "reason": reason, **labels})
+
+    @classmethod
+    def columns(cls) -> list[str]:
+        """The names of a result table's columns, in order: all but the time."""
+        return [field.name for field in fields(cls) if field.name != "seconds"]
+
+    def row(self) -> dict[str, Any]:
+        """The fields as a table row; None is an empty cell."""
+        return {name: getattr(self, name) for name in self.columns()}
+
+    def timing(self) -> dict[str, Any]:
+        """What names the row, and its time."""
+        return {name: getattr(self, name) for name in (*_KEY, "seconds")}
+
+
+_KEY = ("category", "model_id", "view", "method")
+_BLANK: dict[str, Any] = {"visibility": "", "symmetry": "", "seconds": 0.0, "view": 0}
+
+
+def _pose_errors(
+    est: Alignment, gt: Alignment, bounds: FloatArray
+) -> tuple[float, float, float | None]:
+    """Rotation, translation, box IoU."""
+    try:
+        iou = alignment_box_iou(est=est, gt=gt, bounds=bounds)
+    except InputError:  # a box without volume has none
+        iou = None
+    return rotation_error(est=est, gt=gt), translation_error(est=est, gt=gt), iou

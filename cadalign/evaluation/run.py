@@ -1,0 +1,384 @@
+"""Runs: an experiment over many tasks in a folder, that can be killed and started again.
+
+A run's folder::
+
+    run.json          configuration and versions; the same command makes the same file
+    results.parquet   one row per task and method; the same bytes however the run went
+    timings.parquet   seconds of each row: differs from run to run
+    progress.json     how far it is, since when, on which host: differs, too
+    parts/            tables of finished chunks while the run is not finished
+    summary.csv, figures/, overlays/      whatever the experiment makes of its results
+
+A finished chunk is a file in ``parts``, which appears whole or not at all. Started again, a run
+does the chunks that have none. Chunks are the same whatever the number of workers, and their rows
+follow from the run's seed and the tasks' names, so nothing in ``results.parquet`` tells how often
+the run was interrupted or who did the work.
+
+To evaluate something else, write an `Experiment` (`cadalign.evaluation.work`) and a sequence of
+tasks, and call `execute`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cadalign import __version__
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.files import write_json, writing
+from cadalign.evaluation.parallel import Chunk, InProcess, LocalProcesses, Workers
+from cadalign.evaluation.tables import read_table, write_rows, write_tables
+from cadalign.evaluation.work import Experiment
+
+T = TypeVar("T")
+
+_FORMAT = 1
+_PROGRESS_EVERY = 1.0  # seconds
+_FIX = "give another folder (--out), or remove this one"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        """``run.json``"""
+        return self.path / "run.json"
+
+    @property
+    def results(self) -> Path:
+        """``results.parquet``; there once the run is finished."""
+        return self.path / "results.parquet"
+
+    @property
+    def timings(self) -> Path:
+        """``timings.parquet``"""
+        return self.path / "timings.parquet"
+
+    @property
+    def progress(self) -> Path:
+        """``progress.json``"""
+        return self.path / "progress.json"
+
+    @property
+    def summary(self) -> Path:
+        """``summary.csv``"""
+        return self.path / "summary.csv"
+
+    @property
+    def figures(self) -> Path:
+        """``figures``"""
+        return self.path / "figures"
+
+    @property
+    def overlays(self) -> Path:
+        """``overlays``"""
+        return self.path / "overlays"
+
+    @property
+    def parts(self) -> Path:
+        """``parts``"""
+        return self.path / "parts"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all results are there."""
+        return self.results.is_file()
+
+    def part(self, index: int) -> Path:
+        """The results of a chunk."""
+        return self.parts / f"{index:07d}.parquet"
+
+    def part_timings(self, index: int) -> Path:
+        """The timings of a chunk."""
+        return self.parts / f"{index:07d}.timings.parquet"
+
+    def make(self) -> None:
+        """Make the folder.
+
+        Raises
+        ------
+        DataError
+            If that is not possible.
+        """
+        with writing(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes out; a killed process holds no lock.
+
+        Raises
+        ------
+        DataError
+            If one is at work here.
+        """
+        with writing(self.path), (self.path / ".lock").open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise DataError(
+                    "another process is working on this run",
+                    where=str(self.path),
+                    fix="wait for it, or give another folder (--out)",
+                ) from None
+            yield
+
+    def read_config(self) -> dict[str, Any] | None:
+        """What ``run.json`` holds; None where there is none.
+
+        Raises
+        ------
+        DataError
+            If it cannot be read.
+        """
+        try:
+            found = json.loads(self.config_file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"cannot be read ({error})", where=str(self.config_file), fix=_FIX
+            ) from None
+        if not isinstance(found, dict):
+            raise DataError("not the file of a run", where=str(self.config_file), fix=_FIX)
+        return found
+
+    def claim(self, config: dict[str, Any]) -> None:
+        """Write ``run.json``, or see that the one that is there says the same.
+
+        Raises
+        ------
+        DataError
+            If it says something else, or the folder holds something else.
+        """
+        wanted = json.loads(json.dumps({**config, **_versions()}))
+        found = self.read_config()
+        if found is None:
+            if self.parts.exists() or self.results.exists():
+                raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
+            write_json(self.config_file, wanted)
+            return
+        differences = _differences(found, wanted)
+        if differences:
+            raise DataError(
+                "the folder holds a run with another configuration: " + "; ".join(differences),
+                where=str(self.path),
+                fix=_FIX,
+            )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is.
+
+    Parameters
+    ----------
+    done, total : int
+        Tasks.
+    """
+
+    done: int
+    total: int
+
+
+def execute(
+    experiment: Experiment[T],
+    tasks: Sequence[T],
+    folder: RunFolder,
+    *,
+    config: dict[str, Any],
+    chunk_size: int,
+    workers: Workers | None = None,
+    on_progress: Callable[[Progress], object] = lambda progress: None,
+) -> None:
+    """Do a run, or what is left of it.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    tasks : sequence
+        In the order of the result table. Sliced, and only as far as chunks are handed out.
+    folder : RunFolder
+    config : dict
+        All that the results depend on, JSON; the run can only go on with the same.
+    chunk_size : int
+        How many tasks a worker gets at a time.
+    workers : Workers, optional
+        By default a process for each core.
+    on_progress : callable
+        Told of every chunk.
+
+    Raises
+    ------
+    DataError
+        If the folder holds another run, another process works on it, or it cannot be written.
+    CadalignError
+        If workers cannot work.
+    """
+    folder.make()
+    with folder.locked():
+        folder.claim({**config, "tasks": len(tasks), "chunk_size": chunk_size})
+        _sweep(folder.path)
+        if not folder.is_finished:
+            _do_chunks(
+                experiment, tasks, folder, chunk_size, workers or LocalProcesses(), on_progress
+            )
+            _assemble(experiment, folder, -(-len(tasks) // chunk_size))
+        on_progress(Progress(len(tasks), len(tasks)))
+        shutil.rmtree(folder.parts, ignore_errors=True)
+
+
+def workers_of(count: int, *, dask: str | None = None) -> Workers:
+    """The workers that the command line's options name.
+
+    Parameters
+    ----------
+    count : int
+        Processes; -1 for one for each core, 0 for none: all in this process.
+    dask : str, optional
+        The address of a Dask scheduler, whose workers are used instead.
+
+    Raises
+    ------
+    InputError
+        If the number is none.
+    """
+    if dask is not None:
+        from cadalign.evaluation.cluster import DaskWorkers
+
+        return DaskWorkers(dask)
+    if count < -1:
+        raise InputError(
+            f"{count} is not a number of processes",
+            where="workers",
+            fix="give 1 or more, -1 for one for each core, 0 for none",
+        )
+    return LocalProcesses(count) if count else InProcess()
+
+
+def _do_chunks(
+    experiment: Experiment[T],
+    tasks: Sequence[T],
+    folder: RunFolder,
+    chunk_size: int,
+    workers: Workers,
+    on_progress: Callable[[Progress], object],
+) -> None:
+    """Do the chunks that are not done."""
+    with writing(folder.parts):
+        folder.parts.mkdir(exist_ok=True)
+        _sweep(folder.parts)
+    starts = range(0, len(tasks), chunk_size)
+    missing = [index for index in range(len(starts)) if not folder.part(index).is_file()]
+    done = len(tasks) - sum(min(chunk_size, len(tasks) - starts[index]) for index in missing)
+    diary = _Diary(folder, len(tasks), done)
+    on_progress(Progress(done, len(tasks)))
+    chunks = (Chunk(index, tasks[starts[index] : starts[index] + chunk_size]) for index in missing)
+    if not missing:
+        return
+    for chunk, result in workers.evaluate(experiment, chunks):
+        # The results last: they say that the chunk is done.
+        write_rows(folder.part_timings(chunk.index), experiment.timing_columns, result.timings)
+        write_rows(folder.part(chunk.index), experiment.columns, result.rows)
+        done += len(chunk.tasks)
+        diary.note(done)
+        on_progress(Progress(done, len(tasks)))
+    diary.note(done, last=True)
+
+
+def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:
+    """Make one table of the chunks' tables."""
+    write_tables(
+        folder.timings,
+        experiment.timing_columns,
+        (read_table(folder.part_timings(index)) for index in range(chunks)),
+    )
+    # The results last: they say that the run is finished.
+    write_tables(
+        folder.results,
+        experiment.columns,
+        (read_table(folder.part(index)) for index in range(chunks)),
+    )
+
+
+class _Diary:
+    """Keeps ``progress.json``."""
+
+    def __init__(self, folder: RunFolder, total: int, done: int) -> None:
+        self._file = folder.progress
+        self._total = total
+        self._done_before = done
+        self._start = time.time()
+        self._written = 0.0
+
+    def note(self, done: int, *, last: bool = False) -> None:
+        """Write how far the run is, if it was not written just now."""
+        now = time.time()
+        if not last and now - self._written < _PROGRESS_EVERY:
+            return
+        self._written = now
+        write_json(
+            self._file,
+            {
+                "tasks_done": done,
+                "tasks": self._total,
+                "tasks_done_before": self._done_before,
+                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._start)),
+                "seconds": round(now - self._start, 3),
+                "host": platform.node(),
+                "process": os.getpid(),
+            },
+        )
+
+
+def _versions() -> dict[str, Any]:
+    """What results depend on besides the configuration, to their last bits."""
+    return {
+        "format": _FORMAT,
+        "versions": {
+            "cadalign": __version__,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            **{name: version(name) for name in ("numpy", "scipy", "numba", "pyarrow")},
+        },
+    }
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
+    """Where two configurations differ, in words."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return [
+            difference
+            for key in sorted({*found, *wanted})
+            for difference in _differences(
+                found.get(key), wanted.get(key), f"{name}.{key}" if name else key
+            )
+        ]
+    if found == wanted:
+        return []
+    return [f"{name} is {json.dumps(found)} there and {json.dumps(wanted)} now"]
+
+
+def _sweep(path: Path) -> None:
+    """Remove what a killed process left half written."""
+    for unfinished in path.glob(".unfinished-*"):
+        unfinished.unlink(missing_ok=True)

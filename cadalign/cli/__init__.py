@@ -1,0 +1,56 @@
+"""The command line: `cadalign <command>`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from cadalign.cli.demo import Demo
+from cadalign.cli.doctor import Doctor
+from cadalign.cli.evaluate import Evaluate
+from cadalign.cli.fit import Fit
+from cadalign.cli.render import Render
+from cadalign.cli.simulate import Simulate
+from cadalign.errors import CadalignError
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Returns
+    -------
+    int
+        0 on success, 1 if the input or the data were refused; a wrong command line exits with 2.
+        Runs (evaluate, simulate) exit with 3 if they are finished but some of their rows failed.
+    """
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    command = tyro.cli(
+        Command,
+        prog="cadalign",
+        description="Align CAD models to photos from keypoints.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+    try:
+        return command.run()
+    except CadalignError as error:
+        sys.stderr.write(f"cadalign: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("cadalign: interrupted; a run goes on if it is started again\n")
+        return 1
+    except BrokenPipeError:  # the reader of our output has seen enough
+        return 0

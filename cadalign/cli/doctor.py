@@ -1,0 +1,63 @@
+"""`cadalign doctor`: what works on this machine, and how to enable what does not."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+from cadalign.cli.output import new_console
+
+if TYPE_CHECKING:
+    from cadalign.health import Health
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say which renderers work here, how fast, and what would enable the others.
+
+    Also shows the processor cores and whether compiled solvers are kept on disk.
+    """
+
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> int:
+        """Run the checks; returns the exit code, 0 if ray casting works."""
+        from cadalign.health import examine
+
+        with new_console().status("trying the renderers, each in a process of its own ..."):
+            health = examine()
+        if self.json:
+            sys.stdout.write(json.dumps(asdict(health), indent=2) + "\n")
+        else:
+            _print(health)
+        return 0 if health.renderers[-1].works else 1
+
+
+def _print(health: Health) -> None:
+    from rich.table import Table
+
+    console = new_console(stderr=False)
+    table = Table(title="Renderers", caption="ms: a frame of 640 x 480 px, 20,480 triangles")
+    table.add_column("renderer")
+    table.add_column("works")
+    table.add_column("ms", justify="right")
+    table.add_column("versions")
+    table.add_column("drawn by / what is wrong")
+    for renderer in health.renderers:
+        table.add_row(
+            renderer.name,
+            "yes" if renderer.works else "no",
+            "" if renderer.milliseconds is None else f"{renderer.milliseconds:.0f}",
+            renderer.versions,
+            renderer.detail,
+        )
+    console.print(table)
+    console.print(f"--renderer auto takes: {health.best}", markup=False)
+    for name, command in health.remedies.items():
+        console.print(f"To enable {name}: {command}", markup=False)
+    console.print(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
+    console.print(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
+    console.print(f"Compiled solvers: {health.cache}", markup=False)

@@ -1,0 +1,78 @@
+"""`cadalign render`: pictures of one model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from cadalign.cli.output import make_folder, new_console, progress_over
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw a model: a still, a contact sheet of several views, or a turntable.
+
+    One view gives a still, several give a contact sheet, and an --out that ends in .mp4 gives a
+    turntable.
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    out: Path = Path("render.png")
+    """File to write: .png or .mp4."""
+    view: tuple[str, ...] = ("iso",)
+    """Where to look from: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
+    degrees (write --view=-30,20 if it begins with a minus), all, or a camera file (Open3D's, or
+    NeRF's transforms.json)."""
+    size: str = "640x480"
+    """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
+    style: Literal["color", "depth", "normals", "faces", "lines"] = "color"
+    """What to show."""
+    background: str = "grey"
+    """grey, white, black, #rrggbb, or transparent (PNG stills)."""
+    keypoints: Path | None = None
+    """JSON file with keypoints to draw: a list of [x, y, z], or KeypointNet's annotations."""
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Stretch along the model's axes."""
+    fov: float = 35.0
+    """Horizontal field of view in degrees."""
+    samples: int = 16
+    """Rays per pixel at edges; 1 turns antialiasing off."""
+    renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
+    """What draws the colour."""
+    seconds: float = 4.0
+    """Length of a turntable."""
+    fps: int = 30
+    """Its frames per second."""
+
+    def run(self) -> int:
+        """Draw and write; returns the exit code."""
+        from cadalign.render_job import RenderJob, draw_movie, draw_picture
+
+        console = new_console()
+        job = RenderJob.prepare(
+            model=self.model,
+            out=self.out,
+            views=self.view,
+            size=self.size,
+            style=self.style,
+            background=self.background,
+            keypoints=self.keypoints,
+            scale=self.scale,
+            fov=self.fov,
+            samples=self.samples,
+            renderer=self.renderer,
+        )
+        make_folder(self.out.absolute().parent)
+        if job.is_movie:
+            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
+            job.write_movie(
+                progress_over(frames, total=count, label="drawing", console=console), fps=self.fps
+            )
+        else:
+            job.write_picture(draw_picture(job))
+        console.print(f"Written: {self.out} (drawn by {job.renderer.name})", markup=False)
+        return 0

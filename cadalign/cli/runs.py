@@ -1,0 +1,97 @@
+"""What the commands share that do runs: exit codes, progress with a rate, the end's summary."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from cadalign.cli.output import new_console
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from cadalign.evaluation.run import Progress as RunProgress
+
+SUCCESS: Final = 0
+NOTHING_WORKED: Final = 1
+"""Also what a refused input gives."""
+SOME_FAILED: Final = 3
+"""The run is finished and its tables are written, but some rows say ``failed``."""
+RUN_EXIT_CODES = (
+    "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
+    "all rows failed, 2 a wrong command line."
+)
+
+
+class _Rate(ProgressColumn):
+    """Tasks a second, since the run was started this time."""
+
+    def render(self, task: Task) -> Text:
+        rate = task.fields.get("rate", 0.0)
+        return Text(f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s")
+
+
+@contextmanager
+def run_progress(label: str, *, quiet: bool = False) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a progress bar with rate and time left; gives what a run is to tell its progress to."""
+    import time
+
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=new_console(),
+        transient=True,
+        disable=quiet,
+    ) as progress:
+        bar = progress.add_task(label, total=None)
+        first: list[tuple[float, int]] = []
+
+        def show(state: RunProgress) -> None:
+            now = time.monotonic()
+            if not first:
+                first.append((now, state.done))
+            start, done_before = first[0]
+            rate = (state.done - done_before) / max(now - start, 1e-9)
+            progress.update(bar, total=state.total, completed=state.done, rate=rate)
+
+        yield show
+
+
+def exit_code(rows: int, failed: int) -> int:
+    """The exit code of a finished run."""
+    if failed == rows:
+        return NOTHING_WORKED
+    return SOME_FAILED if failed else SUCCESS
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on standard output; NaN becomes null."""
+    sys.stdout.write(json.dumps(_plain(value), indent=2) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and value != value else value

@@ -1,0 +1,168 @@
+"""Measure the robust search on real correspondences: success, and time over PoseLib's and OpenCV's.
+
+Scales are drawn anew for every image and draw, and the given share of the image points is replaced
+by uniform ones. PoseLib and OpenCV get the true scales: they solve the easier problem without
+stretch. Prints a table and writes a JSON file.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import poselib
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import cadalign
+from cadalign import Alignment, RansacOptions, metrics
+from cadalign.datasets import Bundler, Colmap, Correspondences
+
+MAX_REPROJ_ERROR = 4.0
+SUCCESS_PROB = 0.9999
+OPENCV_DRAWS = 2  # it takes the better part of a second
+
+
+@dataclass
+class Arguments:
+    """Measure the robust search on real correspondences."""
+
+    colmap: Path
+    """Folder of a COLMAP model."""
+    bundler: Path
+    """Folder of a Bundler model."""
+    out: Path = Path("bench/ransac.json")
+    """JSON file to write."""
+    draws: int = 20
+    """How often scales and outliers are drawn for each image."""
+    outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
+    """Shares of wrong image points."""
+
+
+def main(arguments: Arguments) -> None:
+    """Run all measurements."""
+    console = Console(width=110)
+    table = Table(title="Robust search: success (R < 0.5 deg, scales within 1 %), median times")
+    for column in ("model", "outliers", "success", "ms", "over PoseLib", "over cv2 RANSAC EPNP"):
+        table.add_column(column, justify="right")
+    rows = []
+    for name, images in (
+        ("COLMAP", list(Colmap(arguments.colmap))),
+        ("Bundler", list(Bundler(arguments.bundler))),
+    ):
+        for share in arguments.outliers:
+            row = {"model": name, **_measure(images, share, arguments.draws)}
+            rows.append(row)
+            table.add_row(
+                name,
+                f"{share:.0%}",
+                f"{100 * row['success']:.1f} %",
+                f"{1e3 * row['seconds']:.2f}",
+                f"{row['over_poselib']:.2f}",
+                f"{row['over_opencv']:.3f}",
+            )
+    console.print(table)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+
+
+def _measure(images: list[Correspondences], share: float, draws: int) -> dict[str, float]:
+    rng = np.random.default_rng(1)
+    max_iterations = 200_000 if share > 0.85 else 10_000
+    succeeded, ours, poselibs, opencvs = [], [], [], []
+    for draw in range(draws):
+        for image in images:
+            scale = np.array([1.0, *rng.uniform(0.5, 2.0, 2)])
+            pose = image.cam_from_world
+            gt = Alignment(pose.rotation, pose.translation, scale)
+            points_2d = image.points_2d.copy()
+            wrong = rng.choice(len(points_2d), round(share * len(points_2d)), replace=False)
+            size = [image.camera.width - 1, image.camera.height - 1]
+            points_2d[wrong] = rng.uniform([0, 0], size, (len(wrong), 2))
+            options = RansacOptions(
+                max_reproj_error=MAX_REPROJ_ERROR,
+                max_iterations=max_iterations,
+                success_prob=SUCCESS_PROB,
+                seed=draw,
+            )
+            model = image.points_3d / scale
+            start = time.perf_counter()
+            try:
+                est = cadalign.fit(model, points_2d, image.camera, ransac=options).alignment
+                succeeded.append(
+                    metrics.rotation_error(est=est, gt=gt) < 0.5
+                    and metrics.scale_error(est=est, gt=gt).max() < 0.01
+                )
+            except cadalign.CadalignError:
+                succeeded.append(False)
+            ours.append(time.perf_counter() - start)
+            poselibs.append(_seconds(_poselib, image, points_2d, max_iterations))
+            if draw < OPENCV_DRAWS:
+                opencvs.append(_seconds(_opencv, image, points_2d, 10_000))
+    seconds = float(np.median(ours))
+    return {
+        "outliers": share,
+        "success": float(np.mean(succeeded)),
+        "seconds": seconds,
+        "over_poselib": seconds / float(np.median(poselibs)),
+        "over_opencv": seconds / float(np.median(opencvs)),
+    }
+
+
+def _seconds(
+    run: Callable[[Correspondences, np.ndarray, int], object],
+    image: Correspondences,
+    points_2d: np.ndarray,
+    iterations: int,
+) -> float:
+    start = time.perf_counter()
+    run(image, points_2d, iterations)
+    return time.perf_counter() - start
+
+
+def _undistorted(image: Correspondences, points_2d: np.ndarray) -> np.ndarray:
+    camera = image.camera
+    return camera.normalize(points_2d) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def _poselib(image: Correspondences, points_2d: np.ndarray, iterations: int) -> object:
+    camera = image.camera
+    return poselib.estimate_absolute_pose(
+        _undistorted(image, points_2d),
+        image.points_3d,
+        {
+            "model": "PINHOLE",
+            "width": camera.width,
+            "height": camera.height,
+            "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+        },
+        {
+            "max_reproj_error": MAX_REPROJ_ERROR,
+            "max_iterations": iterations,
+            "success_prob": SUCCESS_PROB,
+        },
+        {},
+    )
+
+
+def _opencv(image: Correspondences, points_2d: np.ndarray, iterations: int) -> object:
+    return cv2.solvePnPRansac(
+        image.points_3d,
+        _undistorted(image, points_2d),
+        image.camera.matrix,
+        None,
+        flags=cv2.SOLVEPNP_EPNP,
+        iterationsCount=iterations,
+        reprojectionError=MAX_REPROJ_ERROR,
+        confidence=SUCCESS_PROB,
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

@@ -1,0 +1,331 @@
+"""Measure the solvers: accuracy against the Cramer-Rao bound, speed against OpenCV.
+
+Everything runs in one process on the same problems; speeds are ratios of medians, since machines
+differ and are noisy. Prints tables and writes a JSON file.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import cadalign
+from cadalign import metrics
+from cadalign.errors import CadalignError
+from cadalign.evaluation.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.limits import cramer_rao_bound, sample_limit
+from cadalign.simulation import Problem, random_rotation, simulate_problem
+from cadalign.solvers.linear import aepnp
+from cadalign.solvers.minimal import ap4p
+from cadalign.solvers.objective import LINEAR, UNKNOWNS, Objective, evaluate_cost
+from cadalign.solvers.refine import refine
+from cadalign.whitening import whitening_of
+
+ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))
+SPEED_SIZES = (10, 100, 1024, 4096)
+METHODS = ("optimal", "aepnp", "aepnp-paper")
+ERRORS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
+LIMIT_DRAWS = 20
+CALLS_PER_TURN = 10
+
+
+@dataclass
+class Arguments:
+    """Measure the solvers' accuracy and speed."""
+
+    out: Path = Path("bench/solvers.json")
+    """JSON file to write."""
+    problems: int = 2000
+    """Random problems per row."""
+    repetitions: int = 300
+    """Timed calls per figure; the median counts."""
+    keypointnet: Path | None = None
+    """Folder with KeypointNet's annotations, for rows on real keypoints."""
+    seed: int = 0
+    """Seed of the problems."""
+
+
+def main(arguments: Arguments) -> None:
+    """Run all measurements."""
+    console = Console(width=130)
+    results = {
+        "accuracy": list(_accuracy(arguments, console)),
+        "minimal": _minimal(arguments, console),
+        "speed": list(_speed(arguments, console)),
+    }
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    console.print(f"written to {arguments.out}")
+
+
+def _accuracy(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
+    """Rows of errors over those of the limit."""
+    table = Table(title="Errors over the Cramer-Rao limit's: median (90th percentile)")
+    for column in ("problems", "limit R deg", "method", "R", "t", "s_y", "s_z", "failed", "missed"):
+        table.add_column(column, justify="right")
+    sources: list[tuple[str, float, Callable[[np.random.Generator], Problem]]] = [
+        (
+            f"{points} points, {noise:g} px",
+            noise,
+            lambda rng, n=points, s=noise: simulate_problem(rng, points=n, noise_px=s),
+        )
+        for points, noise in ACCURACY_ROWS
+    ]
+    if arguments.keypointnet is not None:
+        sources += _keypointnet_sources(arguments.keypointnet)
+    for name, noise, draw in sources:
+        rng = np.random.default_rng(arguments.seed)
+        problems = [draw(rng) for _ in range(arguments.problems)]
+        limit = _limit(problems, noise, rng)
+        for method in METHODS:
+            row = _accuracy_row(problems, noise, method, limit) | {"problems": name}
+            table.add_row(
+                name,
+                "{:.2f} ({:.2f})".format(*row["limit_rotation_deg"]),
+                method,
+                *("{:.2f} ({:.2f})".format(*row["ratios"][error]) for error in ERRORS),
+                f"{100 * row['failed']:.2f} %",
+                "" if row["missed"] is None else f"{100 * row['missed']:.2f} %",
+            )
+            yield row
+    console.print(table)
+
+
+def _keypointnet_sources(
+    root: Path,
+) -> list[tuple[str, float, Callable[[np.random.Generator], Problem]]]:
+    from cadalign.datasets import KeypointNet
+
+    dataset = KeypointNet(root)
+
+    def draw(rng: np.random.Generator, models: list[np.ndarray]) -> Problem:
+        points = models[rng.integers(len(models))]
+        chosen = points[rng.choice(len(points), 7, replace=False)]
+        scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
+        alignment = cadalign.Alignment(random_rotation(rng), [0.0, 0.0, rng.uniform(1.5, 3)], scale)
+        pixels = KEYPOINT_CAMERA.project(alignment.apply(chosen / scale))
+        pixels += rng.standard_normal(pixels.shape)
+        return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment)
+
+    sources = []
+    for category in ("chair", "bottle", "airplane"):
+        if category in dataset.categories:
+            models = [m.keypoints.xyz for m in dataset[category] if _spans_volume(m.keypoints.xyz)]
+            sources.append(
+                (f"{category}, 7 keypoints", 1.0, lambda rng, models=models: draw(rng, models))
+            )
+    return sources
+
+
+def _spans_volume(points: np.ndarray) -> bool:
+    if len(points) < 7:
+        return False
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[2] > 0.05 * spread[0])
+
+
+def _limit(
+    problems: list[Problem], noise: float, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Errors of an ideal estimator on these problems."""
+    draws = []
+    for problem in problems:
+        try:
+            bound = cramer_rao_bound(
+                problem.points_3d, problem.camera, problem.alignment, sigma=noise
+            )
+        except CadalignError:
+            continue
+        draws.append(sample_limit(bound, problem.alignment, rng=rng, draws=LIMIT_DRAWS))
+    return {error: np.concatenate([draw[error] for draw in draws]) for error in ERRORS}
+
+
+def _accuracy_row(
+    problems: list[Problem], noise: float, method: str, limit: dict[str, np.ndarray]
+) -> dict[str, object]:
+    errors = []
+    failed = missed = 0
+    for problem in problems:
+        try:
+            sigma = noise if method == "optimal" else 1.0
+            result = cadalign.fit(
+                problem.points_3d, problem.points_2d, problem.camera, method=method, sigma=sigma
+            )
+        except CadalignError:
+            failed += 1
+            errors.append([180.0, np.inf, np.inf, np.inf])
+            continue
+        est, gt = result.alignment, problem.alignment
+        _, scale_y, scale_z = metrics.scale_error(est=est, gt=gt)
+        errors.append(
+            [
+                metrics.rotation_error(est=est, gt=gt),
+                metrics.translation_error(est=est, gt=gt),
+                scale_y,
+                scale_z,
+            ]
+        )
+        missed += method == "optimal" and _is_missed(problem, noise, est)
+    levels = (50, 90)
+    table = np.array(errors)
+    ratios = {
+        error: (np.percentile(table[:, k], levels) / np.percentile(limit[error], levels)).tolist()
+        for k, error in enumerate(ERRORS)
+    }
+    return {
+        "method": method,
+        "limit_rotation_deg": np.percentile(limit["rotation_error_deg"], levels).tolist(),
+        "median_rotation_deg": float(np.median(table[:, 0])),
+        "ratios": ratios,
+        "failed": failed / len(problems),
+        "missed": missed / len(problems) if method == "optimal" else None,
+    }
+
+
+def _is_missed(problem: Problem, noise: float, est: cadalign.Alignment) -> bool:
+    """Whether a refinement from the truth ends at a better alignment."""
+    rays = problem.camera.normalize(problem.points_2d)
+    objective = Objective(
+        problem.points_3d,
+        rays,
+        whitening_of(noise, rays, problem.camera),
+        LINEAR,
+        1.0,
+        0.0,
+        np.ones(UNKNOWNS),
+    )
+    cost, _, _ = refine(objective, 200, _pack(problem.alignment))
+    return bool(cost < evaluate_cost(objective, _pack(est)) * (1 - 1e-6) - 1e-9)
+
+
+def _pack(alignment: cadalign.Alignment) -> np.ndarray:
+    return np.concatenate([alignment.rotation.ravel(), alignment.translation, alignment.scale])
+
+
+def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
+    """How often the truth is among the minimal solver's solutions, and how many there are."""
+    rng = np.random.default_rng(arguments.seed)
+    found = solutions = 0
+    for _ in range(arguments.problems):
+        problem = simulate_problem(rng, points=4, noise_px=0.0)
+        gt = problem.alignment
+        rotations, translations, scales = ap4p(
+            problem.points_3d, problem.camera.normalize(problem.points_2d)
+        )
+        solutions += len(rotations)
+        found += any(
+            np.abs(rotation - gt.rotation).max() < 1e-4
+            and np.abs(translation - gt.translation).max() < 1e-4
+            and np.abs(scale - gt.scale).max() < 1e-4
+            for rotation, translation, scale in zip(rotations, translations, scales, strict=True)
+        )
+    result = {
+        "truth_found": found / arguments.problems,
+        "mean_solutions": solutions / arguments.problems,
+    }
+    console.print(
+        f"4 points: the truth is among the solutions in {100 * result['truth_found']:.2f} %, "
+        f"{result['mean_solutions']:.2f} solutions on average"
+    )
+    return result
+
+
+def _speed(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
+    """Medians of running times as ratios to OpenCV's."""
+    table = Table(title="Time over OpenCV's (which does not stretch): ratios of medians")
+    for column in ("points", "what", "microseconds", "over", "ratio"):
+        table.add_column(column, justify="right")
+    rng = np.random.default_rng(arguments.seed)
+    for points in SPEED_SIZES:
+        problem = simulate_problem(rng, points=points, noise_px=1.0)
+        for row in _speed_rows(problem, points, arguments.repetitions):
+            table.add_row(
+                str(points),
+                str(row["what"]),
+                f"{row['microseconds']:.1f}",
+                str(row["peer"]),
+                f"{row['ratio']:.2f}",
+            )
+            yield row
+    console.print(table)
+
+
+def _speed_rows(problem: Problem, points: int, repetitions: int) -> Iterator[dict[str, object]]:
+    x, uv, camera = problem.points_3d, problem.points_2d, problem.camera
+    rays, matrix = camera.normalize(uv), camera.matrix
+    timed: dict[str, Callable[[], object]] = {
+        "cv2 EPNP": lambda: cv2.solvePnP(x, uv, matrix, None, flags=cv2.SOLVEPNP_EPNP),
+        "cv2 SQPNP": lambda: cv2.solvePnP(x, uv, matrix, None, flags=cv2.SOLVEPNP_SQPNP),
+        "cv2 ITERATIVE": lambda: cv2.solvePnP(x, uv, matrix, None),
+        "solvers.aepnp": lambda: aepnp(x, rays),
+        "fit aepnp": lambda: cadalign.fit(x, uv, camera, method="aepnp"),
+        "fit optimal": lambda: cadalign.fit(x, uv, camera),
+        "fit aepnp-paper": lambda: cadalign.fit(x, uv, camera, method="aepnp-paper"),
+    }
+    medians = _interleaved_medians(timed, repetitions)
+    if points == 10:
+        count = 10_000
+        xs, uvs = np.tile(x, (count, 1, 1)), np.tile(uv, (count, 1, 1))
+        batch = {
+            "fit_batch aepnp, 1 thread": 1,
+            "fit_batch aepnp, all cores": -1,
+        }
+        for name, workers in batch.items():
+            run = {
+                name: lambda w=workers: cadalign.fit_batch(
+                    xs, uvs, camera, method="aepnp", workers=w
+                )
+            }
+            medians[name] = _interleaved_medians(run, 9)[name] / count
+    for name, seconds in medians.items():
+        if name.startswith("cv2"):
+            continue
+        peer = "cv2 ITERATIVE" if name == "fit optimal" else "cv2 EPNP"
+        yield {
+            "points": points,
+            "what": name,
+            "microseconds": 1e6 * seconds,
+            "peer": peer,
+            "peer_microseconds": 1e6 * medians[peer],
+            "ratio": seconds / medians[peer],
+        }
+    yield {
+        "points": points,
+        "what": "cv2 SQPNP",
+        "microseconds": 1e6 * medians["cv2 SQPNP"],
+        "peer": "cv2 EPNP",
+        "peer_microseconds": 1e6 * medians["cv2 EPNP"],
+        "ratio": medians["cv2 SQPNP"] / medians["cv2 EPNP"],
+    }
+
+
+def _interleaved_medians(
+    timed: dict[str, Callable[[], object]], repetitions: int
+) -> dict[str, float]:
+    """Median seconds of each function, as a loop over it would see them.
+
+    They take turns of a few calls, so that a slow moment of the machine hits all alike.
+    """
+    times: dict[str, list[float]] = {name: [] for name in timed}
+    for function in timed.values():
+        function()
+    for _ in range(-(-repetitions // CALLS_PER_TURN)):
+        for name, function in timed.items():
+            for _ in range(CALLS_PER_TURN):
+                start = time.perf_counter()
+                function()
+                times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

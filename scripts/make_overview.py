@@ -1,0 +1,61 @@
+"""Make the README's picture: overlays of four sample models, side by side."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+
+from cadalign.box import Box
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.evaluation.instance import make_instance
+from cadalign.fitting import fit
+from cadalign.picture import write_image
+from cadalign.render import RaycastRenderer, draw_overlay
+
+MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
+
+
+@dataclass
+class Arguments:
+    """Make the README's picture."""
+
+    out: Path = Path("docs/overview.png")
+    """Where to write it."""
+    width: int = 1600
+    """Width in pixels."""
+
+
+def main(arguments: Arguments) -> None:
+    """Render, align and draw the models."""
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
+        pictures = [_overlay(dataset, *model) for model in MODELS]
+    row = np.hstack(pictures)
+    height = round(row.shape[0] * arguments.width / row.shape[1])
+    small = cv2.resize(row, (arguments.width, height), interpolation=cv2.INTER_AREA)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    write_image(arguments.out, small)
+
+
+def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
+    instance = make_instance(dataset[category, f"sample_{category}_{number}"], seed=0)
+    result = fit(instance.points_3d, instance.points_2d, instance.camera)
+    frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
+    return draw_overlay(
+        frame.composite(),
+        instance.camera,
+        gt_box=Box.from_model(instance.bounds, instance.gt),
+        est_box=Box.from_model(instance.bounds, result.alignment),
+        observed=instance.points_2d,
+        reprojected=instance.camera.project(result.alignment.apply(instance.points_3d)),
+        legend=category == "chair",
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

@@ -1,0 +1,325 @@
+"""`cadalign demo`: its files, its pictures, and models that cannot be used."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from collections.abc import Callable
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet, load_mesh
+
+CATEGORIES = ["bottle", "car", "chair", "vessel"]
+NUMBERS = ["rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error", "box_iou"]
+GREEN, RED = (40, 205, 80), (240, 50, 50)
+
+
+def run(root: Path, out: Path, *options: str) -> int:
+    return main(["demo", "--root", str(root), "--out", str(out), "--per-category", "1", *options])
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with (out / "results.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def picture_of(out: Path, row: dict[str, str]) -> Path:
+    return out / "overlays" / f"{row['category']}_{row['model_id']}.png"
+
+
+def count_color(path: Path, color: tuple[int, int, int]) -> int:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return int((np.abs(picture[..., ::-1].astype(int) - color).max(axis=2) < 12).sum())
+
+
+@pytest.fixture(scope="module")
+def out(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of a demo on one model of every category."""
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    assert run(sample_root, folder) == 0
+    return folder
+
+
+def test_there_is_a_row_for_every_model(out: Path) -> None:
+    rows = rows_of(out)
+    assert [row["category"] for row in rows] == CATEGORIES
+    assert len({row["model_id"] for row in rows}) == 4
+    assert {row["status"] for row in rows} == {"ok"}
+    assert {row["reason"] for row in rows} == {""}
+    assert {row["seed"] for row in rows} == {"0"}
+    for row in rows:
+        assert int(row["keypoints"]) >= 6
+        assert float(row["seconds"]) > 0
+        numbers = [float(row[name]) for name in NUMBERS]
+        assert np.isfinite(numbers).all()
+        assert min(numbers) >= 0
+
+
+def test_models_are_aligned_well(out: Path) -> None:
+    rows = rows_of(out)
+    assert np.median([float(row["rotation_error_deg"]) for row in rows]) < 2
+    assert np.median([float(row["box_iou"]) for row in rows]) > 0.7
+    assert max(float(row["rms_px"]) for row in rows) < 3
+
+
+def test_every_overlay_shows_both_boxes_over_a_rendered_model(out: Path) -> None:
+    rows = rows_of(out)
+    assert sorted(path.name for path in (out / "overlays").iterdir()) == sorted(
+        picture_of(out, row).name for row in rows
+    )
+    for row in rows:
+        picture = picture_of(out, row)
+        assert count_color(picture, GREEN) > 50
+        assert count_color(picture, RED) > 50
+        pixels = cv2.imread(str(picture))
+        assert pixels.shape == (480, 640, 3)
+        shades = len(np.unique(pixels.reshape(-1, 3), axis=0))
+        assert shades > 500  # a shaded object, not lines over one colour
+
+
+def test_page_shows_every_overlay_by_a_relative_path(out: Path) -> None:
+    page = (out / "index.html").read_text(encoding="utf-8")
+    sources = [unescape(source) for source in re.findall(r'<img src="([^"]*)"', page)]
+    assert sources == [f"overlays/{picture_of(out, row).name}" for row in rows_of(out)]
+    for source in sources:
+        assert (out / source).is_file()
+    for category in CATEGORIES:
+        assert f"<td>{category}" in page
+    assert "http" not in page.replace("http-equiv", "")  # nothing is loaded from elsewhere
+
+
+def test_table_goes_to_standard_output(
+    sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(sample_root, tmp_path / "out", "--categories", "car") == 0
+    captured = capsys.readouterr()
+    assert "Medians per category" in captured.out
+    assert "car" in captured.out
+    assert "chair" not in captured.out
+    assert "index.html" in captured.err
+    assert [row["category"] for row in rows_of(tmp_path / "out")] == ["car"]
+
+
+def without_times(out: Path) -> list[dict[str, str]]:
+    return [
+        {name: value for name, value in row.items() if name != "seconds"} for row in rows_of(out)
+    ]
+
+
+def test_results_follow_from_the_seed_alone(sample_root: Path, out: Path, tmp_path: Path) -> None:
+    # Another choice of categories changes the order, but not an instance.
+    assert run(sample_root, tmp_path / "again", "--categories", "vessel", "car") == 0
+    expected = [row for row in without_times(out) if row["category"] in ("vessel", "car")]
+    assert sorted(without_times(tmp_path / "again"), key=lambda row: row["category"]) == expected
+    assert run(sample_root, tmp_path / "other", "--categories", "car", "--seed", "1") == 0
+    (other,) = without_times(tmp_path / "other")
+    assert other["seed"] == "1"
+    assert other["rotation_error_deg"] not in [row["rotation_error_deg"] for row in expected]
+
+
+def test_keypoints_without_noise_are_fitted_exactly(sample_root: Path, tmp_path: Path) -> None:
+    assert run(sample_root, tmp_path, "--noise-px", "0") == 0
+    for row in rows_of(tmp_path):
+        assert max(float(row[name]) for name in NUMBERS[:-1]) < 1e-6
+        assert float(row["box_iou"]) > 1 - 1e-6
+
+
+def test_without_a_root_the_sample_data_set_is_made(tmp_path: Path) -> None:
+    options = ["--out", str(tmp_path), "--per-category", "1", "--categories", "bottle"]
+    assert main(["demo", *options]) == 0
+    assert [row["status"] for row in rows_of(tmp_path)] == ["ok"]
+    made = KeypointNet(tmp_path / "sample_dataset")
+    assert {category: len(made.ids(category)) for category in made.categories} == dict.fromkeys(
+        CATEGORIES, 12
+    )
+    assert main(["demo", *options]) == 0  # a second time beside the first
+
+
+# --- bad instances ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def root(sample_root: Path, tmp_path: Path) -> Path:
+    """A copy of the sample data set that may be spoilt."""
+    return Path(shutil.copytree(sample_root, tmp_path / "spoilt"))
+
+
+def mesh_path(root: Path, category: str) -> Path:
+    dataset = KeypointNet(root)
+    path = dataset[dataset.ids(category)[0]].mesh_path
+    assert path is not None
+    return path
+
+
+def cut_short(root: Path, category: str) -> None:
+    path = mesh_path(root, category)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def emptied(root: Path, category: str) -> None:
+    mesh_path(root, category).write_bytes(b"")
+
+
+def no_mesh_at_all(root: Path, category: str) -> None:
+    mesh_path(root, category).write_text("this is not a mesh\n")
+
+
+def flattened(root: Path, category: str) -> None:
+    """Press the model and its keypoints flat along z."""
+    path = mesh_path(root, category)
+    mesh = load_mesh(path)
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices)}"]
+    lines += [f"property float {name}" for name in "xyz"]
+    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    lines += ["end_header", *(f"{x:.9g} {y:.9g} 0" for x, y, _ in mesh.vertices)]
+    lines += ["3 {} {} {}".format(*face) for face in mesh.faces]
+    path.write_text("\n".join(lines) + "\n")
+    edit_annotation(root, category, lambda keypoint: keypoint["xyz"].__setitem__(2, 0.0))
+
+
+def edit_annotation(root: Path, category: str, change: Callable[[dict[str, Any]], None]) -> None:
+    path = root / "annotations" / f"{category}.json"
+    entries = json.loads(path.read_text())
+    for keypoint in entries[0]["keypoints"]:
+        change(keypoint)
+    path.write_text(json.dumps(entries))
+
+
+def displaced(root: Path, category: str) -> None:
+    edit_annotation(root, category, lambda keypoint: keypoint["xyz"].__setitem__(1, 0.9))
+
+
+def too_few_keypoints(root: Path, category: str) -> None:
+    path = root / "annotations" / f"{category}.json"
+    entries = json.loads(path.read_text())
+    entries[0]["keypoints"] = entries[0]["keypoints"][:3]
+    entries[0]["symmetries"] = {"reflection": [], "rotation": []}
+    path.write_text(json.dumps(entries))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (cut_short, r"\.ply: "),
+        (emptied, r"\.ply: the mesh file is empty; get it again"),
+        (no_mesh_at_all, r"\.ply: "),
+        (flattened, r"\.ply: the model has zero thickness along z; leave it out"),
+        (displaced, r"keypoints\[\d+\] lies .* off the place that its face and barycentric"),
+        (too_few_keypoints, r"keypoints"),
+    ],
+)
+def test_bad_instance_becomes_a_failed_row_and_the_rest_goes_on(
+    root: Path, tmp_path: Path, spoil: Callable[[Path, str], None], reason: str
+) -> None:
+    spoil(root, "car")
+    out = tmp_path / "out"
+    assert run(root, out, "--categories", "bottle", "car", "chair") == 0
+    bottle, car, chair = rows_of(out)
+    assert bottle["status"] == chair["status"] == "ok"
+    assert car["category"] == "car"
+    assert car["status"] == "failed"
+    assert re.search(reason, car["reason"])
+    assert "\n" not in car["reason"]
+    assert "Error(" not in car["reason"]  # words of cadalign's own, not a bare exception
+    assert [car[name] for name in NUMBERS] == [""] * 5
+    assert float(car["seconds"]) >= 0
+    assert not picture_of(out, car).exists()
+    assert picture_of(out, bottle).exists()
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert car["reason"] in unescape(page)
+    assert page.count("<img ") == 2
+
+
+def test_model_without_mesh_file_is_not_chosen(root: Path, tmp_path: Path) -> None:
+    mesh_path(root, "car").unlink()
+    out = tmp_path / "out"
+    assert run(root, out, "--categories", "bottle", "car", "chair") == 0
+    assert [row["category"] for row in rows_of(out)] == ["bottle", "chair"]
+
+
+def test_exit_code_is_1_where_every_instance_fails(root: Path, tmp_path: Path) -> None:
+    cut_short(root, "car")
+    assert run(root, tmp_path / "out", "--categories", "car") == 1
+    assert [row["status"] for row in rows_of(tmp_path / "out")] == ["failed"]
+
+
+def test_page_escapes_what_files_say(root: Path, tmp_path: Path) -> None:
+    path = root / "annotations" / "car.json"
+    entries = json.loads(path.read_text())
+    name = "<b>&'x"
+    mesh = mesh_path(root, "car")
+    mesh.rename(mesh.with_name(f"{name}.ply"))
+    entries[0]["model_id"] = name
+    path.write_text(json.dumps(entries))
+    out = tmp_path / "out"
+    assert run(root, out, "--categories", "car") == 0
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert name not in page
+    assert name in unescape(page)
+    (source,) = re.findall(r'<img src="([^"]*)"', page)
+    assert (out / unescape(source)).is_file()
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--per-category", "0"], "--per-category: 0 is not positive"),
+        (["--noise-px", "-1"], "--noise-px: -1.0 is not a noise level"),
+        (["--noise-px", "nan"], "--noise-px: nan is not a noise level"),
+        (["--seed", "-1"], "--seed: -1 is negative"),
+        (
+            ["--root", "/nowhere/at/all"],
+            "/nowhere/at/all: no such folder; give KeypointNet's root",
+        ),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
+) -> None:
+    assert main(["demo", "--out", str(tmp_path / "out"), *options]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == f"cadalign: {text}\n"
+    assert captured.out == ""
+
+
+def test_folder_without_annotations_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    assert run(tmp_path / "empty", tmp_path / "out") == 1
+    assert capsys.readouterr().err == (
+        f"cadalign: {tmp_path / 'empty'}: no annotations/*.json below it; "
+        "give the folder that holds KeypointNet's annotations/ and splits/\n"
+    )
+
+
+def test_unknown_category_is_refused(
+    sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(sample_root, tmp_path / "out", "--categories", "spaceship") == 1
+    captured = capsys.readouterr()
+    assert "spaceship" in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_real_models_run(real_data: Path, tmp_path: Path) -> None:
+    assert run(real_data / "keypointnet", tmp_path, "--noise-px", "0") == 0
+    rows = rows_of(tmp_path)
+    assert len(rows) == 5
+    solved = [row for row in rows if row["status"] == "ok"]
+    assert len(solved) >= 4
+    for row in solved:
+        assert max(float(row[name]) for name in NUMBERS[:-1]) < 1e-6

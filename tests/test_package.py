@@ -1,0 +1,200 @@
+"""The package as it is installed: what a wheel holds, and what importing it costs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {
+    "PIL",
+    "cv2",
+    "dask",
+    "embreex",
+    "numba",
+    "open3d",
+    "pyrender",
+    "rich",
+    "scipy",
+    "trimesh",
+    "tyro",
+}
+SHARED = "../" + "shared"
+
+
+def python(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# --- the wheel -------------------------------------------------------------------------------
+
+
+def build_command(source: Path, out: Path) -> list[str]:
+    """Build with the setuptools at hand if it is new enough, otherwise fetch one."""
+    try:
+        recent = int(version("setuptools").split(".")[0]) >= 77
+        version("build")
+    except PackageNotFoundError:
+        recent = False
+    if recent:
+        options = ["build", "--wheel", "--no-isolation", "--outdir", str(out)]
+    else:
+        options = ["pip", "wheel", "--no-deps", "--quiet", "--wheel-dir", str(out)]
+    return [sys.executable, "-m", *options, str(source)]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """A wheel built from a copy of the source, so that nothing old in `build/` gets into it."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    ignore = shutil.ignore_patterns("__pycache__")
+    for name in ("cadalign", "datasets", "render"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=ignore)
+    done = subprocess.run(
+        build_command(source, folder / "out"), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    (path,) = (folder / "out").glob("*.whl")
+    return zipfile.ZipFile(path)
+
+
+def source_files() -> set[str]:
+    """Every Python file, named as it is to be installed."""
+    files = set()
+    for folder, prefix in (("cadalign", ""), ("datasets", "cadalign/"), ("render", "cadalign/")):
+        for path in (ROOT / folder).rglob("*.py"):
+            name = path.relative_to(ROOT).as_posix()
+            if not name.startswith(("cadalign/datasets/", "cadalign/render/")):
+                files.add(prefix + name)
+    return files
+
+
+@pytest.mark.slow
+def test_only_top_level_name_of_the_wheel_is_cadalign(wheel: zipfile.ZipFile) -> None:
+    names = {name.split("/")[0] for name in wheel.namelist()}
+    assert {name for name in names if not name.endswith(".dist-info")} == {"cadalign"}
+
+
+@pytest.mark.slow
+def test_wheel_holds_every_module_and_nothing_twice(wheel: zipfile.ZipFile) -> None:
+    names = [name for name in wheel.namelist() if name.endswith(".py")]
+    assert len(names) == len(set(names))
+    assert set(names) == source_files()
+    packages = {"", "cli/", "datasets/", "datasets/sample/", "evaluation/", "render/", "solvers/"}
+    assert {f"cadalign/{package}__init__.py" for package in packages} <= set(names)
+
+
+@pytest.mark.slow
+def test_wheel_is_typed_and_brings_the_command(wheel: zipfile.ZipFile) -> None:
+    names = wheel.namelist()
+    assert "cadalign/py.typed" in names
+    (entry_points,) = [name for name in names if name.endswith("entry_points.txt")]
+    assert "cadalign = cadalign.cli:main" in wheel.read(entry_points).decode()
+
+
+@pytest.mark.slow
+def test_wheel_works_without_the_source_tree(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    wheel.extractall(tmp_path)
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+        "import cadalign, cadalign.cli, cadalign.datasets, cadalign.datasets.sample, "
+        "cadalign.render, cadalign.evaluation, cadalign.solvers; "
+        "print(cadalign.__file__, cadalign.datasets.__file__, cadalign.render.__file__)"
+    )
+    assert all(path.startswith(str(tmp_path)) for path in python(code).split())
+
+
+# --- imports ---------------------------------------------------------------------------------
+
+
+def test_import_brings_nothing_heavy() -> None:
+    code = "import json, sys, cadalign; print(json.dumps(sorted(sys.modules)))"
+    assert HEAVY & {name.split(".")[0] for name in json.loads(python(code))} == set()
+
+
+def test_command_line_brings_nothing_heavy_before_it_runs() -> None:
+    code = "import json, sys, cadalign.cli; print(json.dumps(sorted(sys.modules)))"
+    loaded = {name.split(".")[0] for name in json.loads(python(code))}
+    assert (HEAVY - {"rich", "tyro"}) & loaded == set()
+
+
+def best_of(times: int, code: str) -> float:
+    """The least time [s] that code takes in a new process.
+
+    Of wall time and processor time the lesser: other programs lengthen the one, helper threads
+    the other.
+    """
+    timed = (
+        "import time; wall, own = time.perf_counter(), time.process_time(); "
+        f"{code}; print(min(time.perf_counter() - wall, time.process_time() - own))"
+    )
+    return min(float(python(timed)) for _ in range(times))
+
+
+def test_import_is_quick() -> None:
+    assert best_of(5, "import cadalign") < 0.3
+
+
+FIRST_FIT = (
+    "import numpy as np, cadalign; r = np.random.default_rng(0); p = r.uniform(-1, 1, (10, 3)); "
+    "c = cadalign.Camera(640, 480, 500, 500, 319.5, 239.5); "
+    "a = cadalign.Alignment(np.eye(3), [0, 0, 6], [1, 1.2, 0.8]); "
+    "cadalign.fit(p, c.project(a.apply(p)), c)"
+)
+
+
+@pytest.mark.slow
+def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled() -> None:
+    python(FIRST_FIT)
+    assert best_of(4, FIRST_FIT) < 1.0
+
+
+def test_everything_that_is_promised_is_there() -> None:
+    code = "import cadalign; print([hasattr(cadalign, name) for name in cadalign.__all__])"
+    assert "False" not in python(code)
+    code = "from cadalign import *; print(fit, fit_batch, Camera, Alignment, Box, FitResult)"
+    assert "function fit" in python(code)
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    import cadalign
+
+    with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
+        cadalign.nonsense  # noqa: B018
+
+
+# --- the source ------------------------------------------------------------------------------
+
+
+def test_nothing_points_out_of_the_repository() -> None:
+    patterns = ("cadalign/**/*.py", "datasets/**/*.py", "render/**/*.py", "scripts/**/*.py")
+    patterns += ("tests/**/*.py", "*.md", "*.toml", "Makefile")
+    offenders = [
+        path.relative_to(ROOT).as_posix()
+        for pattern in patterns
+        for path in ROOT.glob(pattern)
+        if SHARED in path.read_text(encoding="utf-8")
+    ]
+    assert offenders == []
+
+
+def test_links_lead_to_the_packages_at_the_top() -> None:
+    for name in ("datasets", "render"):
+        link = ROOT / "cadalign" / name
+        assert link.is_symlink()
+        assert link.readlink() == Path("..") / name

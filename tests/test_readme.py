@@ -1,0 +1,57 @@
+"""The README's snippets run, and what it names exists."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cadalign
+from cadalign.cli import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_python_snippets_run_and_find_the_stretch() -> None:
+    names: dict[str, Any] = {}
+    for block in blocks("python"):
+        exec(compile(block, "README.md", "exec"), names)
+    result = names["result"]
+    # The snippet's keypoints were made with the stretch (1, 1.3, 0.8).
+    deviation = np.array(result.std.scale[1:])
+    np.testing.assert_array_less(np.abs(result.alignment.scale[1:] / [1.3, 0.8] - 1), 4 * deviation)
+    assert not result.warnings
+
+
+def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
+    assert {"demo", "fit"} <= commands
+    for command in commands:
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        assert stop.value.code == 0
+        assert command in capsys.readouterr().out
+
+
+def test_named_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in set(re.findall(r"make ([a-z]+)", README)):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE) or target == "nothing"
+
+
+def test_linked_files_exist() -> None:
+    for link in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (ROOT / link).exists(), link
+
+
+def test_named_python_objects_exist() -> None:
+    for name in set(re.findall(r"`cadalign\.([a-z_]+)`", README)):
+        assert hasattr(cadalign, name) or __import__(f"cadalign.{name}")

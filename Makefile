@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper test test-fast lint format bench clean
+.PHONY: help demo paper test test-fast lint format bench web clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -38,6 +38,9 @@ lint: $(VENV)/.installed-dev  ## check style (ruff) and types (mypy)
 format: $(VENV)/.installed-dev  ## format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+web:  ## bundle the scripts of the report and the annotator anew (needs Node)
+	cd cadalign/web && npm ci --no-audit --no-fund && npm run build
 
 clean:  ## remove the virtual environment and everything built
 	rm -rf $(VENV) build *.egg-info demo bench .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,1 @@
+"""Aligning a model to a photo by clicking, in the browser."""

@@ -1,0 +1,1 @@
+"""The result of runs as one page, and as tables for papers."""

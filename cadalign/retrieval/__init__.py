@@ -1,0 +1,1 @@
+"""Which model of a library is it, and how must it be stretched?"""

@@ -1,0 +1,4 @@
+import "../common/theme.css";
+import { Stage } from "../common/stage.js";
+
+window.Stage = Stage;

@@ -77,6 +77,17 @@ class Alignment:
         return alignment
 
     @classmethod
+    def from_packed(cls, pose: FloatArray) -> Alignment:
+        """Take over a solver's packed pose (15,): rotation row by row, translation, scale."""
+        pose = pose.copy()
+        pose.flags.writeable = False
+        alignment = object.__new__(cls)
+        object.__setattr__(alignment, "rotation", pose[:9].reshape(3, 3))
+        object.__setattr__(alignment, "translation", pose[9:12])
+        object.__setattr__(alignment, "scale", pose[12:])
+        return alignment
+
+    @classmethod
     def identity(cls) -> Alignment:
         """The alignment that leaves every point where it is."""
         return cls(np.eye(3), np.zeros(3), np.ones(3))

@@ -24,6 +24,8 @@ _RAYLEIGH_MEDIAN = 1.1774100225154747
 # claiming to be certain of everything.
 _LEAST_SIGMA = 1e-9
 _EXACT_COST = 1e-6
+# Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
+_ONE_MINIMUM = np.array([1, 0, 1, -1])
 
 
 Solver = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
@@ -84,7 +86,7 @@ def solve(problems: Problems, options: Options, sigmas: Sequence[Sigma] | None =
     if options.known_axis != "x":
         _restore_axes(solutions, options)
     _reproject(problems, solutions)
-    if solutions.statuses.any():
+    if np.count_nonzero(solutions.statuses):
         for b in np.flatnonzero(solutions.statuses).tolist():
             error = solver_error(
                 int(solutions.statuses[b]),
@@ -245,13 +247,17 @@ def _without_statistics(
     problems: Problems, poses: FloatArray, statuses: IntArray, errors: dict[int, CadalignError]
 ) -> Solutions:
     """The solutions of a method that knows neither noise nor alternatives."""
+    costs = np.empty(poses.shape[:2])
+    costs.fill(np.inf)
+    info = np.empty((len(problems), 4), dtype=np.int64)
+    info[:] = _ONE_MINIMUM
     return Solutions(
         poses=poses,
-        costs=np.full(poses.shape[:2], np.inf),
+        costs=costs,
         covariances=None,
         sigmas=None,
         statuses=statuses,
-        info=np.array([[1, 0, 1, -1]] * len(problems)),
+        info=info,
         residuals=np.empty_like(problems.points_2d),
         errors=errors,
     )

@@ -16,7 +16,7 @@ from cadalign.alignment import Alignment
 from cadalign.batch import BatchResult
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation import Solutions, solve, unpack
+from cadalign.estimation import Solutions, solve
 from cadalign.options import Options
 from cadalign.problems import Problems, pack_many, pack_one
 from cadalign.result import Alternative, FitResult, FitStats
@@ -322,7 +322,7 @@ def _fit_all(problems: Problems, options: Options, start: float) -> FitResult:
     solutions = solve(problems, options)
     if solutions.errors:
         raise solutions.errors[0]
-    alignment = Alignment.from_solver(*unpack(solutions.poses[0, 0]))
+    alignment = Alignment.from_packed(solutions.poses[0, 0])
     minima, iterations, hypotheses, _ = solutions.info[0].tolist()
     count = len(problems.points_3d)
     return FitResult(
@@ -350,7 +350,7 @@ def _alternatives(
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
     return tuple(
-        Alternative(Alignment.from_solver(*unpack(solutions.poses[0, k])), float(ratios[k]))
+        Alternative(Alignment.from_packed(solutions.poses[0, k]), float(ratios[k]))
         for k in range(1, minima)
         if ratios[k] >= LEAST_LIKELIHOOD
     )

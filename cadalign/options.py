@@ -44,7 +44,8 @@ class Options:
             raise InputError(
                 f"{self.known_axis!r} is not an axis", where="known_axis", fix="give x, y or z"
             )
-        self._check_stretch()
+        if self.stretch is not None:
+            self._check_stretch()
         prior = self.scale_prior_sigma
         if prior is not None and not 0 < prior < np.inf:
             raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
@@ -62,7 +63,7 @@ class Options:
     def _check_stretch(self) -> None:
         axes = [axis for axis in "xyz" if axis != self.known_axis]
         allowed = ("".join(axes), axes[0], axes[1], "none")
-        if self.stretch is not None and self.stretch not in allowed:
+        if self.stretch not in allowed:
             raise InputError(
                 f"{self.stretch!r} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",

@@ -143,14 +143,23 @@ def _check_camera(camera: object) -> None:
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
 
 
+def _as_kernels_want(points: npt.ArrayLike) -> FloatArray:
+    """A contiguous and writable array of floats, the given one where it is that already.
+
+    Kernels are compiled for writable arrays; a frozen one would compile them again.
+    """
+    if type(points) is np.ndarray and points.dtype == np.float64 and points.flags.carray:
+        return points
+    return np.require(points, np.float64, ["C", "W"])
+
+
 def _check_pair(
     points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, name_3d: str, name_2d: str
 ) -> tuple[FloatArray, FloatArray]:
     """Writable arrays (n, 3) and (n, 2) of finite numbers, or an `InputError`."""
     try:
-        # Kernels are compiled for writable arrays; a frozen one would compile them again.
-        model = np.require(points_3d, np.float64, ["C", "W"])
-        image = np.require(points_2d, np.float64, ["C", "W"])
+        model = _as_kernels_want(points_3d)
+        image = _as_kernels_want(points_2d)
         valid = (
             model.ndim == 2
             and image.ndim == 2

@@ -2,48 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
+from support import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
-from cadalign import Alignment, Camera, FitResult, fit
+from cadalign import Alignment, Camera, fit
 from cadalign.metrics import rotation_error
-from cadalign.simulation import SIMULATION_CAMERA, Problem, simulate_problem
-
-LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
-
-
-def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5, **options: Any) -> Problem:
-    return simulate_problem(
-        np.random.default_rng(seed), points=points, noise_px=noise_px, **options
-    )
-
-
-def fit_problem(problem: Problem, **options: Any) -> FitResult:
-    return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
-
-
-def moved(alignment: Alignment, step: np.ndarray) -> Alignment:
-    """The alignment after a step of the 8 unknowns, in the documented order."""
-    return Alignment(
-        Rotation.from_rotvec(step[:3]).as_matrix() @ alignment.rotation,
-        alignment.translation + step[3:6],
-        alignment.scale * np.exp([0.0, *step[6:8]]),
-    )
-
-
-def residuals_at(problem: Problem, alignment: Alignment) -> np.ndarray:
-    return problem.camera.project(alignment.apply(problem.points_3d)) - problem.points_2d
-
-
-def assert_same(first: Alignment, second: Alignment, tolerance: float) -> None:
-    assert rotation_error(est=first, gt=second) < np.degrees(tolerance)
-    np.testing.assert_allclose(first.translation, second.translation, rtol=0, atol=10 * tolerance)
-    np.testing.assert_allclose(first.scale, second.scale, rtol=10 * tolerance)
-
+from cadalign.simulation import SIMULATION_CAMERA, Problem
 
 # --- sigma ------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from trimesh.visual.color import linear_to_srgb
 
 from cadalign.datasets.mtl import WHITE, texture_array
 from cadalign.datasets.obj import fan_triangles
@@ -179,6 +180,8 @@ def _piece(geometry: Any, transform: FloatArray, path: Path) -> Mesh:
     elif visual.kind == "vertex":
         materials = (Material(color=WHITE),)
         colors = np.asarray(visual.vertex_colors, dtype=float) / 255
+        if path.suffix.lower() in (".glb", ".gltf"):
+            colors = _encoded(colors)
     elif visual.kind == "face":
         distinct, face_material = np.unique(visual.face_colors, axis=0, return_inverse=True)
         materials = tuple(Material(color=_rgba(color)) for color in distinct)
@@ -207,19 +210,30 @@ def _unit_colors(attribute: Any, count: int) -> FloatArray | None:
     colors = np.ones((count, 4))
     width = min(values.shape[1], 4)
     colors[:, :width] = np.clip(values[:, :width], 0, 1)
-    return colors
+    return _encoded(colors)
+
+
+def _encoded(colors: FloatArray) -> FloatArray:
+    """glTF's factors and vertex colours (..., 4), which are linear light, as sRGB."""
+    encoded = colors.copy()
+    encoded[..., :3] = linear_to_srgb(colors[..., :3])
+    return encoded
 
 
 def _material(material: Any) -> Material:
     """One of trimesh's materials; its colour and texture only."""
     image = getattr(material, "baseColorTexture", None)
     factor = getattr(material, "baseColorFactor", None)
-    if image is None and factor is None:
+    if factor is not None:
+        color = _rgba(_encoded(np.array(_rgba(factor))))
+    elif image is not None:
+        color = WHITE
+    else:
         image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
-    color = WHITE if factor is None and image is not None else GREY
+        color = _rgba(factor) if factor is not None else WHITE if image is not None else GREY
     return Material(
         name=str(getattr(material, "name", None) or ""),
-        color=color if factor is None else _rgba(factor),
+        color=color,
         texture=None if image is None else texture_array(image),
     )
 

@@ -269,7 +269,8 @@ def test_glb_nodes_are_placed_and_colored(write):
     scene.add_geometry(box, node_name="b", transform=moved @ mirrored)
     mesh = load_mesh(write(scene.export(file_type="glb"), "scene.glb"))
     np.testing.assert_allclose(mesh.bounds, [[-1, -1, -1], [5.5, 1, 1]], atol=1e-6)
-    assert {mesh.materials[number].color for number in mesh.face_material} == {(1, 0, 0, 1)}
+    colors = np.array([material.color for material in mesh.materials])[mesh.face_material]
+    np.testing.assert_allclose(colors, np.tile([1.0, 0, 0, 1], (len(mesh.faces), 1)))
     # Outward normals, of the mirrored box too: both volumes count positive.
     assert mesh.to_trimesh().volume == pytest.approx(8 + 1)
 
@@ -284,6 +285,21 @@ def test_glb_texture_is_kept(write):
     mesh = load_mesh(write(trimesh.Scene(square).export(file_type="glb"), "a.glb"))
     np.testing.assert_array_equal(mesh.materials[0].texture, pixels)
     np.testing.assert_allclose(mesh.corner_uv[0], uv, atol=1e-6)
+
+
+@pytest.mark.parametrize("where", ["factor", "vertices"])
+def test_glb_colors_are_linear_light_and_become_srgb(write, where):
+    box = trimesh.creation.box()
+    linear = [55, 128, 255, 255]
+    if where == "factor":
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=linear)
+        box.visual = trimesh.visual.TextureVisuals(material=material)
+    else:
+        box.visual.vertex_colors = np.tile(linear, (8, 1))
+    mesh = load_mesh(write(trimesh.Scene(box).export(file_type="glb"), "a.glb"))
+    color = mesh.materials[0].color if where == "factor" else mesh.vertex_colors[0]
+    # By IEC 61966-2-1: 1.055 c^(1/2.4) - 0.055.
+    np.testing.assert_allclose(color, [0.5018, 0.7366, 1.0, 1.0], atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["stl", "off"])

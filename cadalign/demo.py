@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from cadalign import __version__
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError
+from cadalign.evaluation.files import write_json, write_text
 from cadalign.evaluation.keypoint_tasks import KeypointTask
-from cadalign.evaluation.keypointnet import KeypointNetExperiment
+from cadalign.evaluation.keypointnet import KeypointNetExperiment, Trial
 from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.tables import write_rows
 
 METHOD = "optimal"
 """What the demonstration aligns with."""
@@ -51,40 +56,66 @@ def run_demo(
     out: Path,
     noise_px: float = 1.0,
     seed: int = 0,
-) -> Iterator[Outcome]:
-    """Align one view of every model and draw it; yields an outcome each.
+) -> Iterator[Trial]:
+    """Align one view of every model and draw it; yields a trial each.
 
-    Writes ``overlays/<category>_<model id>.png`` below ``out``. A model that cannot be used, for
-    whatever reason, yields a failed outcome, and the next one is taken.
+    Writes ``overlays/<category>_<model id>.png`` below ``out``, and the same picture without boxes
+    and a sketch of the model. A model that cannot be used, for whatever reason, yields a trial with
+    a failed outcome, and the next one is taken.
 
     Parameters
     ----------
     dataset : KeypointNet
     keys : sequence of (category, model id)
     out : Path
-        An existing folder.
     noise_px : float
         Noise of the keypoints [px].
     seed : int
 
     Yields
     ------
-    Outcome
+    Trial
     """
-    overlays = out / "overlays"
-    overlays.mkdir(exist_ok=True)
-    experiment = KeypointNetExperiment(
-        (METHOD,), noise_px=noise_px, seed=seed, overlays=overlays.absolute()
-    )
+    folder = RunFolder(out.absolute())
+    folder.make_for_pictures()
+    experiment = KeypointNetExperiment((METHOD,), noise_px=noise_px, seed=seed, drawn_in=folder)
     for category, model_id in keys:
         task = KeypointTask.of_model(dataset, category, model_id)
-        yield from experiment.outcomes([task])
+        yield from experiment.trials([task])
 
 
-def write_results(path: Path, outcomes: Sequence[Outcome], *, seed: int) -> None:
-    """Write a CSV file with a row per outcome."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=[*Outcome.columns(), "seed", "seconds"])
-        writer.writeheader()
-        for outcome in outcomes:
-            writer.writerow({**outcome.row(), "seed": seed, "seconds": outcome.seconds})
+def write_results(
+    out: Path, trials: Sequence[Trial], *, root: Path, noise_px: float, seed: int
+) -> None:
+    """Write ``results.csv`` with a row per outcome, and the files of a run for the report.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+    """
+    outcomes = [outcome for trial in trials for outcome in trial.outcomes]
+    text = io.StringIO()
+    writer = csv.DictWriter(
+        text, fieldnames=[*Outcome.columns(), "seed", "seconds"], lineterminator="\n"
+    )
+    writer.writeheader()
+    for outcome in outcomes:
+        writer.writerow({**outcome.row(), "seed": seed, "seconds": outcome.seconds})
+    write_text(out / "results.csv", text.getvalue())
+    folder = RunFolder(out)
+    settings = {"root": str(root.absolute()), "noise_px": noise_px, "seed": seed}
+    write_json(
+        folder.config_file,
+        {
+            "experiment": "demo",
+            **settings,
+            "methods": [METHOD],
+            "tasks": len(trials),
+            "versions": {"cadalign": __version__},
+        },
+    )
+    experiment = KeypointNetExperiment((METHOD,))
+    exhibits = [row for trial in trials for row in trial.exhibits]
+    write_rows(folder.exhibits, experiment.exhibit_columns, exhibits)
+    write_rows(folder.results, experiment.columns, [outcome.row() for outcome in outcomes])

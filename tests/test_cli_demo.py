@@ -7,7 +7,6 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,14 @@ def run(root: Path, out: Path, *options: str) -> int:
 def rows_of(out: Path) -> list[dict[str, str]]:
     with (out / "results.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def payload_of(out: Path) -> dict[str, Any]:
+    page = (out / "index.html").read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', page, re.S)
+    assert found is not None
+    payload: dict[str, Any] = json.loads(found[1])
+    return payload
 
 
 def picture_of(out: Path, row: dict[str, str]) -> Path:
@@ -87,15 +94,28 @@ def test_every_overlay_shows_both_boxes_over_a_rendered_model(out: Path) -> None
         assert shades > 500  # a shaded object, not lines over one colour
 
 
-def test_page_shows_every_overlay_by_a_relative_path(out: Path) -> None:
-    page = (out / "index.html").read_text(encoding="utf-8")
-    sources = [unescape(source) for source in re.findall(r'<img src="([^"]*)"', page)]
-    assert sources == [f"overlays/{picture_of(out, row).name}" for row in rows_of(out)]
-    for source in sources:
-        assert (out / source).is_file()
-    for category in CATEGORIES:
-        assert f"<td>{category}" in page
-    assert "http" not in page.replace("http-equiv", "")  # nothing is loaded from elsewhere
+def test_page_holds_every_instance_with_its_picture_and_model(out: Path) -> None:
+    payload = payload_of(out)
+    instances = payload["tables"]["instances"]
+    assert [payload["tables"]["strings"][k] for k in instances["category"]] == CATEGORIES
+    assert payload["title"] == "cadalign demo"
+    assert {row["category"] for row in payload["headline"]["rows"]} == {*CATEGORIES, "all"}
+    for key, thumb in zip(instances["exhibit"], instances["thumb"], strict=True):
+        exhibit = payload["exhibits"][str(key)]
+        assert payload["pictures"][exhibit["picture"]].startswith("data:image/webp;base64,")
+        assert payload["thumbs"][str(thumb)].startswith("data:image/webp;base64,")
+        assert payload["meshes"][exhibit["mesh"]]["faces"]
+
+
+def test_demo_can_be_reported_on_like_a_run(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(out), "--out", str(tmp_path / "page.html")]) == 0
+    assert (tmp_path / "page.html").stat().st_size > 1e6
+    assert main(["report", str(out), "--format", "csv"]) == 0
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    ours = [row["category"] for row in rows if row["method"] == "optimal"]
+    assert ours == [*CATEGORIES, "all"]
 
 
 def test_table_goes_to_standard_output(
@@ -235,9 +255,10 @@ def test_bad_instance_becomes_a_failed_row_and_the_rest_goes_on(
     assert float(car["seconds"]) >= 0
     assert not picture_of(out, car).exists()
     assert picture_of(out, bottle).exists()
-    page = (out / "index.html").read_text(encoding="utf-8")
-    assert car["reason"] in unescape(page)
-    assert page.count("<img ") == 2
+    payload = payload_of(out)
+    assert car["reason"] in payload["tables"]["strings"]
+    assert payload["tables"]["rows"]["status"] == [0, 1, 0]
+    assert len(payload["pictures"]) == len(payload["thumbs"]) == 2
 
 
 def test_model_without_mesh_file_is_not_chosen(root: Path, tmp_path: Path) -> None:
@@ -263,11 +284,12 @@ def test_page_escapes_what_files_say(root: Path, tmp_path: Path) -> None:
     path.write_text(json.dumps(entries))
     out = tmp_path / "out"
     assert run(root, out, "--categories", "car") == 0
-    page = (out / "index.html").read_text(encoding="utf-8")
-    assert name not in page
-    assert name in unescape(page)
-    (source,) = re.findall(r'<img src="([^"]*)"', page)
-    assert (out / unescape(source)).is_file()
+    assert name not in (out / "index.html").read_text(encoding="utf-8")
+    payload = payload_of(out)
+    assert name in payload["tables"]["strings"]
+    assert len(payload["pictures"]) == 1
+    (row,) = rows_of(out)
+    assert picture_of(out, row).is_file()
 
 
 # --- refusals --------------------------------------------------------------------------------

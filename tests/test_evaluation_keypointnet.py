@@ -13,8 +13,9 @@ import cadalign
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.evaluation.exhibit import exhibit_stem
 from cadalign.evaluation.keypoint_tasks import KeypointTasks
-from cadalign.evaluation.keypointnet import KeypointNetExperiment, overlay_name
+from cadalign.evaluation.keypointnet import KeypointNetExperiment
 from cadalign.evaluation.outcome import FAILED, OK, Outcome
 from cadalign.evaluation.summary import summarize, summary_csv
 
@@ -151,8 +152,11 @@ def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
     arguments = ["evaluate", "keypointnet", str(sample_root), "--out", str(out), *options]
     assert main([*arguments, "--categories", "chair", "car"]) == 0
     models = KeypointNet(sample_root).subset(categories=["chair", "car"])
-    wanted = {overlay_name(*key) for key in models.ids()}
-    assert {path.name for path in (out / "overlays").iterdir()} == wanted
+    wanted = {exhibit_stem(*key) for key in models.ids()}
+    endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "sketches": ".json"}
+    for folder, ending in endings.items():
+        files = {path.name for path in (out / folder).iterdir()}
+        assert files == {f"{name}{ending}" for name in wanted}
     assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}
 
 

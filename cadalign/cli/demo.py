@@ -47,31 +47,27 @@ class Demo:
         # Renderers and solvers take a moment to import; `cadalign --help` should not wait for them.
         from cadalign.demo import choose_models, open_dataset, run_demo, write_results
         from cadalign.evaluation.outcome import OK
-        from cadalign.gallery import write_gallery
+        from cadalign.report import write_report
 
         console = new_console()
         make_folder(self.out)
         dataset = open_dataset(self.root, out=self.out, per_category=self.per_category)
         keys = choose_models(dataset, categories=self.categories, per_category=self.per_category)
-        outcomes = []
-        for outcome in progress_over(
+        trials = []
+        for trial in progress_over(
             run_demo(dataset, keys, out=self.out, noise_px=self.noise_px, seed=self.seed),
             total=len(keys),
             label="aligning",
             console=console,
         ):
-            outcomes.append(outcome)
-            if outcome.status != OK:
-                name = f"{outcome.category} {outcome.model_id}"
-                console.print(f"{name}: {outcome.reason}", markup=False)
-        write_results(self.out / "results.csv", outcomes, seed=self.seed)
-        write_gallery(
-            self.out / "index.html",
-            outcomes,
-            title="cadalign demo",
-            text=f"{len(outcomes)} models, keypoint noise {self.noise_px:g} px, seed {self.seed}. "
-            "Green: true box. Red: predicted box.",
-        )
+            trials.append(trial)
+            for outcome in trial.outcomes:
+                if outcome.status != OK:
+                    name = f"{outcome.category} {outcome.model_id}"
+                    console.print(f"{name}: {outcome.reason}", markup=False)
+        write_results(self.out, trials, root=dataset.root, noise_px=self.noise_px, seed=self.seed)
+        write_report([self.out], self.out / "index.html", title="cadalign demo")
+        outcomes = [outcome for trial in trials for outcome in trial.outcomes]
         _print_table(outcomes)
         console.print(f"Pictures: {self.out / 'index.html'}", markup=False)
         return 0 if any(outcome.status == OK for outcome in outcomes) else 1

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.cli.evaluate_correspondences import EvaluateCorrespondences, conclude
+from cadalign.cli.evaluate_retrieval import EvaluateRetrieval, conclude_retrieval
 from cadalign.cli.output import new_console
+from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
@@ -24,8 +26,8 @@ class EvaluateKeypointNet:
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
     stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
-    row per model, view and method, summary.csv, figures and, if asked for, overlays. Killed, it
-    goes on where it was when the same command is started again.
+    row per model, view and method, summary.csv, figures, report.html and, if asked for, overlays.
+    Killed, it goes on where it was when the same command is started again.
 
     Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or all
     rows failed, 2 a wrong command line.
@@ -92,7 +94,9 @@ class EvaluateKeypointNet:
                 dask=self.dask,
                 on_progress=on_progress,
             )
-        return _conclude(folder, write_keypointnet_report(folder), json=self.json)
+        summaries = write_keypointnet_report(folder)
+        write_run_report(folder)
+        return _conclude(folder, summaries, json=self.json)
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ class EvaluateShow:
         folder = RunFolder(self.run_folder)
         config = folder.read_config()
         experiment = None if config is None else config.get("experiment")
-        if experiment not in ("keypointnet", "correspondences"):
+        if experiment not in ("keypointnet", "correspondences", "retrieval"):
             raise DataError("not the folder of an evaluation's run", where=str(self.run_folder))
         if not folder.is_finished:
             raise DataError(
@@ -121,6 +125,8 @@ class EvaluateShow:
                 where=str(self.run_folder),
                 fix="start the command that made it again: it goes on",
             )
+        if experiment == "retrieval":
+            return conclude_retrieval(folder, json=self.json)
         if experiment == "correspondences":
             from cadalign.evaluation.correspondences_report import write_correspondences_report
 
@@ -135,6 +141,7 @@ class Evaluate:
     what: (
         Annotated[EvaluateKeypointNet, tyro.conf.subcommand("keypointnet")]
         | Annotated[EvaluateCorrespondences, tyro.conf.subcommand("correspondences")]
+        | Annotated[EvaluateRetrieval, tyro.conf.subcommand("retrieval")]
         | Annotated[EvaluateShow, tyro.conf.subcommand("show")]
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.cli.output import new_console
+from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
@@ -24,8 +25,8 @@ class EvaluateCorrespondences:
     For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
     along y and z, and the share of the image points is moved to anywhere in the image; all methods
     get the same input. The run's folder gets results.parquet with a row per input and method,
-    summary.csv and figures. Killed, it goes on where it was when the same command is started again.
-    Times are best measured with --workers 1.
+    summary.csv, figures and report.html. Killed, it goes on where it was when the same command is
+    started again. Times are best measured with --workers 1.
 
     Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or all
     rows failed, 2 a wrong command line.
@@ -92,7 +93,9 @@ class EvaluateCorrespondences:
                 dask=self.dask,
                 on_progress=on_progress,
             )
-        return conclude(folder, write_correspondences_report(folder), json=self.json)
+        summaries = write_correspondences_report(folder)
+        write_run_report(folder)
+        return conclude(folder, summaries, json=self.json)
 
 
 def conclude(folder: RunFolder, summaries: Sequence[CorrespondenceSummary], *, json: bool) -> int:

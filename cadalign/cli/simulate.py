@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from cadalign.cli.output import new_console
+from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class _Sweep:
                 on_progress=on_progress,
             )
         summaries = write_sweep_report(folder, kind)
+        write_run_report(folder)
         metric = summaries[0].metric
         shown = [summary for summary in summaries if summary.metric == metric]
         rows, failed = sum(s.runs for s in shown), sum(s.failed for s in shown)
@@ -114,7 +116,7 @@ class SimulateRuntime(_Sweep):
 
 @dataclass(frozen=True)
 class Simulate:
-    """Repeat the AEPnP paper's simulation: tables, and figures as PNG and PDF."""
+    """Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF."""
 
     what: (
         Annotated[SimulateNoise, tyro.conf.subcommand("noise")]

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError
-from cadalign.evaluation.files import writing
 from cadalign.evaluation.keypoint_tasks import AUTO, VISIBILITIES, KeypointTasks
 from cadalign.evaluation.keypointnet import KeypointNetExperiment
 from cadalign.evaluation.methods import LIMIT, check_methods
@@ -268,19 +267,17 @@ def run_keypointnet(
         visibility=options.visibility,
         max_models=options.max_models,
     )
-    overlays = None
+    drawn_in = None
     if drawn:
-        folder.make()
-        overlays = folder.overlays.absolute()
-        with writing(overlays):
-            overlays.mkdir(exist_ok=True)
+        drawn_in = RunFolder(folder.path.absolute())
+        drawn_in.make_for_pictures()
     execute(
         KeypointNetExperiment(
             methods=options.methods,
             noise_px=options.noise_px,
             min_visible=options.min_visible,
             seed=options.seed,
-            overlays=overlays,
+            drawn_in=drawn_in,
         ),
         tasks,
         folder,

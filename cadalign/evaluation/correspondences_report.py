@@ -27,6 +27,7 @@ from cadalign.evaluation.tables import read_table
 from cadalign.validation import FloatArray
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from matplotlib.axes import Axes
 
 ERRORS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
@@ -162,10 +163,17 @@ def write_correspondences_report(folder: RunFolder) -> list[CorrespondenceSummar
 
 def summarize_correspondences(folder: RunFolder) -> list[CorrespondenceSummary]:
     """A summary for every share of outliers and method, in the order of the run."""
-    table = read_table(folder.results)
-    cells = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-    seconds = read_table(folder.timings, columns=["seconds"])["seconds"]
-    cells[TIME] = 1e3 * seconds.to_numpy(zero_copy_only=False).astype(float)
+    return summarize_correspondence_tables(
+        read_table(folder.results), read_table(folder.timings, columns=["seconds"])
+    )
+
+
+def summarize_correspondence_tables(
+    results: pa.Table, timings: pa.Table
+) -> list[CorrespondenceSummary]:
+    """The same of its tables, which may be those of an unfinished run."""
+    cells = {name: results[name].to_numpy(zero_copy_only=False) for name in results.column_names}
+    cells[TIME] = 1e3 * timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
     methods = list(dict.fromkeys(cells["method"].tolist()))
     return [
         _summarize(share, method, cells)

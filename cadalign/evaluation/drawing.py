@@ -1,45 +1,104 @@
-"""The overlay of an evaluated instance: its picture with true and predicted box."""
+"""The pictures of an evaluated instance: as it is, and with its true and predicted box."""
 
 from __future__ import annotations
 
-import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from cadalign.alignment import Alignment
 from cadalign.box import Box
+from cadalign.camera import Camera
 from cadalign.errors import RenderError
+from cadalign.evaluation.exhibit import exhibit_stem
+from cadalign.evaluation.files import write_whole
 from cadalign.evaluation.instance import Instance
+from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.sketch import write_sketch
 from cadalign.picture import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
+from cadalign.render.color import ByteImage
+
+_THUMB_WIDTH = 320
+_QUALITY, _THUMB_QUALITY = 85, 75
+_EFFORT = 4
 
 
-def draw_instance(path: Path, instance: Instance, estimate: Alignment) -> None:
-    """Render an instance, draw truth and estimate over it, and write that to a PNG file.
+def draw_instance(
+    folder: RunFolder,
+    instance: Instance,
+    estimate: Alignment,
+    *,
+    category: str,
+    model_id: str,
+    view: int = 0,
+) -> None:
+    """Render an instance and write its pictures and its model's sketch to a run's folder.
 
-    The file appears whole or not at all.
+    ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
+    one with the boxes, ``pictures`` it as it is, ``sketches`` the model in few triangles. Each file
+    appears whole or not at all.
 
     Raises
     ------
     RenderError
         If the instance has no mesh to draw.
     DataError
-        If the file cannot be written.
+        If a file cannot be written.
     """
+    stem = exhibit_stem(category, model_id, view)
     if instance.scene is None:
-        raise RenderError("there is no mesh to draw", where=path.stem)
+        raise RenderError("there is no mesh to draw", where=stem)
     frame = _renderer().render(instance.scene, instance.camera, instance.cam_from_model)
+    plain = frame.composite()
+    est_box = Box.from_model(instance.bounds, estimate)
     image = draw_overlay(
-        frame.composite(),
+        plain,
         instance.camera,
-        gt_box=Box.from_model(instance.bounds, instance.gt),
-        est_box=Box.from_model(instance.bounds, estimate),
+        gt_box=instance.gt_box,
+        est_box=est_box,
         observed=instance.points_2d,
         reprojected=instance.camera.project(estimate.apply(instance.points_3d)),
     )
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.png")
-    write_image(unfinished, image)
-    os.replace(unfinished, path)
+    small, camera = _scaled(plain, instance.camera, width=_THUMB_WIDTH)
+    thumb = draw_overlay(
+        small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
+    )
+    _write_webp(folder.pictures / f"{stem}.webp", plain, quality=_QUALITY)
+    _write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
+    sketch = folder.sketches / f"{exhibit_stem(category, model_id)}.json"
+    if view == 0 or not sketch.exists():
+        write_sketch(sketch, instance.scene.mesh)
+    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
+
+
+def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
+    """A picture of that width, and its camera."""
+    height = round(camera.height * width / camera.width)
+    across, down = width / camera.width, height / camera.height
+    small = np.asarray(
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
+    return small, replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        # Pixels' corners, not their centres, are where they were.
+        cx=(camera.cx + 0.5) * across - 0.5,
+        cy=(camera.cy + 0.5) * down - 0.5,
+    )
+
+
+def _write_webp(path: Path, image: ByteImage, *, quality: int) -> None:
+    from PIL import Image
+
+    picture = Image.fromarray(image)
+    write_whole(path, lambda unfinished: picture.save(unfinished, quality=quality, method=_EFFORT))
 
 
 @cache

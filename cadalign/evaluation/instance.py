@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.alignment import Alignment
+from cadalign.box import Box
 from cadalign.camera import Camera
 from cadalign.evaluation.hull import KeypointHull, sample_hull_view
 from cadalign.seeding import instance_rng
@@ -64,6 +66,11 @@ class Instance:
     gt: Alignment
     visibility: str
     scene: Scene | None = None
+
+    @cached_property
+    def gt_box(self) -> Box:
+        """The true box."""
+        return Box.from_model(self.bounds, self.gt)
 
 
 def load_scene(model: AnnotatedModel) -> Scene:

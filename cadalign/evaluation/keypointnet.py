@@ -5,21 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.alignment import Alignment
 from cadalign.errors import CadalignError, DataError
+from cadalign.evaluation.exhibit import EXHIBIT_COLUMNS, Estimate, exhibit_row
 from cadalign.evaluation.hull import KeypointHull
 from cadalign.evaluation.instance import Instance, make_hull_instance, make_instance
 from cadalign.evaluation.keypoint_tasks import KeypointTask
 from cadalign.evaluation.limits import limit_estimate
-from cadalign.evaluation.methods import LIMIT, fit_batch_with
+from cadalign.evaluation.methods import LIMIT, fit_batch_with, fit_with, has_statistics
 from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.symmetry import SymmetryGroup
-from cadalign.evaluation.work import AbortError, Columns, Result, reason_of
+from cadalign.evaluation.work import AbortError, Columns, Result, Row, reason_of
 from cadalign.validation import FloatArray
 
 if TYPE_CHECKING:
@@ -27,6 +28,32 @@ if TYPE_CHECKING:
 
 _TIMING = ("category", "model_id", "view", "method", "seconds")
 _TYPES: dict[str, type] = {"int": int, "float": float, "str": str}
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What became of one view of one model.
+
+    Parameters
+    ----------
+    instance : Instance or str
+        Or why there is none.
+    outcomes : list of Outcome
+        One for each method.
+    estimates : list of Estimate or CadalignError
+        What these are the outcomes of; empty where there is no instance.
+    """
+
+    instance: Instance | str
+    outcomes: list[Outcome]
+    estimates: list[Estimate | CadalignError]
+
+    @property
+    def exhibits(self) -> list[Row]:
+        """Its row in the table of exhibits, if there is an instance to show."""
+        if isinstance(self.instance, str):
+            return []
+        return [exhibit_row(self.instance, self.outcomes, self.estimates)]
 
 
 @dataclass(frozen=True)
@@ -42,16 +69,16 @@ class KeypointNetExperiment:
     min_visible : int
         How many keypoints a view must show.
     seed : int
-    overlays : Path, optional
-        An existing folder; the first method's alignment of every instance with a mesh is drawn
-        there.
+    drawn_in : RunFolder, optional
+        Where the first method's alignment of every instance with a mesh is drawn; its folders
+        `overlays`, `thumbs`, `pictures` and `sketches` must exist.
     """
 
     methods: tuple[str, ...]
     noise_px: float = 1.0
     min_visible: int = 6
     seed: int = 0
-    overlays: Path | None = None
+    drawn_in: RunFolder | None = None
 
     @property
     def columns(self) -> Columns:
@@ -62,6 +89,11 @@ class KeypointNetExperiment:
     def timing_columns(self) -> Columns:
         """The instance, the method, and its share of the seconds that its chunk took."""
         return _columns_of(list(_TIMING))
+
+    @property
+    def exhibit_columns(self) -> Columns:
+        """The instance, and what there is to see of it; see `cadalign.evaluation.exhibit`."""
+        return EXHIBIT_COLUMNS
 
     def warm_up(self) -> None:
         """Compile solvers and metrics."""
@@ -78,78 +110,68 @@ class KeypointNetExperiment:
 
     def evaluate(self, tasks: Sequence[KeypointTask]) -> Result:
         """A row for every task and method."""
-        outcomes = self.outcomes(tasks)
-        return Result([row.row() for row in outcomes], [row.timing() for row in outcomes])
+        trials = self.trials(tasks)
+        outcomes = [outcome for trial in trials for outcome in trial.outcomes]
+        return Result(
+            [outcome.row() for outcome in outcomes],
+            [outcome.timing() for outcome in outcomes],
+            [row for trial in trials for row in trial.exhibits],
+        )
 
     def failure(self, task: KeypointTask, reason: str) -> Result:
         """A failed row for every method."""
         outcomes = [self._failure(task, method, reason) for method in self.methods]
         return Result([row.row() for row in outcomes], [row.timing() for row in outcomes])
 
-    def outcomes(self, tasks: Sequence[KeypointTask]) -> list[Outcome]:
-        """The same as `evaluate`, not yet as rows of a table."""
+    def trials(self, tasks: Sequence[KeypointTask]) -> list[Trial]:
+        """The same as `evaluate`, not yet as rows of tables."""
         made = _Instances(self)
-        instances: list[Instance | str] = []
+        trials = []
         seconds = []
         for task in tasks:
             start = time.perf_counter()
             try:
-                instances.append(made.instance(task))
+                trials.append(Trial(made.instance(task), [], []))
             except Exception as error:
-                instances.append(reason_of(error))
+                trials.append(Trial(reason_of(error), [], []))
             seconds.append(time.perf_counter() - start)
-        table: list[list[Outcome]] = [[] for _ in tasks]
         for method in self.methods:
-            for rows, row in zip(table, self._run(method, tasks, instances), strict=True):
-                rows.append(row)
+            self._run(method, tasks, trials)
         # The first method's row bears the time of making the instance.
-        return [
-            row if place else _with_seconds(row, row.seconds + extra)
-            for rows, extra in zip(table, seconds, strict=True)
-            for place, row in enumerate(rows)
-        ]
+        for trial, extra in zip(trials, seconds, strict=True):
+            _add_seconds(trial.outcomes[0], extra)
+        return trials
 
-    def _run(
-        self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | str]
-    ) -> list[Outcome]:
-        """One method's outcome for every task."""
-        usable = [instance for instance in instances if isinstance(instance, Instance)]
+    def _run(self, method: str, tasks: Sequence[KeypointTask], trials: Sequence[Trial]) -> None:
+        """Add one method's estimate and outcome to every trial."""
+        usable = [trial.instance for trial in trials if isinstance(trial.instance, Instance)]
         start = time.perf_counter()
         estimates = iter(self._estimates(method, usable))
         share = (time.perf_counter() - start) / max(len(usable), 1)
-        outcomes = []
-        for task, instance in zip(tasks, instances, strict=True):
-            if isinstance(instance, str):
-                outcomes.append(self._failure(task, method, instance))
+        for task, trial in zip(tasks, trials, strict=True):
+            if isinstance(trial.instance, str):
+                trial.outcomes.append(self._failure(task, method, trial.instance))
                 continue
             start = time.perf_counter()
+            estimate = next(estimates)
             try:
-                outcome = self._outcome(task, instance, method, next(estimates))
+                outcome = self._outcome(task, trial.instance, method, estimate)
             except AbortError:
                 raise
             except Exception as error:
-                outcome = self._failure(task, method, reason_of(error), instance)
-            outcomes.append(_with_seconds(outcome, share + time.perf_counter() - start))
-        return outcomes
+                outcome = self._failure(task, method, reason_of(error), trial.instance)
+            _add_seconds(outcome, share + time.perf_counter() - start)
+            trial.outcomes.append(outcome)
+            trial.estimates.append(estimate)
 
     def _estimates(
         self, method: str, instances: Sequence[Instance]
-    ) -> list[Alignment | CadalignError]:
+    ) -> list[Estimate | CadalignError]:
         """What a method makes of every instance."""
-        estimates: list[Alignment | CadalignError] = []
-        if method == LIMIT:
-            for instance in instances:
-                try:
-                    estimates.append(
-                        limit_estimate(
-                            instance.points_3d, instance.points_2d, instance.camera, instance.gt
-                        )
-                    )
-                except CadalignError as error:
-                    estimates.append(error)
-            return estimates
+        if method == LIMIT or has_statistics(method):
+            return [self._estimate(method, instance) for instance in instances]
         if not instances:
-            return estimates
+            return []
         batch = fit_batch_with(
             method,
             [instance.points_3d for instance in instances],
@@ -158,24 +180,37 @@ class KeypointNetExperiment:
             sigma=self.noise_px or 1.0,
         )
         return [
-            batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))
+            batch.errors[b] if b in batch.errors else Estimate(batch.alignment(b))
+            for b in range(len(batch))
         ]
+
+    def _estimate(self, method: str, instance: Instance) -> Estimate | CadalignError:
+        """What the limit, or a method that tells more than an alignment, makes of an instance."""
+        given = instance.points_3d, instance.points_2d, instance.camera
+        try:
+            if method == LIMIT:
+                return Estimate(limit_estimate(*given, instance.gt))
+            return Estimate.of_fit(fit_with(method, *given, sigma=self.noise_px or 1.0))
+        except CadalignError as error:
+            return error
 
     def _outcome(
         self,
         task: KeypointTask,
         instance: Instance,
         method: str,
-        estimate: Alignment | CadalignError,
+        estimate: Estimate | CadalignError,
     ) -> Outcome:
         if isinstance(estimate, CadalignError):
             return self._failure(task, method, str(estimate), instance)
-        residuals = _projected(instance, estimate) - instance.points_2d
-        if self.overlays is not None and instance.scene is not None and method == self.methods[0]:
-            _draw(self.overlays / overlay_name(*_names(task)), instance, estimate)
+        alignment = estimate.alignment
+        residuals = _projected(instance, alignment) - instance.points_2d
+        if self.drawn_in is not None and instance.scene is not None and method == self.methods[0]:
+            _draw(self.drawn_in, task, instance, alignment)
         return Outcome.of_alignment(
-            estimate,
+            alignment,
             gt=instance.gt,
+            gt_box=instance.gt_box,
             bounds=instance.bounds,
             symmetry=task.symmetry,
             rms_px=float(np.sqrt((residuals**2).sum(axis=1).mean())),
@@ -183,22 +218,13 @@ class KeypointNetExperiment:
             model_id=task.model_id,
             view=task.view,
             method=method,
-            visibility=instance.visibility,
-            keypoints=len(instance.points_3d),
             seconds=0.0,
+            **_known(instance),
         )
 
     def _failure(
         self, task: KeypointTask, method: str, reason: str, instance: Instance | None = None
     ) -> Outcome:
-        known = (
-            {}
-            if instance is None
-            else {
-                "visibility": instance.visibility,
-                "keypoints": len(instance.points_3d),
-            }
-        )
         return Outcome.of_failure(
             reason,
             category=task.category,
@@ -206,13 +232,8 @@ class KeypointNetExperiment:
             view=task.view,
             method=method,
             symmetry="" if task.problem else str(task.symmetry),
-            **known,
+            **({} if instance is None else _known(instance)),
         )
-
-
-def overlay_name(category: str, model_id: str, view: int = 0) -> str:
-    """The file name of an instance's overlay."""
-    return f"{category}_{model_id}.png" if view == 0 else f"{category}_{model_id}_{view}.png"
 
 
 class _Instances:
@@ -267,12 +288,29 @@ def _projected(instance: Instance, estimate: Alignment) -> FloatArray:
     return instance.camera.pixels_from_normalized(points[:, :2] / points[:, 2:])
 
 
-def _draw(path: Path, instance: Instance, estimate: Alignment) -> None:
+def _known(instance: Instance) -> dict[str, Any]:
+    """What an outcome says of its instance."""
+    _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
+    return {
+        "visibility": instance.visibility,
+        "keypoints": len(instance.points_3d),
+        "stretch_y": stretch_y,
+        "stretch_z": stretch_z,
+    }
+
+
+def _draw(folder: RunFolder, task: KeypointTask, instance: Instance, estimate: Alignment) -> None:
     from cadalign.evaluation.drawing import draw_instance
 
-    assert instance.scene is not None
     try:
-        draw_instance(path, instance, estimate)
+        draw_instance(
+            folder,
+            instance,
+            estimate,
+            category=task.category,
+            model_id=task.model_id,
+            view=task.view,
+        )
     except (OSError, DataError) as error:
         raise AbortError(
             f"the overlay cannot be written: {error}",
@@ -280,13 +318,8 @@ def _draw(path: Path, instance: Instance, estimate: Alignment) -> None:
         ) from None
 
 
-def _names(task: KeypointTask) -> tuple[str, str, int]:
-    return task.category, task.model_id, task.view
-
-
-def _with_seconds(outcome: Outcome, seconds: float) -> Outcome:
-    object.__setattr__(outcome, "seconds", seconds)  # fresh, and seen by nobody yet
-    return outcome
+def _add_seconds(outcome: Outcome, seconds: float) -> None:
+    object.__setattr__(outcome, "seconds", outcome.seconds + seconds)  # fresh, seen by nobody yet
 
 
 def _columns_of(names: Sequence[str]) -> Columns:

@@ -48,6 +48,11 @@ def is_robust(name: str) -> bool:
     return name in _RANSAC
 
 
+def has_statistics(name: str) -> bool:
+    """Whether a method predicts standard deviations and knows of alternatives."""
+    return name == "optimal" or name in _VARIANTS or name in _RANSAC
+
+
 def check_methods(names: Iterable[str]) -> tuple[str, ...]:
     """Return the names, each once, if all are known.
 

@@ -6,14 +6,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from cadalign.alignment import Alignment
+from cadalign.box import Box
 from cadalign.errors import InputError
 from cadalign.evaluation.symmetry import SymmetryGroup
-from cadalign.metrics import (
-    alignment_box_iou,
-    rotation_error,
-    scale_error,
-    translation_error,
-)
+from cadalign.metrics import box_iou, rotation_error, scale_error, translation_error
 from cadalign.validation import FloatArray
 
 OK = "ok"
@@ -39,6 +35,8 @@ class Outcome:
         before.
     keypoints : int
         How many keypoints the method was given.
+    stretch_y, stretch_z : float
+        What the model was stretched by; the true scales are one over these.
     rotation_error_deg : float
         [degrees]
     translation_error : float
@@ -68,6 +66,8 @@ class Outcome:
     reason: str
     visibility: str
     keypoints: int | None
+    stretch_y: float | None
+    stretch_z: float | None
     rotation_error_deg: float | None
     translation_error: float | None
     scale_y_error: float | None
@@ -86,6 +86,7 @@ class Outcome:
         est: Alignment,
         *,
         gt: Alignment,
+        gt_box: Box,
         bounds: FloatArray,
         symmetry: SymmetryGroup,
         rms_px: float,
@@ -93,9 +94,12 @@ class Outcome:
     ) -> Outcome:
         """The errors of an estimate; ``labels`` are the fields that name and time the row."""
         _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
-        errors = _pose_errors(est, gt, bounds)
+        box = Box.from_model(bounds, est)
+        errors = _pose_errors(est, box, gt, gt_box)
         truth = symmetry.nearest_truth(est=est, gt=gt)
-        sym_errors = errors if truth is gt else _pose_errors(est, truth, bounds)
+        sym_errors = errors
+        if truth is not gt:
+            sym_errors = _pose_errors(est, box, truth, Box.from_model(bounds, truth))
         return cls(
             status=OK,
             reason="",
@@ -137,11 +141,11 @@ _BLANK: dict[str, Any] = {"visibility": "", "symmetry": "", "seconds": 0.0, "vie
 
 
 def _pose_errors(
-    est: Alignment, gt: Alignment, bounds: FloatArray
+    est: Alignment, est_box: Box, gt: Alignment, gt_box: Box
 ) -> tuple[float, float, float | None]:
     """Rotation, translation, box IoU."""
     try:
-        iou = alignment_box_iou(est=est, gt=gt, bounds=bounds)
+        iou = box_iou(est=est_box, gt=gt_box)
     except InputError:  # a box without volume has none
         iou = None
     return rotation_error(est=est, gt=gt), translation_error(est=est, gt=gt), iou

@@ -48,7 +48,7 @@ PAPER_TABLE = {
     "vessel": PaperRow(4.592, 0.046, 0.063, 0.041, 7),
 }
 """The paper's Table 1: 1 px noise."""
-_PERCENT_NOTE = (
+PERCENT_NOTE = (
     'The paper\'s columns s1 and s2 are headed "%", but by the numbers in its own source they are '
     "fractions: 0.008 means 0.8 %. They are shown here as such, times 100."
 )
@@ -188,7 +188,7 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
     csv.writer(text, lineterminator="\n").writerows([["dataset", *_HEAD], *rows])
     write_text(plan.out / "table1.csv", text.getvalue())
     body = "\n".join(texts)
-    return f"## Table 1: sparse keypoints, 1 px noise\n\n{_PERCENT_NOTE}\n\n{body}"
+    return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
 
 
 _DATASETS = {

@@ -4,10 +4,14 @@ A run's folder::
 
     run.json          configuration and versions; the same command makes the same file
     results.parquet   one row per task and method; the same bytes however the run went
+    exhibits.parquet  what a report shows of a task besides its errors; the same bytes, too
     timings.parquet   seconds of each row: differs from run to run
     progress.json     how far it is, since when, on which host: differs, too
     parts/            tables of finished chunks while the run is not finished
-    summary.csv, figures/, overlays/      whatever the experiment makes of its results
+    summary.csv, figures/             whatever the experiment makes of its results
+    overlays/, thumbs/                instances with their boxes, large and small
+    pictures/, sketches/              instances without boxes, and their models in few triangles
+    report.html                       all of it as one page
 
 A finished chunk is a file in ``parts``, which appears whole or not at all. Started again, a run
 does the chunks that have none. Chunks are the same whatever the number of workers, and their rows
@@ -38,11 +42,11 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.files import write_json, writing
 from cadalign.evaluation.parallel import Chunk, InProcess, LocalProcesses, Workers
 from cadalign.evaluation.tables import read_table, write_rows, write_tables
-from cadalign.evaluation.work import Experiment
+from cadalign.evaluation.work import Columns, Exhibiting, Experiment
 
 T = TypeVar("T")
 
-_FORMAT = 1
+_FORMAT = 2
 _PROGRESS_EVERY = 1.0  # seconds
 _FIX = "give another folder (--out), or remove this one"
 
@@ -74,6 +78,11 @@ class RunFolder:
         return self.path / "timings.parquet"
 
     @property
+    def exhibits(self) -> Path:
+        """``exhibits.parquet``; not all experiments have one."""
+        return self.path / "exhibits.parquet"
+
+    @property
     def progress(self) -> Path:
         """``progress.json``"""
         return self.path / "progress.json"
@@ -94,6 +103,26 @@ class RunFolder:
         return self.path / "overlays"
 
     @property
+    def pictures(self) -> Path:
+        """``pictures``"""
+        return self.path / "pictures"
+
+    @property
+    def thumbs(self) -> Path:
+        """``thumbs``"""
+        return self.path / "thumbs"
+
+    @property
+    def sketches(self) -> Path:
+        """``sketches``"""
+        return self.path / "sketches"
+
+    @property
+    def report(self) -> Path:
+        """``report.html``"""
+        return self.path / "report.html"
+
+    @property
     def parts(self) -> Path:
         """``parts``"""
         return self.path / "parts"
@@ -111,6 +140,10 @@ class RunFolder:
         """The timings of a chunk."""
         return self.parts / f"{index:07d}.timings.parquet"
 
+    def part_exhibits(self, index: int) -> Path:
+        """The exhibits of a chunk."""
+        return self.parts / f"{index:07d}.exhibits.parquet"
+
     def make(self) -> None:
         """Make the folder.
 
@@ -121,6 +154,13 @@ class RunFolder:
         """
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
+
+    def make_for_pictures(self) -> None:
+        """Make the folder and those in it that pictures go to; see `make`."""
+        self.make()
+        for path in (self.overlays, self.thumbs, self.pictures, self.sketches):
+            with writing(path):
+                path.mkdir(exist_ok=True)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -295,9 +335,12 @@ def _do_chunks(
     chunks = (Chunk(index, tasks[starts[index] : starts[index] + chunk_size]) for index in missing)
     if not missing:
         return
+    exhibited = _exhibit_columns(experiment)
     for chunk, result in workers.evaluate(experiment, chunks):
         # The results last: they say that the chunk is done.
         write_rows(folder.part_timings(chunk.index), experiment.timing_columns, result.timings)
+        if exhibited:
+            write_rows(folder.part_exhibits(chunk.index), exhibited, result.exhibits)
         write_rows(folder.part(chunk.index), experiment.columns, result.rows)
         done += len(chunk.tasks)
         diary.note(done)
@@ -312,12 +355,24 @@ def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> No
         experiment.timing_columns,
         (read_table(folder.part_timings(index)) for index in range(chunks)),
     )
+    exhibited = _exhibit_columns(experiment)
+    if exhibited:
+        write_tables(
+            folder.exhibits,
+            exhibited,
+            (read_table(folder.part_exhibits(index)) for index in range(chunks)),
+        )
     # The results last: they say that the run is finished.
     write_tables(
         folder.results,
         experiment.columns,
         (read_table(folder.part(index)) for index in range(chunks)),
     )
+
+
+def _exhibit_columns(experiment: Experiment[Any]) -> Columns:
+    """The columns of an experiment's exhibits; none if it has no exhibits."""
+    return experiment.exhibit_columns if isinstance(experiment, Exhibiting) else ()
 
 
 class _Diary:

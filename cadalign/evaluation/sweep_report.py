@@ -26,10 +26,11 @@ from cadalign.evaluation.tables import read_table
 from cadalign.validation import FloatArray
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from matplotlib.axes import Axes
 
 TIME_METRIC = "microseconds"
-_VALUE_LABELS = {
+VALUE_LABELS = {
     "noise_px": "noise of the keypoints [px]",
     "points": "number of points",
     "outlier_share": "outliers [%]",
@@ -63,11 +64,18 @@ class SweepSummary:
 
 def summarize_sweep(folder: RunFolder, kind: SweepKind) -> list[SweepSummary]:
     """Quartiles of a finished run, for every metric, method and value."""
-    table = read_table(folder.results)
-    cells = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
+    return summarize_sweep_tables(
+        read_table(folder.results), read_table(folder.timings, columns=["seconds"]), kind
+    )
+
+
+def summarize_sweep_tables(
+    results: pa.Table, timings: pa.Table, kind: SweepKind
+) -> list[SweepSummary]:
+    """The same of its tables, which may be those of an unfinished run."""
+    cells = {name: results[name].to_numpy(zero_copy_only=False) for name in results.column_names}
     metrics: tuple[str, ...] = SWEEP_METRICS
     if kind.is_timed:
-        timings = read_table(folder.timings, columns=["seconds"])
         cells[TIME_METRIC] = 1e6 * timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
         metrics = (TIME_METRIC, *metrics)
     summaries = []
@@ -131,7 +139,7 @@ def draw_sweep(path: Path, kind: SweepKind, summaries: list[SweepSummary]) -> li
             axes.minorticks_off()
             axes.tick_params(axis="x", labelrotation=45 if len(kind.values) > 9 else 0)
         label_log_axis(axes)
-        axes.set_xlabel(_VALUE_LABELS[kind.column])
+        axes.set_xlabel(VALUE_LABELS[kind.column])
         axes.set_ylabel(METRIC_LABELS[metric])
         axes.set_title(_held(kind, summaries), fontsize=9, color="0.35", loc="left")
         axes.legend(loc="best")

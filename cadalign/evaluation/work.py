@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from cadalign.errors import CadalignError, DataError
 
@@ -33,10 +33,13 @@ class Result:
         Of the result table; the same in every run.
     timings : list of dict
         Of the table of what differs from run to run.
+    exhibits : list of dict
+        Of the table of what there is to see, for experiments that are `Exhibiting`.
     """
 
     rows: list[Row]
     timings: list[Row]
+    exhibits: list[Row] = field(default_factory=list)
 
     @classmethod
     def joined(cls, parts: Sequence[Result]) -> Result:
@@ -44,6 +47,7 @@ class Result:
         return cls(
             [row for part in parts for row in part.rows],
             [row for part in parts for row in part.timings],
+            [row for part in parts for row in part.exhibits],
         )
 
 
@@ -66,6 +70,15 @@ class Experiment(Protocol[T_contra]):
 
     def failure(self, task: T_contra, reason: str) -> Result:
         """The rows of a task that could not be evaluated."""
+
+
+@runtime_checkable
+class Exhibiting(Protocol):
+    """An experiment that also records what there is to see of its tasks, the same in every run."""
+
+    @property
+    def exhibit_columns(self) -> Columns:
+        """The columns of the table of exhibits."""
 
 
 class AbortError(DataError):

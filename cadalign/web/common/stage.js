@@ -40,6 +40,7 @@ export class Stage {
 
     this.controls = new OrbitControls(this.camera, this.canvas);
     this.controls.addEventListener("change", () => this.invalidate());
+    this.canvas.addEventListener("keydown", (event) => this.steer(event));
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(host);
     this.resize();
@@ -60,11 +61,32 @@ export class Stage {
     this.invalidate();
   }
 
+  /** Orbit by the arrow keys, come nearer and go back by plus and minus. */
+  steer(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const step = Math.PI / 24;
+    const nearer = 0.9;
+    const move = {
+      ArrowLeft: () => this.controls.rotateLeft(step),
+      ArrowRight: () => this.controls.rotateLeft(-step),
+      ArrowUp: () => this.controls.rotateUp(step),
+      ArrowDown: () => this.controls.rotateUp(-step),
+      "+": () => this.controls.dollyIn(nearer),
+      "=": () => this.controls.dollyIn(nearer),
+      "-": () => this.controls.dollyOut(nearer),
+    }[event.key];
+    if (!move) return;
+    move();
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
   /** Ask for a redraw with the next frame. */
   invalidate() {
     if (this.pending) return;
     this.pending = requestAnimationFrame(() => {
       this.pending = 0;
+      this.beforeDraw?.();
       this.renderer.render(this.scene, this.camera);
     });
   }

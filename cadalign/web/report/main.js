@@ -1,4 +1,58 @@
 import "../common/theme.css";
-import { Stage } from "../common/stage.js";
+import "./page.css";
+import "./gallery.css";
+import "./viewer.css";
+import "./print.css";
+import { h } from "../common/dom.js";
+import { Comparison } from "./compare.js";
+import { switches } from "./filters.js";
+import { Gallery } from "./gallery.js";
+import { heading, headline } from "./headline.js";
+import { Report, readPayload } from "./payload.js";
+import { plotSection } from "./plots.js";
+import { State } from "./state.js";
+import { Viewer } from "./viewer.js";
 
-window.Stage = Stage;
+const report = new Report(readPayload());
+const state = new State();
+document.title = report.title;
+
+let viewer = null;
+const open = (instance, extra) => viewer.open(instance, extra);
+const gallery = report.instances.length ? new Gallery(report, state, { open }) : null;
+const comparison =
+  report.runs.length > 1 && report.rows.count ? new Comparison(report, state, { open }) : null;
+const plots = plotSection(report, state);
+
+const sections = [headline(report), plots, comparison?.element, gallery?.element].filter(Boolean);
+const links = sections
+  .filter(({ id }) => id)
+  .map((section) => {
+    const words = section.dataset.short ?? section.querySelector("h2").textContent;
+    // The fragment holds the state, so these are not links to one.
+    return h("button", { type: "button", onclick: () => section.scrollIntoView() }, words);
+  });
+const bar = h(
+  "nav",
+  { class: "bar", "aria-label": "sections and what they show" },
+  h("div", { class: "links" }, links),
+  (plots || gallery) && switches(report, state),
+);
+document.body.append(h("div", { class: "page" }, heading(report), bar, h("main", {}, sections)));
+// What is scrolled to is not to end up under the bar.
+new ResizeObserver(() => {
+  document.documentElement.style.setProperty("--bar", `${bar.offsetHeight}px`);
+}).observe(bar);
+
+// An instance opened from the comparison is walked through by the comparison's order.
+const list = (instance) => {
+  if (gallery.found.includes(instance)) return gallery.found;
+  return report.instances.filter(({ run }) => run === instance.run);
+};
+if (gallery) {
+  viewer = new Viewer(report, state, {
+    list,
+    closed: (instance) => gallery.focus(gallery.found.indexOf(instance)),
+  });
+}
+document.documentElement.dataset.ready = "";

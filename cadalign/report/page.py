@@ -1,0 +1,122 @@
+"""The page: one HTML file with everything inside, and perhaps a folder of pictures beside it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from cadalign.evaluation.files import dense_json, write_text, writing
+from cadalign.report.headline import headline_of
+from cadalign.report.instances import instance_table
+from cadalign.report.media import INLINE_LIMIT, Shelf, inline_bytes
+from cadalign.report.payload import all_methods, payload_of
+from cadalign.report.runs import INSTANCES, read_runs
+from cadalign.report.words import title_of
+from cadalign.web import asset
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta name="generator" content="cadalign">
+<link rel="icon" href="data:,">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<noscript>This page needs JavaScript. The same tables without it: cadalign report --format md
+</noscript>
+<script type="application/json" id="payload">{payload}</script>
+<script>{script}</script>
+</body>
+</html>
+"""
+# JSON may have these escaped anywhere they can stand; HTML must not see them.
+_ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page that was written.
+
+    Parameters
+    ----------
+    path : Path
+        The page.
+    assets : Path, optional
+        The folder of its pictures, where they are not inside it.
+    """
+
+    path: Path
+    assets: Path | None
+
+
+def write_report(
+    runs: Sequence[str | os.PathLike[str]],
+    path: str | os.PathLike[str],
+    *,
+    assets: bool = False,
+    title: str | None = None,
+) -> Report:
+    """Write the result of runs as a page that needs no network.
+
+    Parameters
+    ----------
+    runs : sequence of path-like
+        Folders of runs, finished or not; several of the same kind are compared.
+    path : path-like
+        The page to write.
+    assets : bool
+        Whether pictures go into a folder beside the page, named after it; they do so in any case if
+        the page were larger than 60 MB.
+    title : str, optional
+        By default it says what was run on what.
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    InputError
+        If there are no runs, one is given twice, or they are of different kinds.
+    DataError
+        If a folder is not a run's, nothing of a run is finished, or the page cannot be written.
+
+    Examples
+    --------
+    >>> write_report(["runs/keypointnet"], "report.html").assets  # doctest: +SKIP
+    >>> write_report(["runs/before", "runs/after"], "compare.html")  # doctest: +SKIP
+    """
+    page = Path(path)
+    found = read_runs(runs)
+    with writing(page.parent):
+        page.parent.mkdir(parents=True, exist_ok=True)
+    table, media = None, {}
+    folder = None
+    if found[0].family == INSTANCES:
+        table = instance_table(found, all_methods(found))
+        if assets or inline_bytes(found) > INLINE_LIMIT:
+            folder = page.with_name(f"{page.stem}_assets")
+        shelf = Shelf(page, folder)
+        shelf.fill(found, table)
+        media = shelf.to_dict()
+    payload = payload_of(found, headline_of(found), table, media, title=title or title_of(found))
+    write_text(page, render_page(payload))
+    return Report(page, folder)
+
+
+def render_page(payload: dict[str, Any]) -> str:
+    """The HTML of a payload; texts in it cannot become part of the page."""
+    return _PAGE.format(
+        title=escape(str(payload["title"])),
+        style=asset("report.css"),
+        payload=dense_json(payload).translate(_ESCAPES),
+        script=asset("report.js"),
+    )

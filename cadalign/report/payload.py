@@ -1,0 +1,131 @@
+"""What the page is told: one JSON object. Its reader is ``cadalign/web/report``.
+
+::
+
+    {
+      "format": 1,
+      "title": "...", "summary": "one paragraph of plain text",
+      "runs": [{"name", "what": "keypointnet" | "demo" | "simulation" | "correspondences"
+                         | "retrieval",
+                "state": "finished" | "unfinished", "done", "total", "settings": [[name, value]]}],
+      "methods": [{"key", "label", "color", "color_dark", "dash": "solid" | "dash", "is_limit"}],
+      "metrics": [{"key", "label", "unit", "factor", "digits", "better": "low" | "high", "log",
+                   "limit"}],
+      "headline": {"group", "columns": [{"key", "label", "unit", "digits", "better"}],
+                   "rows": [{"run", "category", "method", "cells": {key: number}, "best": [key]}],
+                   "failures": [{"run", "category", "method", "reason", "count"}],
+                   "paper": [{"category", "method", "cells"}], "note"},
+      "tables": {
+        "strings": [...],
+        "instances": {"id", "run", "category", "model", "view", "keypoints", "true_y", "true_z",
+                      "noise", "visibility", "symmetry", "exhibit", "thumb"},
+        "rows": {"instance", "method", "status", "reason", each metric's key}
+      },
+      "plots": [{"id", "title", "kind": "lines", "x": {"label", "unit", "log"}, "y",
+                 "traces": [{"run", "method", "x", "y", "low", "high"}], "note"}],
+      "pictures": {key: URL}, "thumbs": {key: URL},
+      "exhibits": {key: exhibit}, "meshes": {key: mesh}
+    }
+
+``tables`` holds columns, each a list: ``category``, ``model``, ``visibility``, ``symmetry`` and
+``reason`` are places in ``strings`` (``reason`` -1 where there is none), ``method`` and ``run``
+places in the lists above, ``status`` is 1 for a failure. ``id`` is the same for the same instance
+of several runs; ``true_y`` and ``true_z`` are what the model was stretched by. Numbers of rows are
+as results have them: shown is the value times the metric's ``factor``. ``limit``, the cells of the
+headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
+
+``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is what `cadalign.evaluation.exhibit`
+describes, with the keys of its ``picture``, which has no boxes drawn in as thumbs have, and of its
+``mesh``, both null where there is none. A mesh is what `cadalign.evaluation.sketch` makes of the
+dataset's model: that, times the exhibit's ``stretch``, is the model that methods were given.
+
+Where pictures are in a folder beside the page, instead of ``exhibits`` and ``meshes`` there are
+``exhibit_files``, scripts that call ``cadalignExhibit(key, exhibit)`` for ``exhibits_per_file``
+keys each (key k is in file k / exhibits_per_file), and ``mesh_files``, by key, that call
+``cadalignMesh(key, mesh)``. A page opened from a file may load scripts, but not fetch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from cadalign.report.headline import Column, Headline
+from cadalign.report.instances import InstanceTable
+from cadalign.report.looks import METRICS, method_dict
+from cadalign.report.plots import line_plots
+from cadalign.report.runs import INSTANCES, Run
+from cadalign.report.words import settings_of, summary_of
+
+_FORMAT = 1
+
+
+def payload_of(
+    runs: Sequence[Run],
+    headline: Headline,
+    table: InstanceTable | None,
+    media: dict[str, Any],
+    *,
+    title: str,
+) -> dict[str, Any]:
+    """Put a page's payload together.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Of one family.
+    headline : Headline
+    table : InstanceTable, optional
+        For runs that have instances.
+    media : dict
+        Pictures, thumbs, exhibits and meshes; see `cadalign.report.media.Shelf`.
+    title : str
+    """
+    return {
+        "format": _FORMAT,
+        "title": title,
+        "summary": summary_of(runs),
+        "runs": [
+            {
+                "name": run.name,
+                "what": run.experiment if run.family == INSTANCES else run.family,
+                "state": "finished" if run.is_finished else "unfinished",
+                "done": run.done,
+                "total": run.total,
+                "settings": [list(pair) for pair in settings_of(run)],
+            }
+            for run in runs
+        ],
+        "methods": [method_dict(name) for name in all_methods(runs)],
+        "metrics": [metric.to_dict() for metric in METRICS] if table is not None else [],
+        "headline": _headline(headline),
+        "tables": None if table is None else table.to_dict(),
+        "plots": line_plots(runs),
+        **media,
+    }
+
+
+def all_methods(runs: Sequence[Run]) -> list[str]:
+    """The methods of all runs, in the order of the first that has them."""
+    return list(dict.fromkeys(name for run in runs for name in run.methods))
+
+
+def _headline(headline: Headline) -> dict[str, Any]:
+    return {
+        "group": headline.group,
+        "columns": [_column(column) for column in headline.columns],
+        "rows": [asdict(row) for row in headline.rows],
+        "failures": [asdict(failure) for failure in headline.failures],
+        "paper": [
+            {"category": row.category, "method": row.method, "cells": row.cells}
+            for row in headline.paper
+        ],
+        "note": headline.note,
+    }
+
+
+def _column(column: Column) -> dict[str, Any]:
+    found = asdict(column)
+    del found["factor"]  # the cells are as shown
+    return found

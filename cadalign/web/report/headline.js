@@ -1,0 +1,222 @@
+// The headline table, the failures behind it, and the settings of the runs.
+import { h } from "../common/dom.js";
+import { count, number, plural } from "./format.js";
+import { swatch } from "./swatch.js";
+
+/** The top of the page: what was run, on what, how far. */
+export function heading(report) {
+  return h(
+    "header",
+    { class: "hero" },
+    h("p", { class: "kicker" }, "cadalign"),
+    h("h1", {}, report.title),
+    h("p", { class: "lead" }, report.summary),
+    report.runs.map((run) => runFacts(run, report.runs.length)),
+  );
+}
+
+function runFacts(run, runs) {
+  const unfinished = run.state !== "finished";
+  const progress =
+    unfinished && run.total
+      ? h(
+          "p",
+          { class: "warning" },
+          h("strong", {}, "Unfinished: "),
+          `${count(run.done)} of ${count(run.total)} instances are done. Numbers may still change. `,
+          h("progress", {
+            value: run.done,
+            max: run.total,
+            "aria-label": `progress of ${run.name}`,
+          }),
+        )
+      : unfinished &&
+        h("p", { class: "warning" }, h("strong", {}, "Unfinished. "), "Numbers may still change.");
+  const facts = (run.settings ?? []).map(([name, value]) =>
+    h("div", {}, h("dt", {}, name), h("dd", {}, String(value))),
+  );
+  const words = runs > 1 ? run.name : "Settings";
+  return [
+    progress,
+    facts.length > 0 &&
+      h("details", { class: "facts" }, h("summary", {}, words), h("dl", {}, facts)),
+  ];
+}
+
+/** The section with the headline table. */
+export function headline(report) {
+  const { headline: given } = report;
+  if (!given.rows.length) {
+    return h(
+      "section",
+      { id: "results" },
+      h("h2", {}, "Results"),
+      h("p", { class: "empty" }, "No results yet."),
+    );
+  }
+  return h(
+    "section",
+    { id: "results", "aria-labelledby": "results-title" },
+    h("h2", { id: "results-title" }, "Results"),
+    h(
+      "div",
+      { class: "scroller", tabindex: 0, role: "region", "aria-labelledby": "results-title" },
+      table(report, given),
+    ),
+    h(
+      "p",
+      { class: "note" },
+      h("b", { class: "best" }, "Bold on a tinted field"),
+      ` is the best of its ${given.group ?? "category"}. `,
+      given.note,
+    ),
+    failures(report, given.failures ?? []),
+  );
+}
+
+function table(report, { columns, rows, paper = [], group = "category" }) {
+  const several = report.runs.length > 1;
+  const names = [...new Set(rows.map((row) => row.category ?? ""))];
+  const bodies = names.map((name) =>
+    h(
+      "tbody",
+      {},
+      name !== "" &&
+        h(
+          "tr",
+          { class: "group" },
+          h(
+            "th",
+            { scope: "rowgroup", colspan: columns.length + 1 + several },
+            h("span", {}, groupWords(group, name)),
+          ),
+        ),
+      inOrder(
+        report,
+        rows.filter((row) => (row.category ?? "") === name),
+      ).map((row) => bodyRow(report, columns, row, several)),
+      paper
+        .filter((row) => (row.category ?? "") === name)
+        .map((row) => paperRow(columns, row, several)),
+    ),
+  );
+  return h(
+    "table",
+    { class: "headline" },
+    h("caption", { class: "visually-hidden" }, `Results by ${group} and method`),
+    h(
+      "thead",
+      {},
+      h(
+        "tr",
+        {},
+        h("th", { scope: "col" }, "method"),
+        several && h("th", { scope: "col", class: "words" }, "run"),
+        columns.map((column) =>
+          h(
+            "th",
+            { scope: "col" },
+            column.label,
+            column.unit && h("small", {}, ` [${column.unit}]`),
+          ),
+        ),
+      ),
+    ),
+    bodies,
+  );
+}
+
+// A category is a word of its own; a value of noise needs to be told what it is.
+const groupWords = (group, name) => (group === "category" ? name : `${group}: ${name}`);
+
+/** Rows of the same method stand together, so that runs can be compared. */
+function inOrder(report, rows) {
+  const place = new Map(report.methods.map((method, index) => [method.key, index]));
+  return rows.toSorted((a, b) => place.get(a.method) - place.get(b.method) || a.run - b.run);
+}
+
+function bodyRow(report, columns, row, several) {
+  const method = report.method.get(row.method);
+  return h(
+    "tr",
+    {},
+    h("th", { scope: "row" }, swatch(report, method), method?.label ?? row.method),
+    several && h("td", { class: "words" }, report.runs[row.run]?.name),
+    columns.map((column) => {
+      const text = shown(column, row.cells[column.key]);
+      const best = row.best?.includes(column.key);
+      return h(
+        "td",
+        {},
+        best
+          ? h("b", { class: "best" }, text, h("span", { class: "visually-hidden" }, " (best)"))
+          : text,
+      );
+    }),
+  );
+}
+
+function paperRow(columns, row, several) {
+  return h(
+    "tr",
+    { class: "paper" },
+    h("th", { scope: "row" }, row.method),
+    several && h("td"),
+    columns.map((column) => h("td", {}, shown(column, row.cells[column.key]))),
+  );
+}
+
+const shown = ({ digits }, value) =>
+  number(value, Number.isInteger(value) && !digits ? undefined : digits);
+
+function failures(report, list) {
+  if (!list.length) return null;
+  const total = list.reduce((sum, failure) => sum + failure.count, 0);
+  const several = report.runs.length > 1;
+  const rows = list
+    .toSorted((a, b) => b.count - a.count)
+    .map((failure) =>
+      h(
+        "tr",
+        {},
+        h("td", { class: "words" }, failure.reason),
+        h("td", {}, count(failure.count)),
+        h("td", { class: "words" }, report.method.get(failure.method)?.label ?? failure.method),
+        h("td", { class: "words" }, failure.category),
+        several && h("td", { class: "words" }, report.runs[failure.run]?.name),
+      ),
+    );
+  const heads = [
+    "reason",
+    "fits",
+    "method",
+    report.headline.group ?? "category",
+    several && "run",
+  ].filter(Boolean);
+  return h(
+    "details",
+    { class: "failures" },
+    h("summary", {}, `${plural(total, "fit")} failed, by reason`),
+    h(
+      "div",
+      { class: "scroller", tabindex: 0, role: "region", "aria-label": "failures by reason" },
+      h(
+        "table",
+        {},
+        h("caption", { class: "visually-hidden" }, "Failures by reason"),
+        h(
+          "thead",
+          {},
+          h(
+            "tr",
+            {},
+            heads.map((head) =>
+              h("th", { scope: "col", class: head === "fits" ? "" : "words" }, head),
+            ),
+          ),
+        ),
+        h("tbody", {}, rows),
+      ),
+    ),
+  );
+}

@@ -1,0 +1,113 @@
+// What is shown, kept in the URL's fragment: a link shows the same view.
+
+const DEFAULTS = {
+  // plots
+  metric: "", // the metric of the plots
+  hide: "", // methods not shown, by key, separated by blanks
+  hideruns: "", // runs not shown, by index
+  // gallery
+  run: "",
+  sort: "", // the metric to sort and to filter by
+  order: "worst", // worst | best | random | listed
+  seed: "1",
+  category: "",
+  method: "",
+  status: "", // ok | failed
+  kmin: "",
+  kmax: "",
+  emin: "",
+  emax: "",
+  q: "",
+  // the instance that is open
+  open: "",
+  openrun: "0",
+  show: "", // the method whose prediction is drawn
+  alt: "", // the alternative drawn in its place
+  layers: "gpk", // g: truth, p: prediction, k: keypoints, w: wireframe
+  beside: "", // the run drawn beside the open one
+  // comparison
+  a: "0",
+  b: "1",
+  by: "", // the metric compared
+  with: "", // the method compared
+};
+
+export class State {
+  #values = { ...DEFAULTS };
+  #listeners = [];
+
+  constructor() {
+    this.#read();
+    window.addEventListener("hashchange", () => {
+      if (this.fragment() !== location.hash) this.#announce(() => this.#read());
+    });
+    window.addEventListener("popstate", () => this.#announce(() => this.#read()));
+  }
+
+  get(name) {
+    return this.#values[name];
+  }
+
+  /** A number, or null where the state names none. */
+  number(name) {
+    const text = this.#values[name];
+    const value = Number(text);
+    return text === "" || !Number.isFinite(value) ? null : value;
+  }
+
+  /** The words of a value that is a list of them. */
+  words(name) {
+    return new Set(this.#values[name].split(" ").filter(Boolean));
+  }
+
+  /** Take a word of a list in or out. */
+  toggle(name, word) {
+    const words = this.words(name);
+    if (!words.delete(word)) words.add(word);
+    this.set({ [name]: [...words].join(" ") });
+  }
+
+  /**
+   * Change values, and tell those who listen.
+   *
+   * @param {object} changes
+   * @param {object} options
+   * @param {boolean} options.remember - whether the browser's "back" is to undo it
+   */
+  set(changes, { remember = false } = {}) {
+    this.#announce(() => {
+      Object.assign(this.#values, changes);
+      const url = this.fragment() || location.pathname + location.search;
+      history[remember ? "pushState" : "replaceState"](null, "", url);
+    });
+  }
+
+  /** The fragment of this state with some values changed. */
+  fragment(changes = {}) {
+    const parameters = new URLSearchParams();
+    for (const [name, value] of Object.entries({ ...this.#values, ...changes })) {
+      if (value !== DEFAULTS[name]) parameters.set(name, value);
+    }
+    const text = parameters.toString();
+    return text && `#${text}`;
+  }
+
+  /** Call back with the names of the values that changed. */
+  listen(action) {
+    this.#listeners.push(action);
+  }
+
+  #read() {
+    const given = new URLSearchParams(location.hash.slice(1));
+    for (const name of Object.keys(DEFAULTS)) {
+      this.#values[name] = given.get(name) ?? DEFAULTS[name];
+    }
+  }
+
+  #announce(change) {
+    const before = { ...this.#values };
+    change();
+    const names = Object.keys(DEFAULTS).filter((name) => before[name] !== this.#values[name]);
+    if (names.length) for (const action of this.#listeners) action(new Set(names));
+  }
+}

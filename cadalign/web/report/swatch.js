@@ -1,0 +1,71 @@
+// A method's colour, line and symbol, as every legend of the page shows it.
+import { svg } from "../common/dom.js";
+import { isDark } from "../common/colors.js";
+
+export const DASHES = { solid: "", dash: "6 4", dot: "2 3", dashdot: "7 3 2 3" };
+
+/** Plotly's names of symbols, and the same as paths about the middle of a swatch. */
+export const SYMBOLS = [
+  ["circle", "M9 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0Z"],
+  ["square", "M9.5 1.5h7v7h-7Z"],
+  ["diamond", "M13 0L18 5L13 10L8 5Z"],
+  ["triangle-up", "M13 0.5L17.8 9H8.2Z"],
+  ["triangle-down", "M13 9.5L17.8 1H8.2Z"],
+  ["cross", "M11.5 0.5h3v3h3v3h-3v3h-3v-3h-3v-3h3Z"],
+  ["star", "M13 0l1.3 3.4 3.7.2-2.9 2.3 1 3.6-3.1-2-3.1 2 1-3.6L8 3.6l3.7-.2Z"],
+];
+
+/** How the lines of each run are drawn where there are several. */
+const RUN_DASHES = ["solid", "dash", "dot", "dashdot"];
+
+export const runDash = (run) => RUN_DASHES[run % RUN_DASHES.length];
+
+/** A method's place among the symbols. */
+export const placeOf = (report, key) =>
+  Math.max(
+    report.methods.findIndex((method) => method.key === key),
+    0,
+  ) % SYMBOLS.length;
+
+/** A method's colour in the page's present light. */
+export const colorOf = (method, dark = isDark()) =>
+  (dark ? method?.color_dark : method?.color) ?? method?.color ?? "gray";
+
+/** A short piece of a run's line. */
+export function runSwatch(run) {
+  const line = {
+    d: "M1 5H25",
+    stroke: "currentColor",
+    "stroke-width": 2,
+    "stroke-dasharray": DASHES[runDash(run)],
+  };
+  return svg(
+    "svg",
+    { class: "swatch", viewBox: "0 0 26 10", width: 26, height: 10, "aria-hidden": "true" },
+    svg("path", line),
+  );
+}
+
+/** A short piece of a method's line. Both colours are given, so that CSS picks with the theme. */
+export function swatch(report, method) {
+  if (!method) return null;
+  const color = `light-dark(${colorOf(method, false)}, ${colorOf(method, true)})`;
+  return svg(
+    "svg",
+    {
+      class: "swatch",
+      viewBox: "0 0 26 10",
+      width: 26,
+      height: 10,
+      "aria-hidden": "true",
+      style: `color: ${color}`,
+    },
+    svg("path", {
+      d: "M1 5H25",
+      stroke: "currentColor",
+      "stroke-width": 2.5,
+      "stroke-dasharray": DASHES[method.dash] ?? "",
+    }),
+    svg("path", { d: SYMBOLS[placeOf(report, method.key)][1], fill: "currentColor" }),
+  );
+}

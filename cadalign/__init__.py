@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from cadalign.batch import BatchResult
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.fitting import fit, fit_batch
+    from cadalign.retrieval.library import Library
+    from cadalign.retrieval.match import Match
     from cadalign.robust import RansacOptions
 
 __version__ = "0.1.0"
@@ -25,6 +27,8 @@ __all__ = [
     "CadalignError",
     "Camera",
     "FitResult",
+    "Library",
+    "Match",
     "Material",
     "Mesh",
     "RansacOptions",
@@ -38,6 +42,8 @@ __all__ = [
 _LAZY = {
     "RansacOptions": "cadalign.robust",
     "BatchResult": "cadalign.batch",
+    "Library": "cadalign.retrieval.library",
+    "Match": "cadalign.retrieval.match",
     "evaluate": "cadalign.evaluation.api",
     "fit": "cadalign.fitting",
     "fit_batch": "cadalign.fitting",

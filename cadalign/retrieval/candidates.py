@@ -1,0 +1,241 @@
+"""What a query is compared with: models, with their labels as they are or mirrored."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.camera import Camera
+from cadalign.errors import DegenerateError, InputError
+from cadalign.options import LOSSES
+from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all
+from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
+from cadalign.retrieval.options import RetrievalOptions
+from cadalign.validation import FloatArray, IntArray, as_floats, as_points
+from cadalign.whitening import rays_of, whitening_of
+
+_LINEAR = LOSSES["linear"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """An image's keypoints, in the order of their semantic ids.
+
+    Parameters
+    ----------
+    semantic_ids : (n,) int
+    points_2d : (n, 2) float
+        [px]
+    camera : Camera
+    query : Query
+        The same for the kernels.
+    spurious : float
+        Log-likelihood of all keypoints if none of them is the model's.
+    """
+
+    semantic_ids: IntArray
+    points_2d: FloatArray
+    camera: Camera
+    query: Query
+    spurious: float
+
+
+def observe(
+    points_2d: npt.ArrayLike,
+    semantic_ids: npt.ArrayLike,
+    camera: Camera,
+    options: RetrievalOptions,
+) -> Observed:
+    """Check an image's keypoints and prepare them for the kernels.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, a semantic id occurs twice, or the
+        keypoints' standard deviations are invalid.
+    """
+    if not isinstance(camera, Camera):
+        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+    pixels = as_points(points_2d, name="points_2d", dimension=2)
+    ids = check_semantic_ids(semantic_ids, len(pixels), where="semantic_ids")
+    order = np.argsort(ids)
+    pixels, ids = pixels[order], ids[order]
+    covariances = _covariances(options, pixels, order)
+    rays = rays_of(pixels, camera)
+    fitting = options.fitting
+    off = np.log(options.spurious / (camera.width * camera.height))
+    density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
+    query = Query(
+        ids=ids,
+        rays=np.require(rays, np.float64, ["C", "W"]),
+        whitening=whitening_of(covariances, rays, camera),
+        loss=LOSSES[fitting.loss],
+        loss_scale=float(fitting.loss_scale),
+        prior_weight=fitting.prior_weight,
+        free=options.fitting.free,
+        max_stretch=float(options.max_stretch),
+        gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
+    )
+    return Observed(ids, pixels, camera, query, float(off) * len(ids))
+
+
+def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
+    """Covariances of noise and shape together, (n, 2, 2) float [px^2], in the given order."""
+    count = len(pixels)
+    dimensions = np.ndim(options.sigma)
+    if dimensions == 3:
+        covariances = as_floats(options.sigma, name="sigma", shape=(count, 2, 2))[order]
+    else:
+        shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
+        deviations = np.broadcast_to(as_floats(options.sigma, name="sigma", shape=shape), count)
+        if not (deviations > 0).all():
+            raise InputError("has values that are not positive", where="sigma")
+        covariances = deviations[order][:, None, None] ** 2 * np.eye(2)
+    extent = float(np.linalg.norm(np.ptp(pixels, axis=0))) if count else 0.0
+    return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The candidates of a query that share enough keypoints with it.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        For the kernels.
+    models : (c,) int
+        Of which row of the table each candidate is.
+    mirrored : (c,) bool
+    base : (c,) float
+        Log-likelihood of a candidate that fits without error.
+    bounds : (c,) float
+        Lower bounds of what twice the log-likelihood falls short of that.
+    """
+
+    candidates: Candidates
+    models: IntArray
+    mirrored: npt.NDArray[np.bool_]
+    base: FloatArray
+    bounds: FloatArray
+
+
+def gather_field(
+    table: ModelTable,
+    observed: Observed,
+    options: RetrievalOptions,
+    *,
+    exclude: Collection[ModelKey] = (),
+) -> Field:
+    """Find the candidates of a query.
+
+    Raises
+    ------
+    InputError
+        If the library or the category is empty or unknown, or no model has one of the semantic ids.
+    DegenerateError
+        If no model shares at least 4 keypoints with the image.
+    """
+    chosen = _chosen_models(table, options.category, exclude)
+    _check_known(table, observed.semantic_ids, chosen, options.category)
+    models, candidates, labelings = _candidates(table, chosen, options.symmetries)
+    bounds, gains, shared = bound_all(observed.query, candidates)
+    kept = shared >= LEAST_SHARED
+    if not kept.any():
+        raise DegenerateError(
+            f"no model shares more than {shared.max()} keypoints with the image",
+            where="semantic_ids",
+            fix=f"at least {LEAST_SHARED} are needed to align a model",
+        )
+    if observed.query.loss != _LINEAR:
+        bounds[:] = 0.0  # holds for squared errors only
+    counts = candidates.spans[:, 1] - candidates.spans[:, 0]
+    base = (
+        gains
+        + observed.spurious
+        + (counts - shared) * np.log(options.missing_prob)
+        + options.log_scale_constant
+        - np.log(labelings)
+    )
+    spans = np.ascontiguousarray(candidates.spans[kept])
+    return Field(
+        candidates._replace(spans=spans),
+        models[kept],
+        spans[:, 0] != spans[:, 2],
+        base[kept],
+        bounds[kept],
+    )
+
+
+def _chosen_models(
+    table: ModelTable, category: str | None, exclude: Collection[ModelKey]
+) -> IntArray:
+    """Rows of the models that are compared, in the table's order."""
+    from cadalign.datasets.categories import require_category
+
+    if not len(table):
+        raise InputError("the library is empty", where="library")
+    rows = np.arange(len(table))
+    if category is not None:
+        rows = rows[table.rows_of(require_category(category, table.categories, where="category"))]
+    if exclude:
+        unwanted = set(exclude)
+        rows = rows[[table.keys[row] not in unwanted for row in rows.tolist()]]
+        if not len(rows):
+            raise InputError("all models are excluded", where="exclude")
+    return rows
+
+
+def _check_known(table: ModelTable, ids: IntArray, chosen: IntArray, category: str | None) -> None:
+    """Refuse a semantic id that none of the models has."""
+    if category is None:
+        known = table.known_ids
+    else:
+        own = slice(int(table.offsets[chosen[0]]), int(table.offsets[chosen[-1] + 1]))
+        known = np.unique(table.semantic_ids[own])
+    unknown = np.setdiff1d(ids, known)
+    if len(unknown):
+        where = "the library" if category is None else f"the category {category!r}"
+        raise InputError(
+            f"no model of {where} has a keypoint with the semantic id {unknown[0]}",
+            where="semantic_ids",
+            fix=f"known are {_ranges(known)}",
+        )
+
+
+def _candidates(
+    table: ModelTable, chosen: IntArray, symmetries: bool
+) -> tuple[IntArray, Candidates, IntArray]:
+    """Models (c,), candidates, and how many labelings the model of each has, (c,)."""
+    first, last = table.offsets[chosen], table.offsets[chosen + 1]
+    spans = np.stack([first, last, first], axis=1)
+    rows = table.places
+    if not symmetries:
+        candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
+        return chosen, candidates, np.ones(len(chosen), dtype=np.int64)
+    counts = last - first
+    start = len(table.xyz)
+    extra = (table.labeling_offsets[chosen + 1] - table.labeling_offsets[chosen]) // counts
+    models = np.repeat(chosen, 1 + extra)
+    number = np.arange(len(models)) - np.repeat(np.cumsum(1 + extra) - (1 + extra), 1 + extra)
+    spans = np.repeat(spans, 1 + extra, axis=0)
+    own = start + table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
+    spans[:, 2] = np.where(number > 0, own, spans[:, 0])
+    candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
+    return models, candidates, np.repeat(1 + extra, 1 + extra)
+
+
+def _ranges(ids: IntArray) -> str:
+    """Rising numbers as text: 0-8, 11.
+
+    Examples
+    --------
+    >>> _ranges(np.array([0, 1, 2, 5]))
+    '0-2, 5'
+    """
+    runs = np.split(ids, np.flatnonzero(np.diff(ids) > 1) + 1)
+    return ", ".join(
+        str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run)
+    )

@@ -1,0 +1,391 @@
+"""Compiled kernels of retrieval: a lower bound of a candidate's cost, and the search for its pose.
+
+A candidate is a model of the library with its keypoints' labels as they are or mirrored. The
+library's keypoints lie one after the other, each model's in the order of their semantic ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numpy as np
+
+from cadalign.solvers.jit import kernel
+from cadalign.solvers.linalg import cholesky, eigenvectors_4
+from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
+from cadalign.solvers.objective import Objective, evaluate_cost
+from cadalign.solvers.refine import refine
+from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts
+from cadalign.validation import FloatArray, IntArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+LEAST_SHARED = 4
+"""Fewer keypoints than this determine no alignment."""
+_BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
+_PROBE_ITERATIONS = 4
+_GRID_ROTATIONS = 48
+_CANCELLATION = 1e-10
+_HOPELESS = 4.0  # so many times the least cost, and ...
+_HOPELESS_EXCESS = 100.0  # ... so much more of it, is not made up for after the first steps
+_SAME_CHORD = 1e-3
+
+
+class Query(NamedTuple):
+    """What an image shows, its keypoints in the order of their semantic ids.
+
+    Parameters
+    ----------
+    ids : (n,) int
+        Semantic ids, rising.
+    rays : (n, 2) float
+        Normalised image coordinates.
+    whitening : (1 or n, 3) float
+        See `cadalign.solvers.objective.Objective`, as the rest.
+    loss : int
+    loss_scale, prior_weight : float
+    free : (8,) float
+    max_stretch : float
+        Scales lie between one over this and this.
+    gains : (n,) float
+        What a candidate gains by sharing each keypoint, errors aside [log-likelihood].
+    """
+
+    ids: IntArray
+    rays: FloatArray
+    whitening: FloatArray
+    loss: int
+    loss_scale: float
+    prior_weight: float
+    free: FloatArray
+    max_stretch: float
+    gains: FloatArray
+
+
+class Candidates(NamedTuple):
+    """The candidates' keypoints.
+
+    Parameters
+    ----------
+    xyz : (k, 3) float
+        Keypoints of the whole library.
+    ids : (k,) int
+        Their semantic ids.
+    rows : (r,) int
+        Which rows of ``xyz`` take the places of a candidate's labels: with labels as they are, the
+        rows themselves.
+    spans : (c, 3) int
+        Of each candidate: where its labels begin in ``ids``, where they end, and where its ``rows``
+        begin.
+    """
+
+    xyz: FloatArray
+    ids: IntArray
+    rows: IntArray
+    spans: IntArray
+
+
+def _kernel(function: F) -> F:
+    """Like the solvers' `kernel`, and compiled anew when this file changes."""
+    dispatcher: Any = kernel(function)
+    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if cache_file is not None:
+        own = Path(__file__).stat()
+        cache_file._source_stamp = (*cache_file._source_stamp, own.st_mtime, own.st_size)
+    return cast(F, dispatcher)
+
+
+@_kernel
+def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Lower bounds of the costs (c,), gains (c,), and numbers of shared keypoints (c,)."""
+    count = candidates.spans.shape[0]
+    bounds = np.zeros(count)
+    gains = np.zeros(count)
+    shared = np.zeros(count, dtype=np.int64)
+    room = query.ids.shape[0]
+    points = np.empty((room, 3))
+    seen = np.empty(room, dtype=np.int64)
+    weights = _least_weights(query)
+    for c in range(count):
+        n = _gather(query, candidates, c, points, seen)
+        shared[c] = n
+        for i in range(n):
+            gains[c] += query.gains[seen[i]]
+        if n >= _BOUNDED_FROM:
+            bounds[c] = _bound(points[:n], seen, query.rays, weights)
+    return bounds, gains, shared
+
+
+@_kernel
+def search_all(
+    query: Query,
+    candidates: Candidates,
+    chosen: IntArray,
+    subsets: int,
+    refined: int,
+    iterations: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Search for the poses of the chosen candidates (m,); packed poses (m, 15) and costs (m,).
+
+    The linear solver proposes a pose, the minimal solver some more for each of ``subsets``
+    4-subsets of the keypoints; the best ``refined`` of them are refined, in at most so many
+    ``iterations``. The cost is infinite where no pose was found.
+    """
+    poses = np.zeros((chosen.shape[0], POSE_SIZE))
+    costs = np.full(chosen.shape[0], np.inf)
+    room = query.ids.shape[0]
+    points = np.empty((room, 3))
+    seen = np.empty(room, dtype=np.int64)
+    for m in range(chosen.shape[0]):
+        n = _gather(query, candidates, chosen[m], points, seen)
+        if n < LEAST_SHARED:
+            continue
+        mean = np.zeros(3)
+        for i in range(n):
+            mean += points[i] / n
+        objective = _centred_objective(query, points[:n], seen, mean)
+        costs[m] = _search(objective, query.max_stretch, subsets, refined, iterations, poses[m])
+        for k in range(3):
+            for j in range(3):
+                poses[m, 9 + k] -= poses[m, 3 * k + j] * poses[m, 12 + j] * mean[j]
+    return poses, costs
+
+
+@_kernel
+def _centred_objective(
+    query: Query, points: FloatArray, seen: IntArray, mean: FloatArray
+) -> Objective:
+    """What a pose of the gathered points, less their mean, is measured against."""
+    n = points.shape[0]
+    each = query.whitening.shape[0] > 1
+    centred = np.empty((n, 3))
+    rays = np.empty((n, 2))
+    whitening = np.empty((n if each else 1, 3))
+    whitening[0] = query.whitening[0]
+    for i in range(n):
+        centred[i] = points[i] - mean
+        rays[i] = query.rays[seen[i]]
+        if each:
+            whitening[i] = query.whitening[seen[i]]
+    return Objective(
+        centred, rays, whitening, query.loss, query.loss_scale, query.prior_weight, query.free
+    )
+
+
+@_kernel
+def _gather(
+    query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
+) -> int:
+    """Write the model points that the image shows, and which of its keypoints they are."""
+    first, last, row = candidates.spans[c, 0], candidates.spans[c, 1], candidates.spans[c, 2]
+    n = 0
+    i = 0
+    k = first
+    while i < query.ids.shape[0] and k < last:
+        if query.ids[i] < candidates.ids[k]:
+            i += 1
+        elif query.ids[i] > candidates.ids[k]:
+            k += 1
+        else:
+            place = candidates.rows[row + k - first]
+            for j in range(3):
+                points[n, j] = candidates.xyz[place, j]
+            seen[n] = i
+            n += 1
+            i += 1
+            k += 1
+    return n
+
+
+@_kernel
+def _least_weights(query: Query) -> FloatArray:
+    """How much a squared error of a ray counts at least, whatever its direction, (n,)."""
+    n = query.ids.shape[0]
+    weights = np.empty(n)
+    for i in range(n):
+        w = i if query.whitening.shape[0] > 1 else 0
+        a, b, c = query.whitening[w, 0], query.whitening[w, 1], query.whitening[w, 2]
+        trace = a * a + b * b + c * c
+        determinant = (a * c) ** 2
+        weights[i] = 0.5 * (trace - np.sqrt(max(trace * trace - 4.0 * determinant, 0.0)))
+    return weights
+
+
+@_kernel
+def _bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: FloatArray) -> float:
+    """A lower bound of the sum of squared whitened errors over all poses and stretches.
+
+    Let a_i = (1, x_i), and let a general linear camera take it to (c_x . a_i, c_y . a_i) / d_i with
+    the depth d_i = c_z . a_i; poses of stretched models are some of these cameras. With w_i the
+    weights and r_i the errors, the sum of w_i d_i^2 |r_i|^2 over all cameras with c_z' P c_z = 1,
+    where P is the sum of w_i a_i a_i', is at least the smallest eigenvalue of the 4 x 4 problem of
+    `cadalign.solvers.aepnp`. By Cauchy and Schwarz d_i^2 <= a_i' P^-1 a_i, the leverage of point
+    i. So that eigenvalue over the largest leverage bounds the sum of w_i |r_i|^2.
+    """
+    n = points.shape[0]
+    mean = np.zeros(5)
+    total = 0.0
+    for i in range(n):
+        w = weights[seen[i]]
+        total += w
+        for j in range(3):
+            mean[j] += w * points[i, j]
+        for j in range(2):
+            mean[3 + j] += w * rays[seen[i], j]
+    mean /= total
+    p = np.zeros((4, 4))
+    a = np.empty((n, 4))
+    for i in range(n):
+        a[i, 0] = 1.0
+        for j in range(3):
+            a[i, 1 + j] = points[i, j] - mean[j]
+        w = weights[seen[i]]
+        for j in range(4):
+            for k in range(j + 1):
+                p[j, k] += w * a[i, j] * a[i, k]
+    if not cholesky(p, 4, _CANCELLATION):
+        return 0.0
+    system = np.zeros((4, 4))
+    u_matrix = np.zeros((4, 4))
+    v_matrix = np.zeros((4, 4))
+    leverage = 0.0
+    white = np.empty(4)
+    for i in range(n):  # in the basis that whitens a, P is the identity
+        square = 0.0
+        for j in range(4):
+            value = a[i, j]
+            for k in range(j):
+                value -= p[j, k] * white[k]
+            white[j] = value / p[j, j]
+            square += white[j] * white[j]
+        leverage = max(leverage, square)
+        w = weights[seen[i]]
+        u = rays[seen[i], 0] - mean[3]
+        v = rays[seen[i], 1] - mean[4]
+        for j in range(4):
+            for k in range(j, 4):
+                product = w * white[j] * white[k]
+                u_matrix[j, k] += u * product
+                v_matrix[j, k] += v * product
+                system[j, k] += (u * u + v * v) * product
+    for j in range(4):
+        for k in range(j):
+            u_matrix[j, k] = u_matrix[k, j]
+            v_matrix[j, k] = v_matrix[k, j]
+    largest = 0.0
+    for j in range(4):
+        largest = max(largest, system[j, j])
+        for k in range(j, 4):
+            for m in range(4):
+                system[j, k] -= u_matrix[j, m] * u_matrix[m, k] + v_matrix[j, m] * v_matrix[m, k]
+            system[k, j] = system[j, k]
+    eigenvectors_4(system, np.empty((4, 4)))
+    least = system[0, 0]
+    for j in range(1, 4):
+        least = min(least, system[j, j])
+    return float(max(0.0, (least - 1e-12 * largest) / leverage))
+
+
+@_kernel
+def _search(
+    objective: Objective,
+    max_stretch: float,
+    subsets: int,
+    refined: int,
+    iterations: int,
+    pose: FloatArray,
+) -> float:
+    """Write the pose of the least cost that is found; returns the cost, or infinity."""
+    starts = np.empty((subsets * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
+    count = _propose(objective, subsets, starts)
+    probed = np.empty((refined, POSE_SIZE))
+    costs = _probe(objective, starts[:count], probed)
+    if not costs.min() < np.inf:  # all have points behind the camera
+        count = rotation_starts(objective.points, objective.rays, starts[:_GRID_ROTATIONS])
+        costs = _probe(objective, starts[:count], probed)
+    least = np.inf
+    for _ in range(probed.shape[0]):
+        best = np.argmin(costs)
+        if not costs[best] < min(np.inf, _HOPELESS * least + _HOPELESS_EXCESS):
+            break
+        costs[best] = np.inf
+        square = 0.0
+        for i in range(9):
+            square += (pose[i] - probed[best, i]) ** 2
+        if least < np.inf and square < _SAME_CHORD * _SAME_CHORD:
+            continue
+        cost, _, _ = refine(objective, iterations, probed[best])
+        cost = _within_limits(objective, max_stretch, iterations, probed[best], cost)
+        if cost < least:
+            least = cost
+            pose[:] = probed[best]
+    return least
+
+
+@_kernel
+def _within_limits(
+    objective: Objective, max_stretch: float, iterations: int, pose: FloatArray, cost: float
+) -> float:
+    """Hold scales that lie beyond the limits at these, and refine the rest; returns the cost."""
+    free = objective.free.copy()
+    for _ in range(2):
+        beyond = False
+        for j in range(2):
+            held = min(max(pose[13 + j], 1.0 / max_stretch), max_stretch)
+            if held != pose[13 + j]:
+                pose[13 + j] = held
+                free[6 + j] = 0.0
+                beyond = True
+        if not beyond:
+            break
+        limited = Objective(
+            objective.points,
+            objective.rays,
+            objective.whitening,
+            objective.loss,
+            objective.loss_scale,
+            objective.prior_weight,
+            free,
+        )
+        cost, _, _ = refine(limited, iterations, pose)
+    return cost
+
+
+@_kernel
+def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
+    """Write where a refinement may start; returns how many."""
+    points, rays, free = objective.points, objective.rays, objective.free
+    chosen = np.empty((subsets, 4), dtype=np.int64)
+    count = minimal_starts(points, rays, chosen, choose_subsets(points, chosen), starts)
+    if linear_start(points, rays, starts[count]):
+        count += 1
+    # Other starts serve coplanar points, and where the unstretched model is a better guess.
+    if count == 0 or free[6] == 0.0 or free[7] == 0.0:
+        count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
+    for k in range(count):
+        for j in range(2):
+            if free[6 + j] == 0.0:
+                starts[k, 13 + j] = 1.0
+    return count
+
+
+@_kernel
+def _probe(objective: Objective, starts: FloatArray, probed: FloatArray) -> FloatArray:
+    """Take a few steps from each of the best starts; their costs, infinite where there are none."""
+    scores = np.empty(starts.shape[0])
+    for k in range(starts.shape[0]):
+        scores[k] = evaluate_cost(objective, starts[k])
+    costs = np.full(probed.shape[0], np.inf)
+    for m in range(probed.shape[0]):
+        best = -1
+        for k in range(starts.shape[0]):
+            if scores[k] < (scores[best] if best >= 0 else np.inf):
+                best = k
+        if best < 0:
+            break
+        scores[best] = np.inf
+        probed[m] = starts[best]
+        costs[m], _, _ = refine(objective, _PROBE_ITERATIONS, probed[m])
+    return costs

@@ -1,0 +1,56 @@
+"""Mirrored labels: what a model's keypoints are called if left and right are confused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from cadalign.validation import FloatArray, IntArray
+
+_ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
+
+
+def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) -> list[IntArray]:
+    """The ways in which a model's keypoints trade labels under its reflections.
+
+    The pairs that mirror each other across a plane x = const trade labels all together; so do those
+    across y = const and z = const, and any of these at once. Pairs along no axis, and planes by
+    which one keypoint would get two labels, are left out.
+
+    Parameters
+    ----------
+    xyz : (k, 3) float
+        The model's keypoints.
+    reflections : iterable of pairs of int
+        Rows of ``xyz`` that mirror each other.
+
+    Returns
+    -------
+    list of (k,) int
+        For each way, which keypoint takes the place of which; the labels as they are not among
+        them.
+
+    Examples
+    --------
+    >>> xyz = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]])
+    >>> mirrored_labelings(xyz, [(0, 1)])
+    [array([1, 0, 2])]
+    """
+    planes: dict[int, list[tuple[int, int]]] = {}
+    for first, second in reflections:
+        apart = np.abs(xyz[first] - xyz[second])
+        axis = int(np.argmax(apart))
+        if apart[axis] > _ALONG * np.linalg.norm(apart):
+            planes.setdefault(axis, []).append((first, second))
+    found: list[IntArray] = [np.arange(len(xyz))]
+    for axis in sorted(planes):
+        rows = [row for pair in planes[axis] for row in pair]
+        if len(set(rows)) < len(rows):
+            continue
+        swap = np.arange(len(xyz))
+        for first, second in planes[axis]:
+            swap[[first, second]] = second, first
+        found += [swap[known] for known in found]
+    unique = {labeling.tobytes(): labeling for labeling in found}
+    return list(unique.values())[1:]

@@ -1,0 +1,102 @@
+"""What a retrieval returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cadalign.alignment import Alignment
+from cadalign.box import Box
+from cadalign.validation import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A model of the library, posed and stretched so as to explain an image's keypoints.
+
+    Parameters
+    ----------
+    category, model_id : str
+    alignment : Alignment
+    rms : float
+        Root mean square length of the shared keypoints' residuals [px].
+    log_likelihood : float
+        Of all keypoints, marked and missing ones; see `cadalign.retrieval.options`.
+    score : float
+        The probability that this is the model, if one of the library (of the category, if one was
+        named) is and all are equally likely beforehand: the likelihood over the sum of all models'.
+        It is calibrated as far as the assumptions hold: of matches with the score 0.9, nine in ten
+        are right.
+    box : Box
+        The model's box in the camera frame.
+    bounds : (2, 3) float
+        The same in the model's own frame.
+    semantic_ids : (n,) int
+        The shared keypoints.
+    points_3d : (n, 3) float
+        These on the model.
+    points_2d : (n, 2) float
+        These in the image [px].
+    residuals : (n, 2) float
+        Projected minus observed [px].
+    missing_ids : tuple of int
+        The image's keypoints that the model does not have.
+    mirrored : bool
+        Whether the labels fit better with left and right exchanged.
+    mesh_path : Path or None
+    silhouette_iou : float, optional
+        With a mask: intersection over union with the model's silhouette; None without a mesh.
+    """
+
+    category: str
+    model_id: str
+    alignment: Alignment
+    rms: float
+    log_likelihood: float
+    score: float
+    box: Box
+    bounds: FloatArray
+    semantic_ids: IntArray
+    points_3d: FloatArray
+    points_2d: FloatArray
+    residuals: FloatArray
+    missing_ids: tuple[int, ...]
+    mirrored: bool
+    mesh_path: Path | None
+    silhouette_iou: float | None = None
+
+    @property
+    def shared(self) -> int:
+        """How many keypoints model and image share."""
+        return len(self.semantic_ids)
+
+    def __repr__(self) -> str:
+        stretch = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
+        return (
+            f"Match({self.category!r}, {self.model_id!r}, score={self.score:.3g}, "
+            f"rms={self.rms:.3g} px, shared={self.shared}, scale=({stretch}))"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the match as plain lists and numbers, for JSON."""
+        return {
+            "category": self.category,
+            "model_id": self.model_id,
+            "score": self.score,
+            "log_likelihood": self.log_likelihood,
+            "rms": self.rms,
+            "shared": self.shared,
+            "alignment": self.alignment.to_dict(),
+            "box": {
+                "center": self.box.center.tolist(),
+                "rotation": self.box.rotation.tolist(),
+                "extents": self.box.extents.tolist(),
+            },
+            "semantic_ids": self.semantic_ids.tolist(),
+            "residuals": self.residuals.tolist(),
+            "missing_ids": list(self.missing_ids),
+            "mirrored": self.mirrored,
+            "mesh": None if self.mesh_path is None else str(self.mesh_path),
+            "silhouette_iou": self.silhouette_iou,
+        }

@@ -1,0 +1,337 @@
+"""The models of a library: one by itself, and all of them as the columns of an Arrow table."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from cadalign.errors import DataError, InputError
+from cadalign.retrieval.labelings import mirrored_labelings
+from cadalign.validation import FloatArray, IntArray, as_floats, as_points, read_only
+
+if TYPE_CHECKING:
+    from cadalign.datasets import AnnotatedModel, Symmetries
+    from cadalign.mesh import Mesh
+
+ModelKey = tuple[str, str]
+"""A category's name and a model's id."""
+
+SCHEMA = pa.schema(
+    [
+        ("category", pa.string()),
+        ("model_id", pa.string()),
+        ("mesh", pa.string()),
+        ("bounds", pa.list_(pa.float64(), 6)),
+        ("keypoints", pa.list_(pa.list_(pa.float64(), 3))),
+        ("semantic_ids", pa.list_(pa.int64())),
+        # Rows that take the places of the rows, labelling after labelling.
+        ("labelings", pa.list_(pa.int64())),
+        ("symmetries", pa.string()),
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryModel:
+    """One model of a library.
+
+    Parameters
+    ----------
+    category, model_id : str
+    xyz : (k, 3) float
+        Keypoints [model units].
+    semantic_ids : (k,) int
+        What each keypoint means; an id means the same on all models of a category, and nothing in
+        other categories.
+    bounds : (2, 3) float
+        Lowest and highest coordinates of the mesh; of the keypoints where there is none.
+    symmetries : Symmetries, optional
+        Which keypoints, as rows of ``xyz``, trade places under reflections and rotations.
+    mesh_path : Path, optional
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, or a semantic id occurs twice.
+    """
+
+    category: str
+    model_id: str
+    xyz: FloatArray
+    semantic_ids: IntArray
+    bounds: FloatArray
+    symmetries: Symmetries = field(default_factory=lambda: _no_symmetries())
+    mesh_path: Path | None = None
+
+    def __post_init__(self) -> None:
+        where = f"{self.category}, model {self.model_id}"
+        xyz = as_points(self.xyz, name=f"{where}, xyz", dimension=3)
+        bounds = as_floats(self.bounds, name=f"{where}, bounds", shape=(2, 3))
+        ids = check_semantic_ids(self.semantic_ids, len(xyz), where=f"{where}, semantic_ids")
+        for name, value in (("xyz", xyz), ("bounds", bounds), ("semantic_ids", ids)):
+            object.__setattr__(self, name, read_only(value))
+
+    @classmethod
+    def of_annotated(cls, model: AnnotatedModel, *, with_mesh: bool = True) -> LibraryModel:
+        """A data set's model; its mesh, if it has one and is wanted, is read for its bounds.
+
+        Raises
+        ------
+        DataError
+            If the mesh cannot be read.
+        """
+        from cadalign.datasets import load_mesh
+
+        xyz = model.keypoints.xyz
+        bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+        path = model.mesh_path if with_mesh else None
+        if path is not None:
+            bounds = load_mesh(path).bounds
+        return cls(
+            category=model.category,
+            model_id=model.model_id,
+            xyz=xyz,
+            semantic_ids=model.keypoints.semantic_ids,
+            bounds=bounds,
+            symmetries=model.symmetries,
+            mesh_path=None if path is None else path.absolute(),
+        )
+
+    @property
+    def key(self) -> ModelKey:
+        """(category, model id)"""
+        return self.category, self.model_id
+
+    def load_mesh(self) -> Mesh:
+        """Read the mesh.
+
+        Raises
+        ------
+        DataError
+            If there is none, or it cannot be read.
+        """
+        from cadalign.datasets import load_mesh
+
+        if self.mesh_path is None:
+            raise DataError(
+                "there is no mesh of this model", where=f"{self.category}, model {self.model_id}"
+            )
+        return load_mesh(self.mesh_path)
+
+
+def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
+    """Semantic ids (count,) as integers.
+
+    Raises
+    ------
+    InputError
+        If they are something else, or one occurs twice.
+    """
+    ids = np.asarray(value)
+    if ids.shape != (count,) or (count and ids.dtype.kind not in "iu"):
+        raise InputError(
+            f"{ids.dtype} of shape {ids.shape}, expected whole numbers of shape ({count},)",
+            where=where,
+        )
+    unique, occurrences = np.unique(ids, return_counts=True)
+    if (occurrences > 1).any():
+        raise InputError(f"the semantic id {unique[occurrences > 1][0]} occurs twice", where=where)
+    return ids.astype(np.int64)
+
+
+class ModelTable:
+    """All models of a library, sorted by category and id; an Arrow table seen as arrays.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        Of the columns of `SCHEMA`, as `ModelTable.of` makes it.
+    """
+
+    def __init__(self, table: pa.Table) -> None:
+        self.table = table.combine_chunks()
+
+    @classmethod
+    def of(cls, models: Iterable[LibraryModel]) -> ModelTable:
+        """The table of these models.
+
+        Raises
+        ------
+        InputError
+            If two have the same category and id.
+        """
+        in_order = sorted(models, key=lambda model: model.key)
+        for first, second in pairwise(in_order):
+            if first.key == second.key:
+                raise InputError(
+                    f"the model {first.model_id!r} of {first.category!r} occurs twice",
+                    where="library",
+                    fix="give every model of a category its own id",
+                )
+        rows = [_row(model) for model in in_order]
+        return cls(pa.Table.from_pylist(rows, schema=SCHEMA))
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @cached_property
+    def keys(self) -> Sequence[ModelKey]:
+        """(category, model id) of every model."""
+        names = self.table["category"].to_pylist()
+        return list(zip(names, self.table["model_id"].to_pylist(), strict=True))
+
+    @cached_property
+    def categories(self) -> tuple[str, ...]:
+        """The categories' names, sorted."""
+        return tuple(sorted(self.table["category"].unique().to_pylist()))
+
+    @cached_property
+    def offsets(self) -> IntArray:
+        """Model m has the keypoints ``offsets[m]`` to ``offsets[m + 1]``, (n + 1,) int."""
+        return _offsets(self._column("semantic_ids"))
+
+    @cached_property
+    def xyz(self) -> FloatArray:
+        """Keypoints of all models, each model's in the order of their ids, (k, 3) float."""
+        return _numbers(self._column("keypoints").flatten().flatten()).reshape(-1, 3)
+
+    @cached_property
+    def semantic_ids(self) -> IntArray:
+        """Their semantic ids, (k,) int."""
+        return _numbers(self._column("semantic_ids").flatten())
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest coordinates of every model, (n, 2, 3) float."""
+        return _numbers(self._column("bounds").flatten()).reshape(-1, 2, 3)
+
+    @cached_property
+    def labeling_offsets(self) -> IntArray:
+        """Model m has the labelings' rows ``[m]`` to ``[m + 1]``, (n + 1,) int."""
+        return _offsets(self._column("labelings"))
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Rows of `xyz`: each keypoint's own, then `labeling_offsets` those of mirrored labels."""
+        first = np.repeat(self.offsets[:-1], np.diff(self.labeling_offsets))
+        mirrored = _numbers(self._column("labelings").flatten()) + first
+        return read_only(np.concatenate([np.arange(len(self.xyz)), mirrored]))
+
+    @cached_property
+    def known_ids(self) -> IntArray:
+        """The semantic ids that any model has, rising."""
+        return np.unique(self.semantic_ids)
+
+    def rows_of(self, category: str) -> slice:
+        """Which models are of a category."""
+        names = [name for name, _ in self.keys]
+        return slice(bisect_left(names, category), bisect_right(names, category))
+
+    def find(self, key: ModelKey) -> int | None:
+        """The row of a model; None if there is none."""
+        row = bisect_left(self.keys, key)
+        return row if row < len(self) and self.keys[row] == key else None
+
+    def model(self, row: int) -> LibraryModel:
+        """One of the models."""
+        own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
+        category, model_id = self.keys[row]
+        path = self.table["mesh"][row].as_py()
+        return LibraryModel(
+            category=category,
+            model_id=model_id,
+            xyz=self.xyz[own],
+            semantic_ids=self.semantic_ids[own],
+            bounds=self.bounds[row],
+            symmetries=_symmetries_from(self.table["symmetries"][row].as_py()),
+            mesh_path=None if path is None else Path(path),
+        )
+
+    def _column(self, name: str) -> Any:
+        column = self.table[name]
+        return column.chunk(0) if column.num_chunks else pa.array([], type=column.type)
+
+
+def _row(model: LibraryModel) -> dict[str, Any]:
+    """A model as a row of the table, its keypoints in the order of their ids."""
+    order = np.argsort(model.semantic_ids)
+    place = np.argsort(order)
+    symmetries = model.symmetries
+    reflections = [(int(place[a]), int(place[b])) for a, b in symmetries.reflections]
+    xyz = model.xyz[order]
+    labelings = mirrored_labelings(xyz, reflections)
+    rotations = [
+        {
+            "keypoints": [int(place[row]) for row in rotation.keypoints],
+            "circle": None
+            if rotation.circle is None
+            else [
+                rotation.circle.center.tolist(),
+                rotation.circle.radius,
+                rotation.circle.normal.tolist(),
+            ],
+        }
+        for rotation in symmetries.rotations
+    ]
+    return {
+        "category": model.category,
+        "model_id": model.model_id,
+        "mesh": None if model.mesh_path is None else str(model.mesh_path),
+        "bounds": model.bounds.ravel().tolist(),
+        "keypoints": xyz.tolist(),
+        "semantic_ids": model.semantic_ids[order].tolist(),
+        "labelings": [row for labeling in labelings for row in labeling.tolist()],
+        "symmetries": json.dumps({"reflections": reflections, "rotations": rotations}),
+    }
+
+
+def _symmetries_from(text: str) -> Symmetries:
+    from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
+
+    data = json.loads(text)
+    return Symmetries(
+        reflections=tuple((first, second) for first, second in data["reflections"]),
+        rotations=tuple(
+            RotationalSymmetry(
+                keypoints=tuple(rotation["keypoints"]),
+                circle=None
+                if rotation["circle"] is None
+                else Circle(
+                    np.array(rotation["circle"][0]),
+                    rotation["circle"][1],
+                    np.array(rotation["circle"][2]),
+                ),
+            )
+            for rotation in data["rotations"]
+        ),
+    )
+
+
+def _no_symmetries() -> Symmetries:
+    from cadalign.datasets import Symmetries
+
+    return Symmetries()
+
+
+def _numbers(array: Any) -> npt.NDArray[Any]:
+    """An Arrow array's numbers without a copy, read-only."""
+    numbers = array.to_numpy(zero_copy_only=True)
+    numbers.flags.writeable = False
+    return np.asarray(numbers)
+
+
+def _offsets(array: Any) -> IntArray:
+    offsets = array.offsets.to_numpy().astype(np.int64)
+    offsets -= offsets[0] if len(offsets) else 0
+    offsets.flags.writeable = False
+    return np.asarray(offsets)

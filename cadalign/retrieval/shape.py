@@ -1,0 +1,73 @@
+"""How far the keypoints of two models are apart once one is stretched to be like the other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.errors import InputError
+from cadalign.retrieval.models import LibraryModel
+from cadalign.validation import FloatArray
+
+SAME_SHAPE = 0.01
+"""Models closer than this cannot be told apart by their keypoints: they count as the same."""
+
+
+def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
+    """Root mean square distance of the shared keypoints, as a share of the true ones' extent.
+
+    The one model is moved, and stretched along y and z (x is taken as known), so as to be as near
+    as possible to the other; it is not turned.
+
+    Parameters
+    ----------
+    est, gt : LibraryModel
+
+    Returns
+    -------
+    float
+        0 for models that differ by nothing but their stretch; NaN where less than 2 keypoints are
+        shared.
+
+    Raises
+    ------
+    InputError
+        If they are of different categories: their semantic ids mean different things.
+
+    Examples
+    --------
+    >>> xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    >>> bounds = np.array([[0, 0, 0], [1, 1, 1.0]])
+    >>> one = LibraryModel("box", "1", xyz, np.arange(4), bounds)
+    >>> two = LibraryModel("box", "2", xyz * [1, 2, 0.5] + 0.1, np.arange(4), bounds)
+    >>> round(shape_distance(two, one), 12)
+    0.0
+    """
+    if est.category != gt.category:
+        raise InputError(
+            f"the one is of {est.category!r}, the other of {gt.category!r}", where="est"
+        )
+    _, mine, theirs = np.intersect1d(est.semantic_ids, gt.semantic_ids, return_indices=True)
+    return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
+
+
+def is_same_shape(est: LibraryModel, gt: LibraryModel) -> bool:
+    """Whether the one is the other to within 1 % after stretch, with the same set of keypoints."""
+    if est.category != gt.category or set(est.semantic_ids) != set(gt.semantic_ids):
+        return False
+    return shape_distance(est, gt) <= SAME_SHAPE
+
+
+def distances(est: FloatArray, gt: FloatArray) -> FloatArray:
+    """The distance of each of some models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
+    if len(gt) < 2:
+        return np.full(len(est), np.nan)
+    moved = est - est.mean(axis=1, keepdims=True)
+    wanted = gt - gt.mean(axis=0)
+    squares = (moved**2).sum(axis=1)
+    products = (moved * wanted).sum(axis=1)
+    # A mirrored or flat model cannot be stretched to be like the other.
+    scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
+    scale[:, 0] = 1.0
+    gaps = moved * scale[:, None] - wanted
+    extent = float(np.linalg.norm(np.ptp(gt, axis=0))) or np.nan
+    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)) / extent)

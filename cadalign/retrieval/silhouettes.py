@@ -1,0 +1,153 @@
+"""Ranking the best matches anew by their silhouettes.
+
+The silhouette of each match's mesh, posed and stretched, is compared with the object's pixels. The
+intersection over union of the right model falls short of 1 by 0.05 on average, exponentially
+distributed: so a match gains ``IoU / 0.05`` in log-likelihood over one without overlap. A match
+without a mesh gains the mean of what the others gain: its silhouette is not known, which is no
+reason to prefer or to reject it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.camera import Camera
+from cadalign.datasets import load_mesh
+from cadalign.errors import CadalignError, InputError
+from cadalign.render import Scene, cast_geometry, silhouette_iou
+from cadalign.retrieval.match import Match
+from cadalign.validation import BoolArray
+
+logger = logging.getLogger("cadalign")
+
+_SHORTFALL = 0.05
+_GRAB_ROUNDS = 5
+_MARGIN = 0.15  # around keypoints and boxes, as a share of their extent
+
+
+def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
+    """The matches in the order of keypoints and silhouettes together.
+
+    Parameters
+    ----------
+    matches : sequence of Match
+        The best by their keypoints.
+    mask : (h, w) bool
+        The object's pixels, as `cadalign.render.silhouette_iou` takes them.
+    camera : Camera
+
+    Returns
+    -------
+    list of Match
+        With ``silhouette_iou`` and, shared out among them anew, ``score``. The likelihood remains
+        that of the keypoints.
+    """
+    overlaps = [_overlap(match, mask, camera) for match in matches]
+    known = [overlap for overlap in overlaps if overlap is not None]
+    if not known:
+        logger.warning("none of the matches has a mesh: the mask tells nothing")
+        return list(matches)
+    mean = float(np.mean(known))
+    gains = np.array([(mean if overlap is None else overlap) / _SHORTFALL for overlap in overlaps])
+    log_scores = np.array([match.log_likelihood for match in matches]) + gains
+    weights = np.exp(log_scores - log_scores.max())
+    weights *= sum(match.score for match in matches) / weights.sum()
+    order = np.lexsort(([match.model_id for match in matches], -log_scores))
+    return [
+        replace(matches[k], score=float(weights[k]), silhouette_iou=overlaps[k])
+        for k in order.tolist()
+    ]
+
+
+def mask_of(
+    mask: npt.ArrayLike | None,
+    image: npt.ArrayLike | None,
+    matches: Sequence[Match],
+    camera: Camera,
+) -> npt.NDArray[Any]:
+    """The object's pixels: as given, or from the image's opacity, or cut out of the image.
+
+    What is cut out starts from the box around the keypoints and the best match (OpenCV's GrabCut).
+
+    Parameters
+    ----------
+    mask : (h, w) bool, optional
+        Of numbers, what is above half of the largest possible value counts.
+    image : (h, w, 3) or (h, w, 4) uint8, optional
+    matches : sequence of Match
+    camera : Camera
+
+    Returns
+    -------
+    (h, w) of truth values or opacities
+
+    Raises
+    ------
+    InputError
+        If both or neither are given, or one is of another kind or size, or shows nothing.
+    """
+    if (mask is None) == (image is None):
+        raise InputError("give a mask or an image, not both", where="mask")
+    where = "image" if mask is None else "mask"
+    found = np.asarray(mask) if mask is not None else _object_in(np.asarray(image), matches, camera)
+    if found.shape != (camera.height, camera.width):
+        raise InputError(
+            f"shape {found.shape}, but the camera's image is {camera.height} high and "
+            f"{camera.width} wide",
+            where=where,
+        )
+    if np.isnan(silhouette_iou(est=found, gt=found)):
+        raise InputError("it shows no pixel of the object", where=where)
+    return found
+
+
+def _object_in(
+    pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera
+) -> npt.NDArray[Any]:
+    """An image's opacity, or what is cut out of it."""
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        raise InputError(
+            f"{pixels.dtype} of shape {pixels.shape}, expected an RGB or RGBA image of uint8",
+            where="image",
+        )
+    if pixels.shape[2] == 4:
+        return np.asarray(pixels[:, :, 3])
+    return _cut_out(pixels, matches, camera)
+
+
+def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:
+    """Intersection over union of a match's silhouette; None without a mesh."""
+    if match.mesh_path is None:
+        return None
+    try:
+        scene = Scene(load_mesh(match.mesh_path))
+    except CadalignError as error:
+        logger.warning("no silhouette: %s", error)
+        return None
+    return silhouette_iou(est=cast_geometry(scene, camera, match.alignment).mask, gt=mask)
+
+
+def _cut_out(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:
+    """Tell the object from its surroundings by their colours, starting from a box."""
+    corners = camera.project(matches[0].box.corners)
+    points = np.concatenate([matches[0].points_2d, corners])
+    margin = _MARGIN * np.ptp(points, axis=0)
+    last = np.array(pixels.shape[1::-1]) - 1
+    left, top = np.clip(points.min(axis=0) - margin, 0, last).astype(int).tolist()
+    right, bottom = np.clip(points.max(axis=0) + margin, 0, last).astype(int).tolist()
+    labels: npt.NDArray[Any] = np.full(pixels.shape[:2], cv2.GC_BGD, dtype=np.uint8)
+    labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
+    if (labels == cv2.GC_BGD).any() and (labels != cv2.GC_BGD).any():
+        cv2.setRNGSeed(0)
+        bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        colors = np.zeros((2, 1, 65))
+        whole = (0, 0, 1, 1)  # not looked at with a mask
+        cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))

@@ -1,0 +1,258 @@
+"""Libraries of CAD models: what they hold, their files, and what is refused."""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cadalign import Library
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.errors import DataError, InputError
+from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.labelings import mirrored_labelings
+from cadalign.retrieval.models import SCHEMA, ModelTable
+
+HEADER = 64
+
+
+def make_model(number: int, *, category: str = "box", keypoints: int = 8) -> LibraryModel:
+    rng = np.random.default_rng(number)
+    xyz = rng.uniform(-0.3, 0.3, (keypoints, 3))
+    bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+    return LibraryModel(category, f"{number:04d}", xyz, rng.permutation(keypoints), bounds)
+
+
+@pytest.fixture
+def library() -> Library:
+    return Library.from_models([make_model(number) for number in range(12)])
+
+
+@pytest.fixture
+def file(library: Library, tmp_path: Path) -> Path:
+    library.save(tmp_path / "boxes.cadalign")
+    return tmp_path / "boxes.cadalign"
+
+
+def assert_same(one: LibraryModel, other: LibraryModel) -> None:
+    assert one.key == other.key
+    assert one.mesh_path == other.mesh_path
+    np.testing.assert_array_equal(one.xyz, other.xyz)
+    np.testing.assert_array_equal(one.semantic_ids, other.semantic_ids)
+    np.testing.assert_array_equal(one.bounds, other.bounds)
+    assert one.symmetries.reflections == other.symmetries.reflections
+    assert len(one.symmetries.rotations) == len(other.symmetries.rotations)
+    for mine, theirs in zip(one.symmetries.rotations, other.symmetries.rotations, strict=True):
+        assert mine.keypoints == theirs.keypoints
+        assert mine.is_circle == theirs.is_circle
+        if mine.circle is not None and theirs.circle is not None:
+            np.testing.assert_array_equal(mine.circle.normal, theirs.circle.normal)
+
+
+# --- what it holds ---------------------------------------------------------------------------
+
+
+def test_a_dataset_s_models_are_in_it_with_symmetries_bounds_and_meshes(sample_root: Path) -> None:
+    dataset = KeypointNet(sample_root)
+    library = Library.from_dataset(dataset)
+    assert library.keys == tuple(sorted(dataset.ids()))
+    for model in dataset:
+        held = library[model.key]
+        order = np.argsort(model.keypoints.semantic_ids)
+        np.testing.assert_array_equal(held.semantic_ids, model.keypoints.semantic_ids[order])
+        np.testing.assert_array_equal(held.xyz, model.keypoints.xyz[order])
+        np.testing.assert_array_equal(held.bounds, model.load_mesh().bounds)
+        np.testing.assert_array_equal(held.load_mesh().faces, model.load_mesh().faces)
+        # The same pairs of keypoints, wherever they stand now.
+        ids = model.keypoints.semantic_ids
+        assert [{int(ids[a]), int(ids[b])} for a, b in model.symmetries.reflections] == [
+            {int(held.semantic_ids[a]), int(held.semantic_ids[b])}
+            for a, b in held.symmetries.reflections
+        ]
+
+
+def test_categories_can_be_chosen_and_unknown_ones_are_refused(sample_root: Path) -> None:
+    dataset = KeypointNet(sample_root)
+    assert Library.from_dataset(dataset, categories=["chair"]).categories == ("chair",)
+    with pytest.raises(InputError, match="unknown category 'chiar', did you mean 'chair'"):
+        Library.from_dataset(dataset, categories=["chiar"])
+
+
+def test_of_a_model_with_a_damaged_mesh_the_keypoints_bounds_are_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = write_sample_dataset(tmp_path / "sample", per_category=1, categories=["chair"])
+    (model,) = KeypointNet(root)
+    assert model.mesh_path is not None
+    model.mesh_path.write_text("nonsense")
+    with caplog.at_level(logging.WARNING, logger="cadalign"):
+        library = Library.from_dataset(KeypointNet(root))
+    assert "bounds are the keypoints'" in caplog.text
+    held = library[model.key]
+    assert held.mesh_path is None
+    np.testing.assert_array_equal(held.bounds[0], model.keypoints.xyz.min(axis=0))
+    with pytest.raises(DataError, match=f"model {model.model_id}: there is no mesh"):
+        held.load_mesh()
+
+
+def test_the_order_in_which_models_come_does_not_show(tmp_path: Path) -> None:
+    models = [make_model(n, category=c) for n in range(5) for c in ("b", "a")]
+    Library.from_models(models).save(tmp_path / "one")
+    Library.from_models(models[::-1]).save(tmp_path / "other")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+
+
+def test_looking_up_an_unknown_model_is_refused(library: Library) -> None:
+    assert library["box", "0003"].model_id == "0003"
+    for key in (("box", "0003x"), ("car", "0003"), ("zebra", "9")):
+        with pytest.raises(InputError, match="library: no model"):
+            library[key]
+
+
+def test_duplicated_models_and_semantic_ids_are_refused() -> None:
+    with pytest.raises(InputError, match="the model '0001' of 'box' occurs twice; give every"):
+        Library.from_models([make_model(1), make_model(2), make_model(1)])
+    Library.from_models([make_model(1), make_model(1, category="crate")])
+    model = make_model(1)
+    with pytest.raises(InputError, match="box, model 0001, semantic_ids: the semantic id 3 occurs"):
+        replace(model, semantic_ids=np.array([3, 1, 2, 3, 4, 5, 6, 7]))
+
+
+def test_malformed_models_are_refused() -> None:
+    model = make_model(1)
+    with pytest.raises(InputError, match=r"model 0001, xyz: shape \(8, 2\)"):
+        replace(model, xyz=model.xyz[:, :2])
+    with pytest.raises(InputError, match="NaN or infinite values in row 2"):
+        replace(model, xyz=np.where(np.arange(8)[:, None] == 2, np.nan, model.xyz))
+    with pytest.raises(InputError, match=r"expected whole numbers of shape \(8,\)"):
+        replace(model, semantic_ids=np.arange(8.0))
+    with pytest.raises(InputError, match=r"expected whole numbers of shape \(8,\)"):
+        replace(model, semantic_ids=np.arange(7))
+
+
+class TestMirroredLabelings:
+    XYZ = np.array([[x, y, z] for z in (-1, 1) for y in (0,) for x in (-1, 1)], dtype=float)
+
+    def test_pairs_across_one_plane_trade_labels_together(self) -> None:
+        (swapped,) = mirrored_labelings(self.XYZ, [(0, 1), (2, 3)])
+        assert swapped.tolist() == [1, 0, 3, 2]
+
+    def test_two_planes_make_three_labelings(self) -> None:
+        found = mirrored_labelings(self.XYZ, [(0, 1), (2, 3), (0, 2), (1, 3)])
+        assert [labels.tolist() for labels in found] == [[1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]
+
+    def test_oblique_and_contradicting_pairs_are_left_out(self) -> None:
+        assert mirrored_labelings(self.XYZ, [(0, 3)]) == []
+        row = np.array([[float(x), 0, 0] for x in range(3)])
+        assert mirrored_labelings(row, [(0, 1), (1, 2)]) == []
+        assert mirrored_labelings(self.XYZ, []) == []
+
+
+# --- its file --------------------------------------------------------------------------------
+
+
+def test_a_saved_library_is_the_same_when_opened(sample_root: Path, tmp_path: Path) -> None:
+    library = Library.from_dataset(KeypointNet(sample_root))
+    library.save(tmp_path / "library")
+    opened = Library.open(tmp_path / "library")
+    assert len(opened) == len(library)
+    assert opened.fingerprint == library.fingerprint
+    for one, other in zip(opened, library, strict=True):
+        assert_same(one, other)
+
+
+def test_an_opened_library_is_mapped_and_cannot_be_changed(file: Path) -> None:
+    table = Library.open(file)._table
+    assert not table.xyz.flags.owndata
+    for array in (table.xyz, table.semantic_ids, table.bounds, table.places, table.offsets):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+def test_a_library_without_models_can_be_saved_and_opened(tmp_path: Path) -> None:
+    Library.from_models([]).save(tmp_path / "empty")
+    empty = Library.open(tmp_path / "empty")
+    assert len(empty) == 0
+    assert empty.categories == ()
+    assert list(empty) == []
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such library file; build it again, with: cadalign lib"):
+        Library.open(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("content", [b"", b"cadalign", b"ARROW1\0\0" + bytes(200)])
+def test_another_kind_of_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "other").write_bytes(content)
+    with pytest.raises(DataError, match="other: not a library file"):
+        Library.open(tmp_path / "other")
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"{tmp_path}: cannot be read"):
+        Library.open(tmp_path)
+
+
+def test_another_version_is_refused_and_both_are_named(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    struct.pack_into("<I", content, 16, 7)
+    file.write_bytes(content)
+    with pytest.raises(DataError, match="of version 7, but this cadalign reads version 1; build"):
+        Library.open(file)
+
+
+@pytest.mark.parametrize("left", [HEADER, HEADER + 1000, -1])
+def test_a_file_that_was_cut_short_is_refused(file: Path, left: int) -> None:
+    file.write_bytes(file.read_bytes()[:left])
+    with pytest.raises(DataError, match=r"cut short: \d+ bytes, \d+ expected; copy it again"):
+        Library.open(file)
+
+
+def test_a_file_with_something_behind_it_is_refused(file: Path) -> None:
+    file.write_bytes(file.read_bytes() + b"\0")
+    with pytest.raises(DataError, match="too long"):
+        Library.open(file)
+
+
+def test_any_changed_byte_is_noticed(file: Path) -> None:
+    content = file.read_bytes()
+    for place in np.linspace(HEADER, len(content) - 1, 12).astype(int).tolist():
+        changed = bytearray(content)
+        changed[place] ^= 0x10
+        file.write_bytes(changed)
+        with pytest.raises(DataError, match="damaged: its checksum is wrong"):
+            Library.open(file)
+
+
+def test_a_library_that_cannot_be_written_says_so(library: Library, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be written"):
+        library.save(tmp_path / "nowhere" / "library")
+
+
+def test_opening_50000_models_takes_less_than_a_second(tmp_path: Path) -> None:
+    few = ModelTable.of(make_model(number, keypoints=10) for number in range(500)).table
+    columns = {name: few[name].to_pylist() for name in few.column_names}
+    import pyarrow as pa
+
+    many = pa.table(
+        {
+            name: [f"{n:06d}" for n in range(50_000)] if name == "model_id" else values * 100
+            for name, values in columns.items()
+        },
+        schema=SCHEMA,
+    )
+    Library(ModelTable(many)).save(tmp_path / "many")
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        library = Library.open(tmp_path / "many")
+        seconds.append(time.perf_counter() - start)
+    assert len(library) == 50_000
+    assert min(seconds) < 1.0
+    assert library.nbytes < 40e6

@@ -9,19 +9,27 @@ from typing import Annotated
 
 import tyro
 
+from cadalign.cli.annotate import Annotate
 from cadalign.cli.demo import Demo
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.evaluate import Evaluate
 from cadalign.cli.fit import Fit
+from cadalign.cli.library import LibraryCommand
 from cadalign.cli.render import Render
+from cadalign.cli.report import Report
+from cadalign.cli.retrieve import Retrieve
 from cadalign.cli.simulate import Simulate
 from cadalign.errors import CadalignError
 
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Annotate, tyro.conf.subcommand("annotate")]
+    | Annotated[Retrieve, tyro.conf.subcommand("retrieve")]
+    | Annotated[LibraryCommand, tyro.conf.subcommand("library")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )

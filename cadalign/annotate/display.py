@@ -1,0 +1,45 @@
+"""The model as the page gets it: triangles, normals and colours in one block of bytes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from cadalign.annotate.model import CadModel
+from cadalign.annotate.simplify import simplify
+from cadalign.mesh import Mesh
+from cadalign.render.caster import FaceArray
+from cadalign.render.color import bytes_from_linear
+from cadalign.render.scene import Scene
+
+MOST_FACES = 150_000
+
+
+def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
+    """The model for display, with at most so many triangles.
+
+    Returns
+    -------
+    bytes
+        Length of a JSON header (uint32, little-endian, a multiple of 4 with padding), the header
+        with ``faces``, ``shown`` and ``all``; then positions (faces, 3, 3) float32 in display
+        coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
+    """
+    mesh = model.scene.mesh
+    small = simplify(mesh, max_faces=max_faces)
+    shown = Mesh(model.to_display(small.vertices), small.faces)
+    header = json.dumps({"shown": len(small.faces), "all": len(mesh.faces)}).encode()
+    header += b" " * (-len(header) % 4)
+    weights = np.full((len(small.faces), 3), 1 / 3, dtype=np.float32)
+    triangles: FaceArray = small.source.astype(np.int32)
+    color = model.scene.surface.color(triangles, weights)
+    return b"".join(
+        [
+            len(header).to_bytes(4, "little"),
+            header,
+            shown.triangles.astype("<f4").tobytes(),
+            Scene(shown).corner_normals.astype("<f4").tobytes(),
+            bytes_from_linear(color[:, :3]).tobytes(),
+        ]
+    )

@@ -1,0 +1,164 @@
+"""The annotator's server: the page, its photos and model, and the actions on them."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp
+
+from cadalign.annotate.display import display_bytes
+from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.session import Session
+from cadalign.annotate.state import state_of
+from cadalign.errors import CadalignError, InputError
+from cadalign.web import asset
+
+LOOPBACK = "127.0.0.1"
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>cadalign annotate</title>
+<link rel="icon" href="data:,">
+<link rel="stylesheet" href="annotate.css">
+<script src="annotate.js" defer></script>
+</head>
+<body><noscript>The annotator needs JavaScript.</noscript></body>
+</html>
+"""
+
+
+def make_app(session: Session, access: Access) -> ASGIApp:
+    """The application, guarded.
+
+    Parameters
+    ----------
+    session : Session
+    access : Access
+        What requests must show.
+    """
+    routes = _Routes(session, access)
+    app = Starlette(
+        routes=[
+            Route("/", routes.page),
+            Route("/annotate.js", routes.script),
+            Route("/annotate.css", routes.style),
+            Route("/model", routes.model),
+            Route("/photo/{number:int}", routes.photo),
+            Route("/state/{number:int}", routes.state),
+            Route("/act/{number:int}", routes.act, methods=["POST"]),
+        ],
+        exception_handlers={CadalignError: _refused},
+    )
+    return Guard(app, access)
+
+
+def listen(port: int) -> socket.socket:
+    """A socket on the loopback interface.
+
+    Parameters
+    ----------
+    port : int
+        0 for any that is free.
+
+    Raises
+    ------
+    InputError
+        If the port is in use or not a port.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((LOOPBACK, port))
+        listener.listen()  # whoever connects before the server runs has to wait, not to fail
+    except (OSError, OverflowError) as error:
+        listener.close()
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"port {port} cannot be listened on ({reason})",
+            where="--port",
+            fix="leave --port away to get a free one",
+        ) from None
+    return listener
+
+
+def serve(app: ASGIApp, listener: socket.socket) -> None:
+    """Serve until interrupted."""
+    import uvicorn
+
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1
+    )
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+class _Routes:
+    """What answers each address. Work that takes time runs in threads."""
+
+    def __init__(self, session: Session, access: Access) -> None:
+        self._session = session
+        self._access = access
+        self._model: bytes | None = None
+
+    async def page(self, request: Request) -> Response:
+        response = Response(_PAGE, media_type="text/html")
+        response.set_cookie(
+            self._access.cookie, self._access.token, httponly=True, samesite="strict"
+        )
+        return response
+
+    async def script(self, request: Request) -> Response:
+        return Response(asset("annotate.js"), media_type="text/javascript")
+
+    async def style(self, request: Request) -> Response:
+        return Response(asset("annotate.css"), media_type="text/css")
+
+    async def model(self, request: Request) -> Response:
+        data = await run_in_threadpool(self._display)
+        return Response(data, media_type="application/octet-stream")
+
+    async def photo(self, request: Request) -> Response:
+        photo = self._session.slide(request.path_params["number"]).photo
+        kind, data = await run_in_threadpool(photo.encoded)
+        return Response(data, media_type=kind)
+
+    async def state(self, request: Request) -> Response:
+        return await self._answer(request.path_params["number"], None)
+
+    async def act(self, request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0] != "application/json":
+            raise InputError("the body is not JSON", where="content-type")
+        try:
+            action = json.loads(await request.body())
+        except (ValueError, RecursionError):
+            raise InputError("the body is not JSON", where="body") from None
+        if not isinstance(action, dict):
+            raise InputError("the body is not an object", where="body")
+        return await self._answer(request.path_params["number"], action)
+
+    async def _answer(self, number: int, action: dict[str, Any] | None) -> Response:
+        def work() -> bytes:
+            with self._session.lock:
+                outcome = None if action is None else self._session.act(number, action)
+                state = state_of(self._session, number, outcome)
+            return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
+
+        return Response(await run_in_threadpool(work), media_type="application/json")
+
+    def _display(self) -> bytes:
+        with self._session.lock:
+            if self._model is None:
+                self._model = display_bytes(self._session.model)
+            return self._model
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, status_code=422)

@@ -1,0 +1,76 @@
+"""`cadalign annotate`: align a model to photos by clicking, in the browser."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from cadalign.cli.output import make_folder, new_console
+
+
+@dataclass(frozen=True)
+class Annotate:
+    """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
+
+    Serves a page on this machine only. Every change is saved at once: an observation beside each
+    photo (photo.json), its alignment (photo_fit/fit.json), and the model's keypoints
+    (model.keypoints.json).
+    """
+
+    image: Path
+    """A photo, or a folder of photos."""
+    model: Path
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    observation: Path | None = None
+    """Where a single photo's observation is kept and found again; by default beside the photo."""
+    out: Path | None = None
+    """Folder for the observations; by default the photos'."""
+    camera: Path | None = None
+    """JSON file of the calibrated camera (COLMAP's form, Open3D's or NeRF's). Without one the focal
+    length is estimated."""
+    keypoints: Path | None = None
+    """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
+    port: int = 0
+    """Port to listen on; 0 for a free one."""
+    no_open: bool = False
+    """Print the address instead of opening a browser."""
+
+    def run(self) -> int:
+        """Serve until interrupted; returns the exit code."""
+        import webbrowser
+
+        from cadalign.annotate.guard import Access
+        from cadalign.annotate.prepare import open_session
+        from cadalign.annotate.server import listen, make_app, serve
+
+        console = new_console()
+        listener = listen(self.port)
+        with listener:
+            if self.out is not None:
+                make_folder(self.out)
+            with console.status("reading photos and model"):
+                session = open_session(
+                    image=self.image,
+                    model=self.model,
+                    observation=self.observation,
+                    camera=self.camera,
+                    keypoints=self.keypoints,
+                    out=self.out,
+                )
+            access = Access(listener.getsockname()[1])
+            threading.Thread(target=session.warm_up, daemon=True).start()
+            new_console(stderr=False).print(access.url, markup=False, soft_wrap=True)
+            console.print(
+                "Open this address in a browser; end with Ctrl+C. It works on this machine only, "
+                "and for this session.",
+                markup=False,
+            )
+            if not self.no_open:
+                webbrowser.open(access.url)
+            with suppress(KeyboardInterrupt):
+                serve(make_app(session, access), listener)
+        folder = session.keypoints_path.parent
+        console.print(f"Saved in {folder.absolute()}", markup=False)
+        return 0

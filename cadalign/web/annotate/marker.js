@@ -1,0 +1,38 @@
+// How a point is drawn, the same in the photo and on the model.
+
+export const KINDS = {
+  pair: { fill: "#1f5fbf", ring: "#ffffff", radius: 11 },
+  selected: { fill: "#0b2e66", ring: "#ffd23f", radius: 13 },
+  wrong: { fill: "#b3261e", ring: "#ffffff", radius: 11 },
+  free: { fill: "#ffffff", ring: "#3a4048", radius: 5 },
+  suggested: { fill: "transparent", ring: "#ffd23f", radius: 12 },
+};
+
+/** What a pair looks like. */
+export function kindOf(pair, selected) {
+  if (pair.pair === selected) return "selected";
+  return pair.off === null ? "pair" : "wrong";
+}
+
+/** Draw a disk with a label about (x, y). */
+export function drawBadge(context, kind, label, x, y) {
+  const { fill, ring, radius } = KINDS[kind];
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  if (fill !== "transparent") {
+    context.fillStyle = fill;
+    context.fill();
+  }
+  // A dark line under the light one keeps it visible on any ground.
+  for (const [style, width] of [["rgb(0 0 0 / 60%)", 4.5], [ring, 2]]) {
+    context.strokeStyle = style;
+    context.lineWidth = width;
+    context.stroke();
+  }
+  if (!label) return;
+  context.fillStyle = "#ffffff";
+  context.font = "600 12px system-ui, sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  context.fillText(label, x, y + 0.5);
+}

@@ -1,0 +1,133 @@
+"""Align one sample chair to a photo of another: the README's worked example, and its picture.
+
+The photo is a rendering of the one chair; keypoints are joined by their semantic ids. Writes the
+picture and, if asked to, the files for `cadalign fit` and `cadalign annotate`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+
+from cadalign.alignment import Alignment
+from cadalign.annotate.model import CadModel
+from cadalign.annotate.wireframe import Wireframe
+from cadalign.box import Box
+from cadalign.camera import Camera
+from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
+from cadalign.fitting import fit
+from cadalign.observation import Observation
+from cadalign.picture import write_image
+from cadalign.render import (
+    Angles,
+    RaycastRenderer,
+    Scene,
+    draw_overlay,
+    draw_still,
+    pose_in_view,
+    visible_keypoints,
+)
+from cadalign.render.color import ByteImage
+from cadalign.render.stills import on_background
+
+CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
+VIEW = Angles(azimuth=143.0, elevation=24.0)
+PHOTO_GROUND = (206, 208, 212)
+LINE = (35, 208, 255)
+
+
+@dataclass
+class Arguments:
+    """Align one sample chair to a photo of another."""
+
+    out: Path = Path("docs/other_chair.png")
+    """Where to write the picture."""
+    photo_of: str = "006"
+    """The sample chair in the photo."""
+    model: str = "000"
+    """The sample chair that is aligned to it."""
+    files: Path | None = None
+    """Folder for the photo, the observation and the model's keypoints."""
+    width: int = 1500
+    """Width of the picture in pixels."""
+
+
+def main(arguments: Arguments) -> None:
+    """Render, align, print and draw."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = arguments.files or Path(folder)
+        chairs = KeypointNet(write_sample_dataset(root / "sample"))
+        seen = chairs["chair", f"sample_chair_{arguments.photo_of}"]
+        model = chairs["chair", f"sample_chair_{arguments.model}"]
+        photo = root / "photo.png"
+        observation = observe(seen, model, photo)
+        observation.save(root / "photo.json")
+        ModelKeypoints.of_model(model).save(root / f"{model.model_id}.keypoints.json")
+        result = fit(observation.points_3d, observation.points_2d, observation.camera, sigma=None)
+        print(result)
+
+        scene = Scene(model.load_mesh())
+        image = still(Scene(seen.load_mesh()))
+        aligned = draw_overlay(
+            with_wireframe(image, CadModel(scene.mesh), result.alignment),
+            CAMERA,
+            est_box=Box.from_model(scene.bounds, result.alignment),
+            observed=observation.points_2d,
+            reprojected=CAMERA.project(result.alignment.apply(observation.points_3d)),
+            legend=False,
+        )
+        row = np.hstack([image, still(scene), aligned])
+    height = round(row.shape[0] * arguments.width / row.shape[1])
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    small = cv2.resize(row, (arguments.width, height), interpolation=cv2.INTER_AREA)
+    write_image(arguments.out, np.asarray(small, dtype=np.uint8))
+
+
+def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
+    """Render the photo; its visible keypoints, with the other model's points of the same ids."""
+    scene = Scene(seen.load_mesh())
+    pose = pose_in_view(scene, CAMERA, VIEW)
+    write_image(photo, still(scene))
+    visible = visible_keypoints(scene, seen.keypoints.xyz, CAMERA, pose)
+    in_photo = dict(
+        zip(
+            seen.keypoints.semantic_ids[visible].tolist(),
+            CAMERA.project(pose.apply(seen.keypoints.xyz[visible])),
+            strict=True,
+        )
+    )
+    on_model = dict(zip(model.keypoints.semantic_ids.tolist(), model.keypoints.xyz, strict=True))
+    shared = sorted(in_photo.keys() & on_model.keys())
+    return Observation(
+        points_3d=np.array([on_model[number] for number in shared]),
+        points_2d=np.array([in_photo[number] for number in shared]),
+        camera=CAMERA,
+        semantic_ids=np.array(shared),
+        image=photo,
+        model=model.mesh_path,
+    )
+
+
+def still(scene: Scene) -> ByteImage:
+    """A picture of a chair, (h, w, 3) uint8."""
+    pose = pose_in_view(scene, CAMERA, VIEW)
+    color = draw_still(RaycastRenderer(), scene, CAMERA, pose, samples=16)
+    return on_background(color, PHOTO_GROUND)
+
+
+def with_wireframe(image: ByteImage, model: CadModel, alignment: Alignment) -> ByteImage:
+    """The photo with the lines of the stretched model."""
+    drawn = image.copy()
+    for start, end in Wireframe(model).seen_in(CAMERA, alignment):
+        ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
+        cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
+    return drawn
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

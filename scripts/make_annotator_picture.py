@@ -1,0 +1,72 @@
+"""Make the README's picture of the annotator, in a headless browser.
+
+The photo and the model are those of `align_other_chair.py`, whose files are needed:
+
+    python scripts/align_other_chair.py --files chairs
+    python scripts/make_annotator_picture.py --files chairs
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from playwright.sync_api import Page, sync_playwright
+
+from cadalign.observation import Observation
+
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.mesh
+    && annotator.photo.picture)"""
+
+
+@dataclass
+class Arguments:
+    """Make the README's picture of the annotator."""
+
+    files: Path
+    """Where `align_other_chair.py` has written its files."""
+    out: Path = Path("docs/annotator.png")
+    """Where to write the picture."""
+
+
+def main(arguments: Arguments) -> None:
+    """Serve, open the page, and take its picture."""
+    observation = arguments.files / "photo.json"
+    model = Observation.load(observation).model
+    command = [sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())"]
+    command += ["annotate", "--no-open", "--image", str(arguments.files / "photo.png")]
+    command += ["--model", str(model), "--observation", str(observation)]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout is not None
+        url = server.stdout.readline().strip()
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=shutil.which("chromium"), args=FLAGS
+            )
+            page = browser.new_page(viewport={"width": 1280, "height": 960}, color_scheme="light")
+            page.goto(url)
+            wait(page)
+            arguments.out.parent.mkdir(parents=True, exist_ok=True)
+            page.screenshot(path=arguments.out)
+            browser.close()
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def wait(page: Page) -> None:
+    """Wait until everything is drawn."""
+    while not page.evaluate(READY):
+        page.wait_for_timeout(100)
+    page.keyboard.press("v")
+    page.wait_for_timeout(1000)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

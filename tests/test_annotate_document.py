@@ -1,0 +1,192 @@
+"""Pairs, their edits, undo and redo, and the names of model points."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign.annotate.document import Document, FocalChoice, Pair
+from cadalign.annotate.history import History
+from cadalign.annotate.keypoint_book import KeypointBook
+from cadalign.datasets import ModelKeypoint
+from cadalign.errors import InputError
+
+EMPTY = Document()
+
+
+def test_either_half_may_come_first() -> None:
+    photo_first, pair = EMPTY.place_uv((1.0, 2.0))
+    photo_first, again = photo_first.place_keypoint(5)
+    model_first, _ = EMPTY.place_keypoint(5)
+    model_first, _ = model_first.place_uv((1.0, 2.0))
+    assert pair == again == 1
+    assert photo_first.complete_pairs == model_first.complete_pairs
+    assert photo_first.complete_pairs == (Pair(1, (1.0, 2.0), 5),)
+
+
+def test_halves_fill_the_oldest_gap_unless_another_pair_is_preferred() -> None:
+    document = EMPTY
+    for u in range(3):
+        document, _ = document.place_uv((float(u), 0.0))
+    first, number = document.place_keypoint(7)
+    assert number == 1
+    preferred, number = document.place_keypoint(7, preferred=3)
+    assert number == 3
+    assert preferred.pair(3).complete
+    # A pair that has this half already cannot be filled: the oldest gap is.
+    _, number = first.place_keypoint(8, preferred=1)
+    assert number == 2
+
+
+def test_numbers_are_never_given_twice() -> None:
+    document, first = EMPTY.place_uv((0.0, 0.0))
+    document, second = document.delete(first).place_uv((0.0, 0.0))
+    assert second != first
+
+
+def test_releasing_the_model_half_keeps_the_photo_half() -> None:
+    document, pair = EMPTY.place_uv((1.0, 2.0))
+    document, _ = document.place_keypoint(5)
+    assert document.release_keypoint(pair).pairs == (Pair(1, (1.0, 2.0)),)
+    lone, pair = EMPTY.place_keypoint(5)
+    assert lone.release_keypoint(pair).pairs == ()
+
+
+def test_a_keypoint_has_one_place() -> None:
+    document, _ = EMPTY.place_keypoint(5)
+    with pytest.raises(InputError) as error:
+        document.place_keypoint(5)
+    assert str(error.value) == (
+        "keypoint: this keypoint is pair 1 already; "
+        "a keypoint has one place in a photo: move or delete that pair"
+    )
+
+
+def test_unknown_pair_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^pair: there is no pair 9; reload the page$"):
+        EMPTY.move(9, (0.0, 0.0))
+
+
+# --- undo ------------------------------------------------------------------------------------
+
+EDITS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), max_size=25)
+
+
+def edited(document: Document, edit: int, which: int) -> Document:
+    """One of all kinds of edits, on one of the pairs if there are any."""
+    numbers = [pair.number for pair in document.pairs]
+    if edit == 0 or not numbers:
+        return document.place_uv((float(which), 1.0))[0]
+    if edit == 1:
+        free = min(set(range(30)) - document.keypoints)
+        return document.place_keypoint(free)[0]
+    number = numbers[which % len(numbers)]
+    if edit == 2:
+        return document.move(number, (float(which), 2.0))
+    if edit == 3:
+        return document.delete(number)
+    return document.choose_focal(FocalChoice(known=which % 2 == 0, pixels=100.0 + which))
+
+
+@given(EDITS)
+def test_undo_leads_back_through_every_document_and_redo_forth(
+    edits: list[tuple[int, int]],
+) -> None:
+    history = History(EMPTY)
+    documents = [EMPTY]
+    for edit, which in edits:
+        history.record(edited(history.document, edit, which))
+        documents.append(history.document)
+    for expected in documents[-2::-1]:
+        assert history.undo()
+        assert history.document is expected
+    assert not history.can_undo
+    assert not history.undo()
+    for expected in documents[1:]:
+        assert history.redo()
+        assert history.document is expected
+    assert not history.redo()
+
+
+@given(EDITS)
+def test_no_keypoint_is_used_twice_whatever_is_done(edits: list[tuple[int, int]]) -> None:
+    document = EMPTY
+    for edit, which in edits:
+        document = edited(document, edit, which)
+        used = [pair.keypoint for pair in document.pairs if pair.keypoint is not None]
+        assert len(used) == len(set(used))
+        numbers = [pair.number for pair in document.pairs]
+        assert len(numbers) == len(set(numbers))
+
+
+def test_an_edit_after_an_undo_forgets_what_was_undone() -> None:
+    history = History(EMPTY)
+    history.record(EMPTY.place_uv((1.0, 1.0))[0])
+    history.undo()
+    history.record(EMPTY.place_uv((2.0, 2.0))[0])
+    assert not history.can_redo
+
+
+def test_moves_of_one_gesture_are_undone_together() -> None:
+    placed, pair = EMPTY.place_uv((0.0, 0.0))
+    history = History(placed)
+    for gesture, u in ((1, 1.0), (1, 2.0), (2, 3.0), (2, 4.0)):
+        history.record(history.document.move(pair, (u, 0.0)), step=(pair, gesture))
+    history.undo()
+    assert history.document.pair(pair).uv == (2.0, 0.0)
+    history.undo()
+    assert history.document is placed
+    assert not history.can_undo
+
+
+# --- the model's keypoints -------------------------------------------------------------------
+
+
+def test_points_without_id_or_name_get_free_ones() -> None:
+    book = KeypointBook(
+        [ModelKeypoint("seat", (0, 0, 0)), ModelKeypoint("seat", (1, 0, 0), semantic_id=4)]
+    )
+    added = book.add(ModelKeypoint("", (2, 0, 0)))
+    assert {number: point.name for number, point in book} == {
+        4: "seat",
+        5: "seat (2)",
+        added: f"point {added}",
+    }
+    assert book.given == {4, 5}
+    assert added == 6
+
+
+def test_points_are_found_by_their_place() -> None:
+    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
+    assert book.find((0.999, 0, 0), tolerance=0.01) == 1
+    assert book.find((0.9, 0, 0), tolerance=0.01) is None
+    assert KeypointBook().find((0, 0, 0), tolerance=1) is None
+
+
+def test_names_are_checked() -> None:
+    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
+    book.rename(0, "  front   left ")
+    assert book[0].name == "front left"
+    with pytest.raises(InputError, match=r"^name: another keypoint is called 'b'$"):
+        book.rename(0, "b")
+    for bad in ("", " \n ", 81 * "x"):
+        with pytest.raises(InputError, match=r"is not a name; give 1 to 80 characters$"):
+            book.rename(0, bad)
+    with pytest.raises(InputError, match=r"^keypoint: there is no keypoint 9; reload the page$"):
+        book.rename(9, "c")
+
+
+def test_points_of_an_earlier_session_are_taken_in() -> None:
+    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
+    book.take_in(
+        [
+            ModelKeypoint("renamed", (1e-9, 0, 0), 0),
+            ModelKeypoint("placed", (2, 0, 0), 7),
+            ModelKeypoint("elsewhere", (5, 0, 0), 1),
+        ],
+        tolerance=1e-6,
+    )
+    names = {number: point.name for number, point in book}
+    assert names == {0: "renamed", 1: "b", 7: "placed", 8: "elsewhere"}
+    assert book.given == {0, 1, 7, 8}

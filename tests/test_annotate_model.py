@@ -1,0 +1,237 @@
+"""Exact points on the model, whatever is shown of it."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign import Alignment, Camera, Mesh
+from cadalign.annotate.display import display_bytes
+from cadalign.annotate.files import read_given_keypoints
+from cadalign.annotate.model import CadModel
+from cadalign.annotate.simplify import simplify
+from cadalign.annotate.wireframe import Wireframe, box_lines
+from cadalign.datasets import KeypointNet, load_mesh
+from cadalign.errors import DataError, InputError
+
+SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
+
+
+def sphere(rings: int, *, dent: float = 0.0) -> Mesh:
+    """A unit sphere of 2 * rings^2 triangles, moved off the origin."""
+    theta, phi = np.meshgrid(
+        np.linspace(0.01, np.pi - 0.01, rings + 1), np.linspace(0, 2 * np.pi, rings + 1)
+    )
+    radius = 1 + dent * np.sin(5 * theta) * np.cos(4 * phi)
+    points = radius[..., None] * np.stack(
+        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1
+    )
+    a = np.arange(rings)[:, None] * (rings + 1) + np.arange(rings)
+    quads = np.stack([a, a + 1, a + rings + 2, a + rings + 1], axis=-1).reshape(-1, 4)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return Mesh(points.reshape(-1, 3) + [3.0, -1.0, 2.0], faces)
+
+
+def box_mesh() -> Mesh:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], dtype=float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return Mesh(corners, faces)
+
+
+# --- picking ---------------------------------------------------------------------------------
+
+
+def test_pick_gives_point_face_and_barycentrics() -> None:
+    model = CadModel(Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]]))
+    point = model.pick([1.5, 0.5, 4.0], [0, 0, -2])
+    assert point is not None
+    np.testing.assert_allclose(point.xyz, [1.5, 0.5, 0], atol=1e-5)
+    assert point.face_index == 0
+    np.testing.assert_allclose(point.barycentric, [0.25, 0.5, 0.25], atol=1e-5)
+    assert model.pick([5, 5, 4], [0, 0, -1]) is None
+
+
+def test_pick_on_a_polygon_counts_its_first_triangle() -> None:
+    mesh = Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]], polygon=np.array([7, 7]))
+    point = CadModel(mesh).pick([0.5, 1.5, 4.0], [0, 0, -1])
+    assert point is not None
+    assert point.face_index == 7
+    rebuilt = mesh.surface_points([7], [point.barycentric])[0]
+    np.testing.assert_allclose(rebuilt, point.xyz, atol=1e-9)
+    bent = [*SQUARE[:3], [0, 2, 1]]
+    point = CadModel(Mesh(bent, [[0, 1, 2], [0, 2, 3]], polygon=np.array([7, 7]))).pick(
+        [0.5, 1.5, 4.0], [0, 0, -1]
+    )
+    assert point is not None
+    assert point.face_index is None  # no weights of the first triangle name it
+
+
+@given(st.integers(0, 2**31))
+def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mesh = sphere(12, dent=0.2)
+    model = CadModel(mesh)
+    origin = model.center + 6 * (lambda v: v / np.linalg.norm(v))(rng.normal(size=3))
+    target = model.center + rng.uniform(-0.5, 0.5, 3)
+    point = model.pick(origin, target - origin)
+    assert point is not None
+    assert point.face_index is not None
+    rebuilt = mesh.surface_points([point.face_index], [point.barycentric])[0]
+    np.testing.assert_allclose(rebuilt, point.xyz, atol=1e-9)
+    off_ray = np.cross(np.array(point.xyz) - origin, target - origin)
+    assert np.linalg.norm(off_ray) / np.linalg.norm(target - origin) < 1e-4
+    assert model.is_seen(origin, point.xyz)
+    assert not model.is_seen(2 * model.center - origin, point.xyz)
+
+
+def test_rays_are_checked() -> None:
+    model = CadModel(Mesh(SQUARE, [[0, 1, 2]]))
+    with pytest.raises(InputError, match=r"^direction: is zero$"):
+        model.pick([0, 0, 1], [0, 0, 0])
+    with pytest.raises(InputError, match=r"^origin: NaN or infinite"):
+        model.pick([0, 0, np.nan], [0, 0, 1])
+
+
+def test_a_model_without_extent_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^dot: all its vertices are in one place$"):
+        CadModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
+
+
+def test_display_coordinates_are_centred_with_diagonal_1() -> None:
+    model = CadModel(box_mesh())
+    shown = model.to_display(model.scene.bounds)
+    np.testing.assert_allclose(shown.sum(axis=0), 0, atol=1e-12)
+    assert np.linalg.norm(shown[1] - shown[0]) == pytest.approx(1)
+    np.testing.assert_allclose(model.from_display(shown), model.scene.bounds)
+
+
+def test_samples_are_corners_far_from_each_other() -> None:
+    model = CadModel(box_mesh())
+    assert len(model.samples) == 8
+    for point in model.samples:
+        assert point.face_index is not None
+        rebuilt = model.scene.mesh.surface_points([point.face_index], [point.barycentric])
+        np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-12)
+    assert len(CadModel(sphere(60)).samples) == 96
+
+
+# --- what is shown ---------------------------------------------------------------------------
+
+
+def test_small_meshes_are_shown_as_they_are() -> None:
+    mesh = box_mesh()
+    small = simplify(mesh, max_faces=12)
+    assert small.vertices is mesh.vertices
+    assert small.faces is mesh.faces
+
+
+@pytest.mark.parametrize("limit", [1, 50, 2000])
+def test_simplified_meshes_keep_to_the_limit_and_near_the_surface(limit: int) -> None:
+    mesh = sphere(80)
+    small = simplify(mesh, max_faces=limit)
+    assert 0 < len(small.faces) <= limit
+    assert len(small.source) == len(small.faces)
+    assert len(np.unique(np.sort(small.faces, axis=1), axis=0)) == len(small.faces)
+    if limit == 2000:
+        assert len(small.faces) > 0.5 * limit
+        radius = np.linalg.norm(small.vertices[small.faces].reshape(-1, 3) - [3, -1, 2], axis=1)
+        assert radius.min() > 0.97
+        assert radius.max() < 1.001
+        # Each stands for a triangle of the full mesh that lies there.
+        gaps = mesh.triangles[small.source].mean(1) - small.vertices[small.faces].mean(1)
+        assert np.linalg.norm(gaps, axis=1).max() < 0.1
+
+
+def test_display_bytes_hold_triangles_normals_and_colours() -> None:
+    model = CadModel(box_mesh())
+    data = display_bytes(model)
+    length = int.from_bytes(data[:4], "little")
+    assert length % 4 == 0
+    assert json.loads(data[4 : 4 + length]) == {"shown": 12, "all": 12}
+    numbers = np.frombuffer(data[4 + length : -36], "<f4").reshape(2, 12, 3, 3)
+    np.testing.assert_allclose(model.from_display(numbers[0]), model.scene.triangles, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(numbers[1], axis=-1), 1, atol=1e-6)
+    assert set(data[-36:]) == {round(0.7 * 255)}
+
+
+@pytest.mark.slow
+def test_two_million_faces_are_shown_decimated_and_picked_exactly(tmp_path: Path) -> None:
+    mesh = sphere(1000, dent=0.1)
+    assert len(mesh.faces) == 2_000_000
+    start = time.perf_counter()
+    model = CadModel(mesh)
+    data = display_bytes(model)
+    length = int.from_bytes(data[:4], "little")
+    header = json.loads(data[4 : 4 + length])
+    assert header["all"] == 2_000_000
+    assert 75_000 < header["shown"] <= 150_000
+    rng = np.random.default_rng(1)
+    for face in rng.integers(0, 2_000_000, 50).tolist():
+        target = mesh.triangles[face].mean(axis=0)
+        outwards = target - model.center
+        point = model.pick(model.center + 4 * outwards, -outwards)
+        assert point is not None
+        assert point.face_index is not None
+        assert np.linalg.norm(point.xyz - target) < 1e-4 * model.diagonal
+    Wireframe(model)
+    assert time.perf_counter() - start < 60
+
+
+# --- the lines over the photo ----------------------------------------------------------------
+
+CAMERA = Camera.from_fov(640, 480, fov_x=50.0)
+
+
+def test_wireframe_shows_the_edges_that_are_seen() -> None:
+    model = CadModel(box_mesh())
+    turn = np.array([[0.8, 0, 0.6], [0.36, 0.8, -0.48], [-0.48, 0.6, 0.64]])
+    alignment = Alignment(turn, [0, -0.5, 9], [1, 1.2, 0.7])
+    lines = Wireframe(model).seen_in(CAMERA, alignment)
+    assert lines.shape[1:] == (2, 2)
+    corners = CAMERA.project(alignment.apply(model.scene.mesh.vertices))
+    # Of a box's 8 corners one is hidden, and three of its edges.
+    gaps = np.linalg.norm(corners[:, None] - lines.reshape(-1, 2), axis=2).min(axis=1)
+    assert (gaps < 1e-6).sum() == 7
+    edges = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
+    whole = box_lines(model.scene.bounds, CAMERA, alignment)
+    all_edges = np.linalg.norm(whole[:, 1] - whole[:, 0], axis=1).sum()
+    assert 0.6 < edges / all_edges < 0.9
+
+
+def test_wireframe_shows_the_outline_of_smooth_models() -> None:
+    model = CadModel(sphere(40))
+    alignment = Alignment(np.eye(3), [-3, 1, 4], [1, 1, 1])  # the sphere's centre at depth 6
+    lines = Wireframe(model).seen_in(CAMERA, alignment)
+    assert len(lines) > 40
+    ends = CAMERA.normalize(lines.reshape(-1, 2))
+    angle = np.arctan(np.linalg.norm(ends, axis=1))
+    assert np.median(angle) == pytest.approx(np.arcsin(1 / 6), rel=0.03)
+
+
+def test_lines_behind_the_camera_are_left_out() -> None:
+    model = CadModel(box_mesh())
+    behind = Alignment(np.eye(3), [0, 0, -9], [1, 1, 1])
+    assert Wireframe(model).seen_in(CAMERA, behind).shape == (0, 2, 2)
+    assert box_lines(model.scene.bounds, CAMERA, behind).shape == (0, 2, 2)
+
+
+# --- the keypoints that come with a model ----------------------------------------------------
+
+
+def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> None:
+    annotated = KeypointNet(sample_root)["chair", "sample_chair_000"]
+    assert annotated.mesh_path is not None
+    mesh = load_mesh(annotated.mesh_path)
+    file = sample_root / "annotations" / "chair.json"
+    points = read_given_keypoints(file, annotated.mesh_path, mesh)
+    assert [point.semantic_id for point in points] == annotated.keypoints.semantic_ids.tolist()
+    np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
+    with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
+        read_given_keypoints(file, Path("other.ply"), mesh)

@@ -1,0 +1,438 @@
+"""The annotator's page in a real browser: clicks, drags, keys, reloads."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from annotating import Case, make_case, place_all, place_twenty, served
+from playwright.sync_api import Browser, Page
+
+from cadalign.annotate.guard import Access
+from cadalign.annotate.session import Session
+from cadalign.annotate.state import state_of
+from cadalign.cli import main
+
+READY = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
+)
+
+# Without the thousands of numbers of the lines.
+STATE = """() => annotator.api.idle && annotator.state && {
+    ...annotator.state,
+    alignment: { ...annotator.state.alignment, lines: null, box: null },
+}"""
+COUNT_COLOR = """color => {
+    const { canvas, context } = annotator.photo;
+    const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let k = 0; k < data.length; k += 4) {
+        if ([0, 1, 2].every((c) => Math.abs(data[k + c] - color[c]) < 25)) count += 1;
+    }
+    return count;
+}"""
+
+
+@pytest.fixture(scope="module")
+def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return make_case(sample_root, tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture
+def case(original: Case, tmp_path: Path) -> Case:
+    folder = tmp_path / "photos"
+    shutil.copytree(original.folder, folder)
+    return Case(
+        folder,
+        folder / original.photo.name,
+        folder / original.camera.name,
+        original.model,
+        folder / original.keypoints.name,
+        original.instance,
+    )
+
+
+class Driver:
+    """The page, and how to click on pixels of the photo and points of the model."""
+
+    def __init__(self, page: Page, session: Session) -> None:
+        self.page = page
+        self.session = session
+        self.errors: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
+
+    def open(self, access: Access) -> None:
+        self.page.goto(access.url)
+        self.wait(READY)
+
+    # Not `wait_for_function`, which evaluates text in the page: its policy forbids that.
+    def wait(self, condition: str, timeout: float = 20.0) -> None:
+        for _ in range(int(timeout / 0.02)):
+            if self.page.evaluate(condition):
+                return
+            self.page.wait_for_timeout(20)
+        pytest.fail(f"not true in {timeout:g} s: {condition}; errors: {self.errors}")
+
+    def wait_for_state(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        for _ in range(500):
+            state = self.page.evaluate(STATE)
+            if state and condition(state):
+                return dict(state)
+            self.page.wait_for_timeout(20)
+        pytest.fail(f"the state never came; errors: {self.errors}")
+
+    def pixel(self, uv: list[float]) -> tuple[float, float]:
+        """Where a pixel of the photo is on the page."""
+        x, y = self.page.evaluate(
+            """uv => {
+                const { left, top } = annotator.photo.canvas.getBoundingClientRect();
+                const place = annotator.photo.toView(uv);
+                return [left + place.x, top + place.y];
+            }""",
+            uv,
+        )
+        return x, y
+
+    def surface(self, xyz: np.ndarray) -> tuple[float, float]:
+        """Where a model point is on the page."""
+        place = self.page.evaluate("xyz => annotator.model.toPage(xyz)", xyz.tolist())
+        return place["x"], place["y"]
+
+    def eye(self) -> np.ndarray:
+        """Where the model is looked at from, in model coordinates."""
+        eye = self.page.evaluate("annotator.model.stage.camera.position.toArray()")
+        return self.session.model.from_display(eye)
+
+    def look(self, eye: np.ndarray) -> None:
+        """Look at the model from another place, as orbiting would."""
+        self.page.evaluate(
+            """eye => {
+                annotator.model.stage.camera.position.set(...eye);
+                annotator.model.stage.controls.update();
+                annotator.model.stage.invalidate();
+            }""",
+            self.session.model.to_display(eye).tolist(),
+        )
+        self.page.wait_for_timeout(50)
+
+
+@pytest.fixture
+def opened(browser: Browser, case: Case) -> Iterator[tuple[Driver, Case, Access]]:
+    session = case.open()
+    context = browser.new_context(viewport={"width": 1000, "height": 760})
+    with served(session) as access:
+        driver = Driver(context.new_page(), session)
+        driver.open(access)
+        yield driver, case, access
+        context.close()
+        assert driver.errors == []
+
+
+def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
+    opened: tuple[Driver, Case, Access], capsys: pytest.CaptureFixture[str]
+) -> None:
+    driver, case, _ = opened
+    page = driver.page
+    # The chair as the photo shows it, so that the keypoints that are seen there are seen here.
+    pose = case.instance.cam_from_model
+    towards = pose.inverse(np.zeros((1, 3)))[0] - driver.session.model.center
+    driver.look(
+        driver.session.model.center
+        + 2.2 * driver.session.model.diagonal * towards / np.linalg.norm(towards)
+    )
+    for number, (keypoint, uv) in enumerate(case.clicks[:6], start=1):
+        page.mouse.click(*driver.pixel(uv))
+        driver.wait_for_state(lambda state, n=number: len(state["pairs"]) == n)
+        page.mouse.click(
+            *driver.surface(driver.session.model.to_display(driver.session.book[keypoint].xyz))
+        )
+        state = driver.wait_for_state(lambda state, k=keypoint: state["pairs"][-1]["keypoint"] == k)
+        assert state["alignment"]["status"] == ("done" if number >= 4 else "none")
+        error = np.array(state["pairs"][-1]["uv"]) - uv
+        assert np.abs(error).max() < 0.75 / page.evaluate("annotator.photo.scale")
+    text = page.inner_text("main")
+    assert "Stretch along y" in text
+    assert "Pairs agree to" in text
+
+    # The alignment is drawn: red box, blue edges.
+    for color in ([255, 90, 99], [53, 208, 255]):
+        assert page.evaluate(COUNT_COLOR, color) > 150
+
+    # Drag a point, see the alignment follow, and undo that in one step.
+    before = driver.wait_for_state(lambda _: True)
+    x, y = driver.pixel(before["pairs"][2]["uv"])
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for step in range(1, 9):
+        page.mouse.move(x + 4 * step, y + step)
+    page.mouse.up()
+    scale = page.evaluate("annotator.photo.scale")
+    target = [before["pairs"][2]["uv"][0] + 32 / scale, before["pairs"][2]["uv"][1] + 8 / scale]
+    moved = driver.wait_for_state(
+        lambda state: np.allclose(state["pairs"][2]["uv"], target, atol=0.01)
+    )
+    assert moved["alignment"]["alignment"] != before["alignment"]["alignment"]
+    page.keyboard.press("Control+z")
+    undone = driver.wait_for_state(lambda state: state["can_redo"])
+    assert undone["pairs"][2]["uv"] == before["pairs"][2]["uv"]
+    assert undone["alignment"] == before["alignment"]
+    page.keyboard.press("Control+y")
+    driver.wait_for_state(lambda state: not state["can_redo"])
+    page.keyboard.press("Control+Shift+z")
+    page.keyboard.press("Control+z")
+    driver.wait_for_state(lambda state: state["can_redo"])
+
+    # Nothing is lost by a reload, nor by a crash: a new server finds it all on disk.
+    page.reload()
+    driver.wait(READY)
+    assert "token" not in page.url
+    reloaded = driver.wait_for_state(lambda _: True)
+    assert reloaded["pairs"] == undone["pairs"]
+    assert reloaded["alignment"] == undone["alignment"]
+    restarted = state_of(case.open(keypoints=None), 0)
+    assert json.loads(json.dumps(restarted["pairs"])) == undone["pairs"]
+
+    # It is saved, and the file gives the alignment that the page shows.
+    assert page.inner_text("[role=status]").startswith("Saved to photo.json at ")
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["alignment"] == undone["alignment"]["alignment"]
+
+
+def test_clicks_on_the_model_give_the_surface_point(opened: tuple[Driver, Case, Access]) -> None:
+    driver, _, _ = opened
+    model = driver.session.model
+    rng = np.random.default_rng(3)
+    gaps = []
+    for view in range(3):
+        towards = rng.normal(size=3)
+        driver.look(model.center + 1.6 * model.diagonal * towards / np.linalg.norm(towards))
+        eye = driver.eye()
+        triangles = model.scene.triangles[rng.permutation(len(model.scene.triangles))[:60]]
+        for target in triangles.mean(axis=1):
+            point = model.pick(eye, target - eye)
+            if point is None or np.linalg.norm(point.xyz - target) > 1e-4 * model.diagonal:
+                continue  # hidden
+            x, y = driver.surface(model.to_display(target))
+            if driver.page.evaluate(
+                """({ x, y }) => annotator.model.markerAt({ x, y }) !== null
+                    || document.elementFromPoint(x, y) !== annotator.model.stage.canvas""",
+                {"x": x, "y": y},
+            ):
+                continue
+            count = len(driver.session.slides[0].document.pairs)
+            driver.page.mouse.click(x, y)
+            driver.wait_for_state(
+                lambda state, n=count: len(state["pairs"]) == n + 1 or state["message"] != ""
+            )
+            pairs = driver.session.slides[0].document.pairs
+            if len(pairs) == count:
+                continue  # half a pixel beside the outline
+            placed = driver.session.book[pairs[-1].keypoint]
+            gaps.append(np.linalg.norm(np.array(placed.xyz) - target) / model.diagonal)
+            if len(gaps) >= 8 * (view + 1):
+                break
+    assert len(gaps) >= 15
+    # At grazing angles half a pixel is more than that on the surface.
+    assert np.mean(np.array(gaps) < 2e-3) >= 0.9
+    assert np.median(gaps) < 1e-3
+
+
+def test_click_is_fitted_and_redrawn_within_100_ms_at_20_pairs(
+    opened: tuple[Driver, Case, Access],
+) -> None:
+    driver, case, _ = opened
+    place_twenty(driver.session, case)
+    driver.page.evaluate("annotator.api.refresh()")
+    driver.wait_for_state(lambda state: len(state["pairs"]) == 20)
+    times = []
+    for _ in range(8):
+        # The last half of the twentieth pair is placed anew; that is what is timed.
+        driver.page.evaluate("annotator.act({ do: 'undo' })")
+        driver.wait_for_state(lambda state: fitted_pairs(state) == 19)
+        driver.page.evaluate("annotator.redrawn = null; annotator.act({ do: 'redo' })")
+        driver.wait("annotator.redrawn !== null")
+        driver.wait_for_state(lambda state: fitted_pairs(state) == 20)
+        times.append(driver.page.evaluate("annotator.redrawn"))
+    assert min(times) < 100, times
+
+
+def fitted_pairs(state: dict[str, Any]) -> int:
+    return sum(pair["residual"] is not None for pair in state["pairs"])
+
+
+def test_keys_nudge_select_suggest_and_delete(opened: tuple[Driver, Case, Access]) -> None:
+    driver, case, _ = opened
+    page = driver.page
+    place_all(driver.session, case, count=6)
+    page.evaluate("annotator.api.refresh()")
+    driver.wait_for_state(lambda state: len(state["pairs"]) == 6)
+    page.keyboard.press("]")
+    assert page.evaluate("annotator.selected") == 1
+    page.keyboard.press("[")
+    assert page.evaluate("annotator.selected") == 6
+    u, v = case.clicks[5][1]
+    for key in ("ArrowRight", "ArrowRight", "ArrowDown", "Shift+ArrowLeft"):
+        page.keyboard.press(key)
+    driver.wait_for_state(
+        lambda state: np.allclose(state["pairs"][5]["uv"], [u + 0.5 - 2.5, v + 0.25])
+    )
+    page.keyboard.press("Control+z")  # nudges in a row are one step
+    driver.wait_for_state(lambda state: np.allclose(state["pairs"][5]["uv"], [u, v]))
+    page.keyboard.press("Escape")
+    suggested = page.evaluate("annotator.state.suggestion.keypoint")
+    page.keyboard.press("n")
+    driver.wait_for_state(lambda state: state["pairs"][-1]["keypoint"] == suggested)
+    page.keyboard.press("Delete")
+    driver.wait_for_state(lambda state: len(state["pairs"]) == 6)
+    page.keyboard.press("?")
+    assert page.locator("dialog").is_visible()
+    page.keyboard.press("Escape")
+    assert not page.locator("dialog").is_visible()
+
+
+def test_both_views_can_be_used_by_the_keyboard_alone(
+    opened: tuple[Driver, Case, Access],
+) -> None:
+    driver, _, _ = opened
+    page = driver.page
+    page.locator("section[aria-label=Photo] canvas").focus()
+    page.keyboard.press("+")
+    page.keyboard.press("Enter")
+    state = driver.wait_for_state(lambda state: len(state["pairs"]) == 1)
+    middle = page.evaluate("annotator.photo.toPixel(annotator.photo.middle)")
+    np.testing.assert_allclose(state["pairs"][0]["uv"], middle)
+    page.locator("section[aria-label=Model] canvas").focus()
+    before = driver.eye()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowUp")
+    page.wait_for_timeout(50)
+    assert not np.allclose(driver.eye(), before)
+    page.locator("summary").press("Enter")
+    page.locator(".keypoints button").first.press("Enter")
+    driver.wait_for_state(lambda state: state["pairs"][0]["keypoint"] is not None)
+
+
+def test_wheel_and_drag_zoom_and_pan_without_placing(opened: tuple[Driver, Case, Access]) -> None:
+    driver, _, _ = opened
+    page = driver.page
+    anchor = [200.0, 300.0]
+    x, y = map(round, driver.pixel(anchor))  # browsers tell whole pixels of a wheel
+    anchor = page.evaluate(
+        """([x, y]) => {
+            const { left, top } = annotator.photo.canvas.getBoundingClientRect();
+            return annotator.photo.toPixel({ x: x - left, y: y - top });
+        }""",
+        [x, y],
+    )
+    scale = page.evaluate("annotator.photo.scale")
+    page.mouse.move(x, y)
+    page.mouse.wheel(0, -500)
+    driver.wait(f"annotator.photo.scale > {1.5 * scale}")
+    assert driver.pixel(anchor) == pytest.approx((x, y), abs=0.6)  # about the pointer
+    page.mouse.down()
+    page.mouse.move(x + 30, y - 20, steps=4)
+    page.mouse.up()
+    assert driver.pixel(anchor) == pytest.approx((x + 30, y - 20), abs=1.1)
+    assert driver.wait_for_state(lambda _: True)["pairs"] == []
+
+
+def test_a_finger_places_a_point(browser: Browser, case: Case) -> None:
+    session = case.open()
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True)
+    with served(session) as access:
+        driver = Driver(context.new_page(), session)
+        driver.open(access)
+        driver.page.touchscreen.tap(*driver.pixel([200.0, 300.0]))
+        (pair,) = driver.wait_for_state(lambda state: len(state["pairs"]) == 1)["pairs"]
+        assert pair["uv"] == pytest.approx([200, 300], abs=1.5)
+        assert driver.errors == []
+    context.close()
+
+
+def test_contradictions_trouble_and_misses_are_said(opened: tuple[Driver, Case, Access]) -> None:
+    driver, case, _ = opened
+    page = driver.page
+    place_all(driver.session, case, count=10)
+    u, v = case.clicks[4][1]
+    driver.session.act(0, {"do": "move", "pair": 5, "uv": [u + 45, v]})
+    page.evaluate("annotator.api.refresh()")
+    driver.wait_for_state(lambda state: len(state["pairs"]) == 10)
+    row = page.locator("tr.wrong")
+    assert row.count() == 1
+    assert row.inner_text().startswith("Pair 5 contradicts the others: ")
+    assert row.inner_text().endswith(" px off")
+    box = page.locator("section[aria-label=Model] canvas").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + 8, box["y"] + box["height"] - 8)
+    driver.wait(
+        "document.querySelector('[role=alert]').textContent === 'That click missed the model.'"
+    )
+
+
+def test_page_says_when_the_server_is_gone(browser: Browser, case: Case) -> None:
+    context = browser.new_context()
+    with served(case.open()) as access:
+        driver = Driver(context.new_page(), case.open())
+        driver.open(access)
+    driver.page.evaluate("annotator.act({ do: 'undo' })")
+    driver.wait(
+        "document.querySelector('[role=alert]').textContent.startsWith('The server does not')"
+    )
+    context.close()
+
+
+def test_photos_of_a_folder_come_in_turn(browser: Browser, case: Case) -> None:
+    shutil.copy(case.photo, case.folder / "second.png")
+    session = case.open(image=case.folder)
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    with served(session) as access:
+        driver = Driver(context.new_page(), session)
+        driver.open(access)
+        page = driver.page
+        assert page.inner_text("h1") == "photo.png"
+        assert page.get_by_role("button", name="Previous").is_disabled()
+        page.get_by_role("button", name="Next").click()
+        driver.wait_for_state(lambda state: state["image"]["name"] == "second.png")
+        driver.wait(READY)
+        page.mouse.click(*driver.pixel([100.0, 100.0]))
+        driver.wait_for_state(lambda state: len(state["pairs"]) == 1)
+        page.reload()
+        driver.wait(READY)
+        assert page.inner_text("h1") == "second.png"
+        page.keyboard.press("PageUp")
+        state = driver.wait_for_state(lambda state: state["image"]["name"] == "photo.png")
+        assert state["pairs"] == []
+        assert driver.errors == []
+    context.close()
+    assert (case.folder / "second.unfinished.json").exists()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_control_has_a_name_and_nothing_sticks_out(
+    browser: Browser, case: Case, width: int, scheme: Any
+) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
+    with served(session) as access:
+        driver = Driver(context.new_page(), session)
+        driver.open(access)
+        page = driver.page
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        for control in page.locator("button, input, [role=application], summary").all():
+            if control.is_visible():
+                name = control.evaluate(
+                    "c => c.ariaLabel || c.labels?.[0]?.textContent || c.textContent"
+                )
+                assert name.strip()
+        assert page.locator("h1").count() == 1
+        assert driver.errors == []
+    context.close()

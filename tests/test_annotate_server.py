@@ -1,0 +1,241 @@
+"""The annotator's server refuses whoever is not the session's own page."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from annotating import Case, make_case, served
+
+from cadalign.annotate.guard import MAX_BODY, Access
+from cadalign.annotate.server import listen
+from cadalign.errors import InputError
+
+UNDO = json.dumps({"do": "undo"})
+
+
+@pytest.fixture(scope="module")
+def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return make_case(sample_root, tmp_path_factory.mktemp("served"))
+
+
+@pytest.fixture(scope="module")
+def access(case: Case) -> Iterator[Access]:
+    with served(case.open()) as opened:
+        yield opened
+
+
+def ask(
+    access: Access,
+    path: str,
+    *,
+    method: str = "GET",
+    body: str | None = None,
+    token: str | None = "right",
+    **headers: str,
+) -> tuple[int, http.client.HTTPMessage, bytes]:
+    """Send a request as it is written, with the session's token unless another is given."""
+    sent = {name.replace("_", "-"): value for name, value in headers.items()}
+    if token is not None:
+        sent["X-Cadalign-Token"] = access.token if token == "right" else token
+    connection = http.client.HTTPConnection("127.0.0.1", access.port, timeout=20)
+    try:
+        connection.request(method, path, body=body, headers=sent)
+        response = connection.getresponse()
+        return response.status, response.headers, response.read()
+    finally:
+        connection.close()
+
+
+def act(access: Access, body: str = UNDO, **options: str) -> int:
+    defaults = {"Content_Type": "application/json"}
+    return ask(access, "/act/0", method="POST", body=body, **(defaults | options))[0]
+
+
+PATHS = ["/", "/annotate.js", "/annotate.css", "/model", "/photo/0", "/state/0"]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
+    status, headers, body = ask(access, path)
+    assert status == 200
+    assert body
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert headers["Cache-Control"] == "no-store"
+    assert "Access-Control-Allow-Origin" not in headers
+
+
+@pytest.mark.parametrize("path", [*PATHS, "/nowhere", "/?token=", "/?token=wrong"])
+@pytest.mark.parametrize("token", [None, "", "wrong", "täuschung"])
+def test_without_the_token_nothing_is(access: Access, path: str, token: str | None) -> None:
+    if token == "täuschung":
+        token = token.encode().decode("latin-1")
+    status, headers, body = ask(access, path, token=token)
+    assert status == 403
+    assert body == b"the token is missing or wrong: open the address that cadalign has printed"
+    assert "Set-Cookie" not in headers
+
+
+def test_actions_need_the_token(access: Access) -> None:
+    assert act(access) == 200
+    assert ask(access, "/act/0", method="POST", body=UNDO, token=None)[0] == 403
+
+
+def test_token_in_the_address_opens_the_page_only_and_gives_a_cookie(access: Access) -> None:
+    status, headers, _ = ask(access, f"/?token={access.token}", token=None)
+    assert status == 200
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=strict" in cookie
+    pair = cookie.split(";")[0]
+    assert ask(access, "/state/0", token=None, Cookie=pair)[0] == 200
+    assert ask(access, "/state/0", token=None, Cookie=pair[:-1])[0] == 403
+    assert ask(access, "/state/0", token=None, Cookie='a="b; ;;=')[0] == 403
+    assert ask(access, f"/state/0?token={access.token}", token=None)[0] == 403
+
+
+def test_tokens_differ_and_are_long() -> None:
+    tokens = {Access(1).token for _ in range(100)}
+    assert len(tokens) == 100
+    assert min(map(len, tokens)) >= 43
+    assert Access(1).token not in repr(Access(1))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd",
+        "/photo/../../../etc/passwd",
+        "/photo/..%2f..%2fetc%2fpasswd",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/photo/%2e%2e/camera.json",
+        "/..\\camera.json",
+        "//etc/passwd",
+        "/photo/photo.png",
+        "/photo/-1",
+        "/camera.json",
+        "/annotate.js/../LICENSES.txt",
+    ],
+)
+def test_no_path_leads_to_other_files(access: Access, path: str) -> None:
+    status, _, body = ask(access, path)
+    assert status in (404, 422)
+    assert b"root:" not in body
+    assert b"params" not in body
+
+
+def test_unknown_photo_is_an_error_in_words(access: Access) -> None:
+    status, _, body = ask(access, "/photo/99")
+    assert status == 422
+    assert json.loads(body) == {"error": "image: there is no photo 100"}
+
+
+@pytest.mark.parametrize("origin", ["https://evil.example", "null", "http://127.0.0.1:1", ""])
+def test_other_origins_are_refused(access: Access, origin: str) -> None:
+    assert act(access, Origin=origin) == 403
+    assert ask(access, "/state/0", Origin=origin)[0] == 403
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_other_sites_are_refused(access: Access, site: str) -> None:
+    assert ask(access, "/photo/0", Sec_Fetch_Site=site)[0] == 403
+
+
+def test_own_origin_is_served(access: Access) -> None:
+    for name in ("127.0.0.1", "localhost"):
+        origin = f"http://{name}:{access.port}"
+        assert act(access, Origin=origin, Sec_Fetch_Site="same-origin") == 200
+    assert ask(access, "/state/0", Sec_Fetch_Site="none")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1", "localhost:1", "127.0.0.1.evil.example"]
+)
+def test_names_that_were_made_to_lead_here_are_refused(access: Access, host: str) -> None:
+    status, _, body = ask(access, "/state/0", Host=host)
+    assert (status, body) == (400, b"unknown host")
+
+
+def test_only_json_objects_are_actions(access: Access) -> None:
+    assert act(access, Content_Type="text/plain") == 422
+    assert act(access, "{") == 422
+    assert act(access, "[1]") == 422
+    assert act(access, "[" * 60_000) == 422
+    assert act(access, '{"do": "place_uv", "uv": [NaN, 1]}') == 422
+    assert ask(access, "/act/0")[0] == 405
+
+
+# --- bodies that are too long ----------------------------------------------------------------
+
+
+def post_head(access: Access, *lines: str) -> bytes:
+    head = ["POST /act/0 HTTP/1.1", f"Host: 127.0.0.1:{access.port}", *lines]
+    head += [f"X-Cadalign-Token: {access.token}", "Content-Type: application/json"]
+    return "\r\n".join([*head, "", ""]).encode()
+
+
+def answer_to(access: Access, head: bytes, chunk: bytes, chunks: int) -> tuple[str, int]:
+    """Status line, and how many chunks could be sent before the server had had enough."""
+    with socket.create_connection(("127.0.0.1", access.port), timeout=20) as client:
+        client.sendall(head)
+        client.settimeout(0.05)
+        sent, answer = 0, b""
+        try:
+            for _ in range(chunks):
+                try:
+                    answer += client.recv(4096)
+                    break
+                except TimeoutError:
+                    client.sendall(chunk)
+                    sent += 1
+            client.settimeout(20)
+            while not answer:
+                answer = client.recv(4096)
+        except (ConnectionError, BrokenPipeError):
+            pass
+        return answer.split(b"\r\n")[0].decode(), sent
+
+
+def test_a_body_of_100_mb_is_refused_without_reading_it(access: Access) -> None:
+    head = post_head(access, f"Content-Length: {100 * 1024 * 1024}")
+    status, sent = answer_to(access, head, 1024 * b"x", 10)
+    assert status.startswith("HTTP/1.1 413")
+    assert sent < 10
+
+
+def test_an_endless_body_is_cut_off(access: Access) -> None:
+    chunk = b"4000\r\n" + 0x4000 * b"x" + b"\r\n"
+    status, sent = answer_to(access, post_head(access, "Transfer-Encoding: chunked"), chunk, 200)
+    assert status.startswith("HTTP/1.1 413")
+    assert sent <= MAX_BODY / 0x4000 + 8
+
+
+def test_a_wrong_length_is_refused(access: Access) -> None:
+    head = post_head(access, "Content-Length: 1e3")
+    assert answer_to(access, head, b"x", 1)[0].split()[1] in ("400", "413")
+
+
+# --- the socket ------------------------------------------------------------------------------
+
+
+def test_it_listens_on_the_loopback_interface_only() -> None:
+    with listen(0) as listener:
+        assert listener.getsockname()[0] == "127.0.0.1"
+
+
+def test_port_in_use_is_an_error_in_words() -> None:
+    with listen(0) as listener:
+        port = listener.getsockname()[1]
+        with pytest.raises(InputError) as error:
+            listen(port)
+    assert str(error.value) == (
+        f"--port: port {port} cannot be listened on (Address already in use); "
+        "leave --port away to get a free one"
+    )
+    with pytest.raises(InputError, match=r"^--port: port 99999 cannot be listened on"):
+        listen(99999)

@@ -1,0 +1,84 @@
+"""`cadalign annotate` from the command line: it starts, says where, ends, and refuses in words."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from annotating import Case, make_case
+
+from cadalign.annotate.server import listen
+from cadalign.cli import main
+
+
+@pytest.fixture(scope="module")
+def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return make_case(sample_root, tmp_path_factory.mktemp("cli"))
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main(["annotate", *map(str, arguments), "--no-open"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    return captured.err.strip().splitlines()[-1].removeprefix("cadalign: ")
+
+
+def test_it_serves_until_interrupted(case: Case) -> None:
+    program = "import sys; from cadalign.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "annotate", "--no-open"]
+    command += ["--image", str(case.photo), "--model", str(case.model)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        url = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{43}", url)
+        with urllib.request.urlopen(url, timeout=30) as response:
+            assert b"annotate.js" in response.read()
+    finally:
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert out == ""
+    assert err.strip().splitlines()[-1] == f"Saved in {case.folder.absolute()}"
+
+
+def test_port_in_use(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    with listen(0) as listener:
+        port = listener.getsockname()[1]
+        message = refusal(capsys, "--image", case.photo, "--model", case.model, "--port", port)
+    assert message == (
+        f"--port: port {port} cannot be listened on (Address already in use); "
+        "leave --port away to get a free one"
+    )
+
+
+def test_missing_model_and_photo(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    nowhere = case.folder / "nowhere.obj"
+    assert refusal(capsys, "--image", case.photo, "--model", nowhere) == (
+        f"{nowhere}: no such mesh file"
+    )
+    assert refusal(capsys, "--image", nowhere, "--model", case.model) == (
+        f"{nowhere}: no such file or folder"
+    )
+    assert refusal(capsys, "--image", case.camera, "--model", case.model).startswith(
+        f"{case.camera}: not an image that can be read ("
+    )
+
+
+def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    file = case.folder / "file"
+    file.write_text("")
+    message = refusal(capsys, "--image", case.photo, "--model", case.model, "--out", file / "out")
+    assert message == f"{file / 'out'}: cannot be made (Not a directory); choose another --out"
+
+
+def test_model_is_required(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["annotate", "--image", "photo.jpg"])
+    assert stop.value.code == 2
+    assert "--model" in capsys.readouterr().err

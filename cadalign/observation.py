@@ -21,7 +21,6 @@ or for none. ``image`` and ``model`` are optional paths, relative to the file.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +31,14 @@ import numpy.typing as npt
 
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError, DataError
+from cadalign.json_file import (
+    as_index,
+    as_object,
+    read_json,
+    refuse_unknown,
+    write_json,
+    written_path,
+)
 from cadalign.validation import FloatArray, IntArray, as_floats, as_points
 
 _FIELDS = {"camera", "keypoints", "image", "model"}
@@ -85,16 +92,7 @@ class Observation:
             message names file and field.
         """
         path = Path(path)
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise DataError("no such file", where=str(path)) from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"cannot be read ({error})", where=str(path)) from None
-        except json.JSONDecodeError as error:
-            raise DataError(
-                f"not valid JSON: {error.msg}", where=f"{path}, line {error.lineno}"
-            ) from None
+        data = read_json(path)
         try:
             return cls.from_dict(data, folder=path.parent)
         except CadalignError as error:
@@ -104,9 +102,8 @@ class Observation:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        if not isinstance(data, Mapping):
-            raise DataError(f"expected an object, got {type(data).__name__}")
-        _refuse_unknown(data, _FIELDS, where="top level")
+        data = as_object(data, where=None)
+        refuse_unknown(data, _FIELDS, where="top level")
         for name in ("camera", "keypoints"):
             if name not in data:
                 raise DataError("missing", where=name)
@@ -138,30 +135,18 @@ class Observation:
         data: dict[str, Any] = {"camera": self.camera.to_dict(), "keypoints": keypoints}
         for name, path in (("image", self.image), ("model", self.model)):
             if path is not None:
-                data[name] = _relative(path, folder)
+                data[name] = written_path(path, folder=folder)
         return data
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
-        data = self.to_dict(folder=Path(path).parent)
-        Path(path).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
-def _refuse_unknown(data: Mapping[str, Any], known: set[str], *, where: str) -> None:
-    unknown = sorted(set(data) - known)
-    if unknown:
-        raise DataError(
-            f"unknown field {unknown[0]!r}",
-            where=where,
-            fix=f"known are {', '.join(sorted(known))}",
-        )
+        write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
 
 def _check_keypoint(keypoint: Any, *, where: str) -> None:
     """Refuse a keypoint that lacks a field or holds something else than finite numbers."""
-    if not isinstance(keypoint, Mapping):
-        raise DataError(f"expected an object, got {type(keypoint).__name__}", where=where)
-    _refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
+    keypoint = as_object(keypoint, where=where)
+    refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
     for name, length in (("xyz", 3), ("uv", 2)):
         if name not in keypoint:
             raise DataError("missing", where=f"{where}.{name}")
@@ -171,9 +156,7 @@ def _check_keypoint(keypoint: Any, *, where: str) -> None:
         and not as_floats(keypoint["sigma"], name=f"{where}.sigma", shape=()) > 0
     ):
         raise DataError("is not positive", where=f"{where}.sigma")
-    identity = keypoint.get("semantic_id", 0)
-    if not isinstance(identity, int) or isinstance(identity, bool):
-        raise DataError(f"{identity!r} is not a whole number", where=f"{where}.semantic_id")
+    as_index(keypoint.get("semantic_id", 0), where=f"{where}.semantic_id")
 
 
 def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | None:
@@ -188,13 +171,6 @@ def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | No
             fix="give it for all keypoints or for none",
         )
     return np.array([keypoint[name] for keypoint in keypoints], dtype=kind)
-
-
-def _relative(path: Path, folder: Path | None) -> str:
-    """A path as it is written: without the folder that it is read relative to."""
-    if folder is None or not path.is_relative_to(folder):
-        return str(path)
-    return str(path.relative_to(folder))
 
 
 def _path(data: Mapping[str, Any], name: str, folder: Path | None) -> Path | None:

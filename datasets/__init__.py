@@ -9,6 +9,7 @@ from cadalign.datasets.formats import CORRESPONDENCE_FORMATS, open_correspondenc
 from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
 from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
 from cadalign.datasets.meshes import check_solid, flat_axes, load_mesh
+from cadalign.datasets.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
 from cadalign.datasets.shapenet import ShapeNet, ShapeNetModel
 
@@ -24,6 +25,8 @@ __all__ = [
     "Correspondences",
     "KeypointNet",
     "Keypoints",
+    "ModelKeypoint",
+    "ModelKeypoints",
     "RotationalSymmetry",
     "ShapeNet",
     "ShapeNetModel",

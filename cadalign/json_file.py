@@ -80,6 +80,11 @@ def as_text(value: Any, *, where: str) -> str:
     return value
 
 
+def as_number(value: Any, *, where: str) -> float:
+    """Refuse what is not a finite number."""
+    return float(as_floats(value, name=where, shape=()))
+
+
 def as_numbers(value: Any, length: int, *, where: str) -> tuple[float, ...]:
     """Refuse what is not a list of so many finite numbers."""
     return tuple(as_floats(value, name=where, shape=(length,)).tolist())

@@ -6,6 +6,12 @@ from cadalign.datasets.categories import SYNSETS
 from cadalign.datasets.colmap import Colmap
 from cadalign.datasets.correspondences import Correspondences, CorrespondenceSet
 from cadalign.datasets.formats import CORRESPONDENCE_FORMATS, open_correspondences
+from cadalign.datasets.image_keypoints import (
+    ImageKeypoints,
+    choose_object,
+    join_keypoints,
+)
+from cadalign.datasets.keypoint_files import read_image_keypoints
 from cadalign.datasets.keypointnet import AnnotatedModel, KeypointNet
 from cadalign.datasets.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
 from cadalign.datasets.meshes import check_solid, flat_axes, load_mesh
@@ -23,6 +29,7 @@ __all__ = [
     "Colmap",
     "CorrespondenceSet",
     "Correspondences",
+    "ImageKeypoints",
     "KeypointNet",
     "Keypoints",
     "ModelKeypoint",
@@ -32,9 +39,12 @@ __all__ = [
     "ShapeNetModel",
     "Symmetries",
     "check_solid",
+    "choose_object",
     "flat_axes",
+    "join_keypoints",
     "load_mesh",
     "open_correspondences",
+    "read_image_keypoints",
     "sample_models",
     "write_sample_dataset",
 ]

@@ -67,7 +67,7 @@ def warnings_of(
     deviation: Deviation,
     *,
     redundancy: int,
-    focal_range_hit: float | None = None,
+    doubt: str | None = None,
 ) -> tuple[str, ...]:
     """Which stretch or motion the keypoints leave uncertain, and why.
 
@@ -80,8 +80,8 @@ def warnings_of(
         Its predicted standard deviations.
     redundancy : int
         Equations minus unknowns.
-    focal_range_hit : float, optional
-        The estimated focal length [px], where it is the end of the range that was searched.
+    doubt : str, optional
+        Why the estimated focal length is doubtful, however well determined it looks.
 
     Returns
     -------
@@ -99,11 +99,8 @@ def warnings_of(
             f"the focal length is known only to +-{_percent(deviation.focal)}: "
             f"{_why_focal_is_weak(points_3d, alignment)}"
         )
-    if focal_range_hit is not None:
-        warnings.append(
-            f"the focal length lies at the end of the searched range ({focal_range_hit:.4g} px): "
-            "the keypoints fit best at one that no camera has"
-        )
+    if doubt is not None:
+        warnings.append(doubt)
     for axis, relative in enumerate(deviation.scale):
         if relative > _WEAK_SCALE:
             warnings.append(

@@ -348,6 +348,7 @@ def _unrefined(problems: Problems, options: Options, consensus: Consensus) -> Fi
         known_axis=options.known_axis,
         stretched_axes=options.stretched_axes,
         focal=options.focal,
+        focal_prior=options.focal_prior,
     )
 
 
@@ -371,6 +372,7 @@ def _fit_all(problems: Problems, options: Options, start: float) -> FitResult:
         known_axis=options.known_axis,
         stretched_axes=options.stretched_axes,
         focal=options.focal,
+        focal_prior=options.focal_prior,
         alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
     )

@@ -7,13 +7,13 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cadalign.camera import Camera
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
+from cadalign.photo import open_photo
 from cadalign.validation import FloatArray
 
 logger = logging.getLogger("cadalign")
@@ -24,6 +24,7 @@ _GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0
 
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
 _CONTRADICTION = 1.25
+_CONTRADICTING_SIGMAS = 3.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 # EXIF tags, and the length of their units [mm].
 _EXIF_IFD = 0x8769
@@ -95,22 +96,9 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
-        from PIL import Image, UnidentifiedImageError
-
-        path = Path(path)
-        try:
-            with Image.open(path) as image:
-                tags = dict(image.getexif().get_ifd(_EXIF_IFD))
-                width, height = image.size
-        except FileNotFoundError:
-            raise DataError("no such file", where=str(path)) from None
-        except (
-            OSError,
-            SyntaxError,
-            UnidentifiedImageError,
-            Image.DecompressionBombError,
-        ) as error:
-            raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
+        with open_photo(path) as image:
+            tags = dict(image.getexif().get_ifd(_EXIF_IFD))
+            width, height = image.size
         focal = _focal_in_pixels(tags, width, height, str(path))
         return None if focal is None else cls(focal, relative_sigma)
 
@@ -128,6 +116,31 @@ def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
         return grid
     near = np.abs(np.log(grid / prior.focal)) < max(4 * prior.relative_sigma, 0.5)
     return np.sort(np.append(grid[near], prior.focal))
+
+
+def focal_doubt(camera: Camera, prior: FocalPrior | None) -> str | None:
+    """Why an estimated focal length is doubtful, in words; None where it is not.
+
+    Parameters
+    ----------
+    camera : Camera
+        With the estimate.
+    prior : FocalPrior, optional
+        What it was estimated with.
+    """
+    if prior is not None:
+        off = math.log(camera.fx / prior.focal)
+        if abs(off) > _CONTRADICTING_SIGMAS * prior.relative_sigma:
+            return (
+                f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px "
+                f"instead of {prior.focal:.4g} px +-{100 * prior.relative_sigma:.2g} %"
+            )
+    if np.isclose(camera.fx, focal_bounds(camera), rtol=1e-6).any():
+        return (
+            f"the focal length is the end of the searched range ({camera.fx:.4g} px): "
+            "the keypoints fit best at one that no camera has"
+        )
+    return None
 
 
 def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int, where: str) -> float | None:

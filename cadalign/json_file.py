@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cadalign.errors import DataError
+from cadalign.errors import CadalignError, DataError
 from cadalign.validation import as_floats
 
 
@@ -32,6 +32,16 @@ def read_json(path: Path) -> Any:
         ) from None
     except RecursionError:
         raise DataError("not valid JSON: nested too deeply", where=str(path)) from None
+
+
+@contextmanager
+def in_file(path: Path) -> Iterator[None]:
+    """Let errors about a file's content name the file."""
+    try:
+        yield
+    except CadalignError as error:
+        where = f"{path}: {error.where}" if error.where else str(path)
+        raise DataError(error.what, where=where, fix=error.fix) from None
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
@@ -98,7 +108,9 @@ def as_path(value: Any, *, folder: Path, where: str) -> Path:
 
 
 def written_path(path: Path, *, folder: Path | None) -> str:
-    """A path as it is written into a file: relative to the file's folder, unless it is absolute."""
-    if folder is None or (path.is_absolute() and not path.is_relative_to(folder.resolve())):
-        return str(path)
-    return os.path.relpath(path, folder)
+    """A path as it is written into a file: without the folder that it is read relative to."""
+    if folder is not None:
+        for base in (folder, folder.resolve()):
+            if path.is_relative_to(base):
+                return str(path.relative_to(base))
+    return str(path)

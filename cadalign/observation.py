@@ -34,12 +34,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.camera import Camera
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError
 from cadalign.json_file import (
     as_index,
     as_number,
     as_object,
     as_text,
+    in_file,
     read_json,
     refuse_unknown,
     write_json,
@@ -107,11 +108,8 @@ class Observation:
         """
         path = Path(path)
         data = read_json(path)
-        try:
+        with in_file(path):
             return cls.from_dict(data, folder=path.parent)
-        except CadalignError as error:
-            where = f"{path}: {error.where}" if error.where else str(path)
-            raise DataError(error.what, where=where, fix=error.fix) from None
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:

@@ -15,7 +15,7 @@ from cadalign.alignment import Alignment
 from cadalign.camera import Camera
 from cadalign.deviation import Deviation, deviation_of, warnings_of
 from cadalign.errors import InputError
-from cadalign.focal import focal_bounds
+from cadalign.focal import FocalPrior, focal_doubt
 from cadalign.validation import FloatArray, as_floats, as_points
 
 
@@ -93,6 +93,8 @@ class FitResult:
         The axes whose scale was estimated.
     focal : {"known", "estimate"}
         Whether the focal length was estimated.
+    focal_prior : FocalPrior, optional
+        What was known of it beforehand.
     alternatives : tuple of Alternative
         Other alignments that explain the keypoints as well: with 4 points all other exact
         solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
@@ -110,6 +112,7 @@ class FitResult:
     known_axis: str = "x"
     stretched_axes: str = "yz"
     focal: str = "known"
+    focal_prior: FocalPrior | None = None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = FitStats(0, 0, 0.0)
 
@@ -139,16 +142,8 @@ class FitResult:
             self.alignment,
             std,
             redundancy=2 * len(kept) - unknowns,
-            focal_range_hit=self._focal_range_hit,
+            doubt=focal_doubt(self.camera, self.focal_prior) if self.focal == "estimate" else None,
         )
-
-    @property
-    def _focal_range_hit(self) -> float | None:
-        """The focal length where it was estimated and is the end of the range, otherwise None."""
-        if self.focal == "known":
-            return None
-        at_end = np.isclose(self.camera.fx, focal_bounds(self.camera), rtol=1e-6).any()
-        return self.camera.fx if at_end else None
 
     def __str__(self) -> str:
         count = int(self.inliers.sum())
@@ -201,6 +196,7 @@ class FitResult:
             "known_axis": self.known_axis,
             "stretched_axes": self.stretched_axes,
             "focal": self.focal,
+            "focal_prior": None if self.focal_prior is None else asdict(self.focal_prior),
             "alternatives": [
                 {
                     "alignment": other.alignment.to_dict(),
@@ -224,6 +220,7 @@ class FitResult:
         """
         try:
             covariance = data["covariance"]
+            prior = data["focal_prior"]
             unknowns = 8 if data["focal"] == "known" else 9
             return cls(
                 alignment=Alignment.from_dict(data["alignment"]),
@@ -239,6 +236,7 @@ class FitResult:
                 known_axis=data["known_axis"],
                 stretched_axes=data["stretched_axes"],
                 focal=data["focal"],
+                focal_prior=None if prior is None else FocalPrior(**prior),
                 alternatives=tuple(
                     Alternative(
                         Alignment.from_dict(other["alignment"]),

@@ -13,9 +13,9 @@ MMPose predictions (``inferencer(..., pred_out_dir=...)``)
 ultralytics' ``results.to_json()``
     ``[{"confidence", "keypoints": {"x": [...], "y": [...], "visible": [...]}}, ...]``
 
-The third number of a keypoint is its visibility flag where all of an object's are 0, 1 or 2: 0 for
-not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in COCO, integer
-coordinates are pixel centres.
+The third number of a keypoint is its visibility flag where all of an object's are 0, 1 or 2 and one
+is 2: 0 for not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in
+COCO, integer coordinates are pixel centres.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.datasets.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
-from cadalign.errors import CadalignError, DataError
-from cadalign.json_file import as_number, as_object, as_text, read_json
+from cadalign.errors import DataError
+from cadalign.json_file import as_number, as_object, as_text, in_file, read_json
 from cadalign.validation import FloatArray, as_floats
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.coco_keypoints"
@@ -45,11 +45,8 @@ def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
         file and field.
     """
     data = read_json(path)
-    try:
+    with in_file(path):
         objects = _read(data)
-    except CadalignError as error:
-        where = f"{path}: {error.where}" if error.where else str(path)
-        raise DataError(error.what, where=where, fix=error.fix) from None
     if not objects:
         raise DataError("there are no keypoints", where=str(path))
     return objects
@@ -80,11 +77,14 @@ def _annotations(data: Mapping[str, Any]) -> list[ImageKeypoints]:
     for entry, where in _entries(data, "annotations"):
         if entry.get("num_keypoints") == 0:
             continue
-        found = _detection(entry, where, names=names.get(entry.get("category_id")))
-        image_id = entry.get("image_id")
-        if images and image_id not in images:
-            raise DataError(f"there is no image {image_id!r}", where=f"{where}.image_id")
-        objects.append(_in_image(found, *images[image_id]) if images else found)
+        category = entry.get("category_id")
+        found = _detection(entry, where, names=None if category is None else names.get(category))
+        if images:
+            image_id = _key(entry, "image_id", where)
+            if image_id not in images:
+                raise DataError(f"there is no image {image_id!r}", where=f"{where}.image_id")
+            found = _in_image(found, *images[image_id])
+        objects.append(found)
     return objects
 
 
@@ -145,7 +145,7 @@ def _detection(entry: Any, where: str, *, names: tuple[str, ...] | None = None) 
 
 
 def _points(entry: Mapping[str, Any], where: str) -> tuple[FloatArray, FloatArray | None]:
-    """Pixels (k, 2) and scores (k,) of one object; NaN and None of missing ones become 0."""
+    """Pixels (k, 2) and scores (k,) of one object."""
     value = entry["keypoints"]
     if isinstance(value, Mapping):
         for name in ("x", "y"):

@@ -41,6 +41,7 @@ from cadalign.json_file import (
     as_object,
     as_path,
     as_text,
+    in_file,
     read_json,
     refuse_unknown,
     write_json,
@@ -197,11 +198,8 @@ class ModelKeypoints:
         """
         path = Path(path)
         data = read_json(path)
-        try:
+        with in_file(path):
             return cls._from_data(data, path.parent, mesh)
-        except CadalignError as error:
-            where = f"{path}: {error.where}" if error.where else str(path)
-            raise DataError(error.what, where=where, fix=error.fix) from None
 
     @classmethod
     def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
@@ -254,7 +252,7 @@ class ModelKeypoints:
         """What the file holds, the model's path relative to ``folder``."""
         data: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         if self.model is not None:
-            data["model"] = written_path(self.model, folder=folder)
+            data["model"] = written_path(self.model.resolve(), folder=folder)
         data["keypoints"] = [_written(keypoint) for keypoint in self.keypoints]
         return data
 

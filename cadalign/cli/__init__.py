@@ -13,6 +13,7 @@ from cadalign.cli.demo import Demo
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.evaluate import Evaluate
 from cadalign.cli.fit import Fit
+from cadalign.cli.observe import Observe
 from cadalign.cli.render import Render
 from cadalign.cli.simulate import Simulate
 from cadalign.errors import CadalignError
@@ -20,6 +21,7 @@ from cadalign.errors import CadalignError
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Observe, tyro.conf.subcommand("observe")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Render, tyro.conf.subcommand("render")]

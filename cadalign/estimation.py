@@ -150,7 +150,7 @@ def _solve_optimal(
     errors: dict[int, CadalignError],
 ) -> Solutions:
     if options.focal == "estimate":
-        search: Search = partial(search_focal, problems, options, points, sigmas)
+        search: Search = partial(search_focal, problems, options, points, sigmas, errors)
     else:
         search = _search_at_known_focal(problems, options, points, sigmas, errors)
     estimate = options.sigma is None and sigmas is None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.camera import Camera
-from cadalign.errors import InputError
+from cadalign.errors import CadalignError, InputError
 from cadalign.focal import focal_bounds
 from cadalign.focal_views import (
     FocalViews,
@@ -106,6 +106,7 @@ def search_focal(
     options: Options,
     points: FloatArray,
     sigmas: Sequence[Sigma] | None,
+    errors: dict[int, CadalignError],
     noises: FloatArray,
 ) -> Minima:
     """Find the minima over alignment and focal length for every problem.
@@ -118,6 +119,8 @@ def search_focal(
         Model points, the known axis first.
     sigmas : sequence of B, optional
         Take the place of the options' sigma.
+    errors : dict of int to CadalignError
+        Receives why a problem cannot be solved, where its keypoints are the reason.
     noises : (B,) float
         Standard deviations that priors and loss scales are to be multiplied by.
     """
@@ -140,7 +143,11 @@ def search_focal(
         if len(task.points) < options.min_points:
             found.statuses[b] = TOO_FEW
             continue
-        minima, found.info[b, 1], found.info[b, 2] = _minima(task)
+        try:
+            minima, found.info[b, 1], found.info[b, 2] = _minima(task)
+        except InputError as error:
+            errors[b] = error
+            continue
         for k, minimum in enumerate(minima[:MAX_MINIMA]):
             found.poses[b, k] = minimum.pose
             found.costs[b, k] = minimum.cost

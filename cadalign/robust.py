@@ -136,6 +136,9 @@ def find_consensus(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
         )
     order = _by_confidence(confidences, count)
+    guided = order is not None
+    if order is None:
+        order = np.arange(count)
     ordered_3d, ordered_2d = np.ascontiguousarray(points[order]), points_2d[order].copy()
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
     pose = np.zeros(15)
@@ -157,7 +160,7 @@ def find_consensus(
             float(ransac.success_prob),
             int(ransac.seed),
             exhaustive,
-            confidences is not None,
+            guided,
             ransac.refine,
             pose,
             inliers,
@@ -178,7 +181,7 @@ def find_consensus(
             float(ransac.success_prob),
             int(ransac.seed),
             exhaustive,
-            confidences is not None,
+            guided,
             ransac.refine,
             pose,
             inliers,
@@ -213,10 +216,10 @@ def _objective(
     return Objective(points, rays, whitening, LINEAR, 1.0, options.prior_weight, options.free)
 
 
-def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp]:
-    """The order of falling confidence; the given order where there are none."""
+def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
+    """The order of falling confidence; None where there are none, or all are alike."""
     if confidences is None:
-        return np.arange(count)
+        return None
     values = as_floats(confidences, name="confidences", shape=(count,))
     if (values < 0).any():
         raise InputError(
@@ -224,7 +227,7 @@ def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray
             where="confidences",
             fix="give numbers that are not negative",
         )
-    return np.argsort(-values, kind="stable")
+    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None
 
 
 def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) -> float:

@@ -49,7 +49,7 @@ def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
         objects = _read(data)
     if not objects:
         raise DataError("there are no keypoints", where=str(path))
-    return objects
+    return [replace(found, source=f"{path}: {found.source}") for found in objects]
 
 
 def _read(data: Any) -> list[ImageKeypoints]:

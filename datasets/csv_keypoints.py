@@ -51,7 +51,7 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = csv.reader(file)
+            lines = csv.reader(file, strict=True)
             header = _header(next(lines, []), path)
             rows = [(lines.line_num, row) for row in lines if any(cell.strip() for cell in row)]
     except FileNotFoundError:

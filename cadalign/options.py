@@ -53,7 +53,8 @@ class Options:
         prior = self.scale_prior_sigma
         if prior is not None and not 0 < prior < np.inf:
             raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
-        self._check_focal()
+        if self.focal != "known" or self.focal_prior is not None:
+            self._check_focal()
         if self.method != "optimal" and (
             self.loss != "linear"
             or prior is not None

@@ -66,6 +66,16 @@ def test_box_and_points_lie_on_the_car(car: Path) -> None:
     assert result.alignment.rotation[1, 1] < -0.99
 
 
+def test_trusted_keypoints_on_one_side_do_not_mislead(car: Path) -> None:
+    # The first 18 keypoints are the car's left side, nearly a plane.
+    points_3d, points_2d, camera = keypoints_in(car)
+    for seed in range(5):
+        ransac = RansacOptions(max_reproj_error=THRESHOLD_PX, seed=seed)
+        scores = np.linspace(1.0, 0.5, 36)
+        result = fit(points_3d, points_2d, camera, sigma=None, ransac=ransac, confidences=scores)
+        assert result.inliers.sum() >= 25
+
+
 def test_detection_goes_all_the_way_from_file_to_picture(
     car: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

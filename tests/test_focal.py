@@ -375,14 +375,18 @@ def test_wrong_keypoints_are_found(camera: Camera, points: int, share: float) ->
 
 def test_robust_search_is_reproducible_and_guided() -> None:
     problem = problem_of(2, points=100, noise_px=1.0)
-    points_2d, wrong = spoiled(problem, 0.7)
+    points_2d, wrong = spoiled(problem, 0.8)
+    few = RansacOptions(min_iterations=1, max_iterations=10)
     arguments: Any = (problem.points_3d, points_2d, UNKNOWN)
-    options: Any = {"focal": "estimate", "ransac": RansacOptions(min_iterations=1)}
-    first, second = fit(*arguments, **options), fit(*arguments, **options)
+    options: Any = {"focal": "estimate", "ransac": few}
+    with pytest.raises(NoConsensusError):
+        fit(*arguments, **options)
+    scores = np.where(wrong, 0.1, 0.9)
+    first = fit(*arguments, **options, confidences=scores)
+    second = fit(*arguments, **options, confidences=scores)
     assert first.alignment == second.alignment
-    guided = fit(*arguments, **options, confidences=np.where(wrong, 0.1, 0.9))
-    assert guided.stats.iterations < first.stats.iterations
-    assert not guided.inliers[wrong].any()
+    assert not first.inliers[wrong].any()
+    assert first.inliers.sum() >= 18
 
 
 def test_noise_without_a_model_has_no_consensus() -> None:

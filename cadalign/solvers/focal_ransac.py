@@ -106,9 +106,11 @@ def ransac_focal_kernel(
             if iterations > 0 and not next_subset(chosen, n):
                 break
         else:
-            if guided:
-                grow_pool(growth, size, n, iterations)
-            draw_sample(state, growth, guided, n, chosen)
+            # The most trusted points may all lie on one side: every other sample is of all points.
+            from_pool = guided and iterations % 2 == 0
+            if from_pool:
+                grow_pool(growth, size, n, iterations // 2)
+            draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
         for f in range(log_focals.shape[0]):
             view = view_at(objective, rays[f], whitening[f])
@@ -144,7 +146,7 @@ def ransac_focal_kernel(
                         pose[:] = trial
                 good = (best_support / n) ** size * (1.0 - 1.0 / _REJECTION)
                 if good > 0.0:
-                    needed = np.log(1.0 - success_prob) / np.log1p(-good)
+                    needed = np.log(1.0 - success_prob) / np.log1p(-good) * (2.0 if guided else 1.0)
     find_inliers(best_view, threshold, pose, inliers)
     return best, best_focal, iterations, hypotheses
 

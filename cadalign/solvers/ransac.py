@@ -106,9 +106,11 @@ def ransac_kernel(
             if iterations > 0 and not next_subset(chosen, n):
                 break
         else:
-            if guided:
-                grow_pool(growth, size, n, iterations)
-            draw_sample(state, growth, guided, n, chosen)
+            # The most trusted points may all lie on one side: every other sample is of all points.
+            from_pool = guided and iterations % 2 == 0
+            if from_pool:
+                grow_pool(growth, size, n, iterations // 2)
+            draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
         found = solve_sample(objective, minimal, chosen, candidates)
         hypotheses += found
@@ -137,7 +139,7 @@ def ransac_kernel(
             elif good > 0.0:
                 # A rejection test that errs once in _REJECTION costs that many more samples.
                 good *= 1.0 - 1.0 / _REJECTION
-                needed = np.log(1.0 - success_prob) / np.log1p(-good)
+                needed = np.log(1.0 - success_prob) / np.log1p(-good) * (2.0 if guided else 1.0)
     if best < np.inf and optimize:
         best = _finish(objective, threshold, order, best, pose)
     find_inliers(objective, threshold, pose, inliers)

@@ -7,6 +7,7 @@ from cadalign.alignment import Alignment
 from cadalign.box import Box
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError
+from cadalign.focal import FocalPrior
 from cadalign.mesh import Material, Mesh
 from cadalign.result import FitResult
 
@@ -27,6 +28,7 @@ __all__ = [
     "CadalignError",
     "Camera",
     "FitResult",
+    "FocalPrior",
     "Library",
     "Match",
     "Material",

@@ -30,8 +30,10 @@ class BatchResult:
     scale : (B, 3) float
     rms : (B,) float
         Root mean square length of the inliers' residuals [px].
-    covariance : (B, 8, 8) float or None
+    covariance : (B, 8, 8) or (B, 9, 9) float or None
         See `cadalign.FitResult`.
+    focal_length : (B,) float
+        Horizontal focal length of the cameras [px], estimated where it was unknown.
     residuals : (n, 2) float
         Of all problems, one after the other [px].
     inliers : (n,) bool
@@ -47,6 +49,7 @@ class BatchResult:
     scale: FloatArray
     rms: FloatArray
     covariance: FloatArray | None
+    focal_length: FloatArray
     residuals: FloatArray
     inliers: BoolArray
     offsets: IntArray
@@ -78,6 +81,10 @@ class BatchResult:
     def of_solutions(cls, problems: Problems, solutions: Solutions) -> BatchResult:
         """Arrange what a solver found."""
         errors = dict(solutions.errors)
+        focals = np.broadcast_to(problems.calibrations[:, 0], len(problems)).copy()
+        if solutions.focals is not None:
+            focals = solutions.focals[:, 0].copy()
+        focals[list(errors)] = np.nan
         covariance = solutions.covariances
         poses = solutions.poses[:, 0].copy()
         residuals = solutions.residuals
@@ -96,6 +103,7 @@ class BatchResult:
             scale=poses[:, 12:],
             rms=rms,
             covariance=covariance,
+            focal_length=focals,
             residuals=residuals,
             inliers=np.repeat(~np.isnan(rms), problems.counts),
             offsets=problems.offsets,
@@ -106,12 +114,15 @@ class BatchResult:
     def of_fits(cls, problems: Problems, fits: Sequence[FitResult | CadalignError]) -> BatchResult:
         """Arrange single results, or the errors in their place."""
         count, total = len(problems), len(problems.points_3d)
+        found = [fit for fit in fits if isinstance(fit, FitResult)]
+        unknowns = 9 if any(fit.focal == "estimate" for fit in found) else 8
         batch = cls(
             rotation=np.full((count, 3, 3), np.nan),
             translation=np.full((count, 3), np.nan),
             scale=np.full((count, 3), np.nan),
             rms=np.full(count, np.nan),
-            covariance=np.full((count, 8, 8), np.nan),
+            covariance=np.full((count, unknowns, unknowns), np.nan),
+            focal_length=np.full(count, np.nan),
             residuals=np.full((total, 2), np.nan),
             inliers=np.zeros(total, dtype=bool),
             offsets=problems.offsets,
@@ -123,6 +134,7 @@ class BatchResult:
                 batch.translation[b] = fit.alignment.translation
                 batch.scale[b] = fit.alignment.scale
                 batch.rms[b] = fit.rms
+                batch.focal_length[b] = fit.camera.fx
                 batch.residuals[problems.rows(b)] = fit.residuals
                 batch.inliers[problems.rows(b)] = fit.inliers
                 if fit.covariance is not None and batch.covariance is not None:
@@ -141,6 +153,7 @@ class BatchResult:
             scale=np.concatenate([part.scale for part in parts]),
             rms=np.concatenate([part.rms for part in parts]),
             covariance=np.concatenate(covariances) if covariances else None,
+            focal_length=np.concatenate([part.focal_length for part in parts]),
             residuals=np.concatenate([part.residuals for part in parts]),
             inliers=np.concatenate([part.inliers for part in parts]),
             offsets=np.concatenate(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import InputError
+from cadalign.lens import distort, undistort
 from cadalign.validation import FloatArray, as_points
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
@@ -44,6 +45,8 @@ class Camera:
     distortion : tuple of float, optional
         OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with k3, or with
         k3, k4, k5, k6. Empty for a lens without distortion.
+    focal_known : bool
+        False for a camera whose focal lengths are placeholders; see `without_focal`.
 
     Raises
     ------
@@ -65,6 +68,7 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    focal_known: bool = field(default=True, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -117,10 +121,80 @@ class Camera:
         focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
+    @classmethod
+    def without_focal(
+        cls,
+        width: int,
+        height: int,
+        *,
+        cx: float | None = None,
+        cy: float | None = None,
+        distortion: tuple[float, ...] = (),
+    ) -> Camera:
+        """Make a camera of which only the image is known, for ``fit(..., focal="estimate")``.
+
+        Its pixels are square. ``fx`` and ``fy`` are placeholders; `project`, `normalize` and fits
+        with a known focal length refuse it.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size [px].
+        cx, cy : float, optional
+            Principal point [px]; the image's centre by default.
+        distortion : tuple of float, optional
+            As for `Camera`.
+
+        Examples
+        --------
+        >>> camera = Camera.without_focal(640, 480)
+        >>> camera.cx, camera.cy, camera.focal_known
+        (319.5, 239.5, False)
+        >>> camera.with_focal(700).fy
+        700.0
+        """
+        if not _is_number(width) or not _is_number(height) or min(width, height) < 1:
+            raise InputError(
+                f"{width!r} x {height!r} is not a size", where="camera.width", fix=_SIZE_FIX
+            )
+        placeholder = float(max(width, height))
+        return cls(
+            width,
+            height,
+            placeholder,
+            placeholder,
+            (width - 1) / 2 if cx is None else cx,
+            (height - 1) / 2 if cy is None else cy,
+            distortion,
+            focal_known=False,
+        )
+
+    def with_focal(self, focal: float) -> Camera:
+        """The same camera with the horizontal focal length ``focal`` [px], known from now on.
+
+        The shape of its pixels stays: ``fy`` changes in proportion.
+        """
+        return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
+
     @property
     def matrix(self) -> FloatArray:
         """The calibration matrix K, (3, 3) float."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=float)
+
+    def require_focal(self) -> None:
+        """Refuse a camera `without_focal`.
+
+        Raises
+        ------
+        InputError
+            If the focal length is unknown.
+        """
+        if not self.focal_known:
+            raise InputError(
+                "the focal length is unknown",
+                where="camera",
+                fix='estimate it with focal="estimate", or give it: camera.with_focal(...)',
+            )
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
         """Project points of the camera frame into the image.
@@ -138,8 +212,10 @@ class Camera:
         Raises
         ------
         InputError
-            If a point lies in or behind the camera's plane (z <= 0).
+            If a point lies in or behind the camera's plane (z <= 0), or the focal length is
+            unknown.
         """
+        self.require_focal()
         points = as_points(points_cam, name="points_cam", dimension=3)
         behind = np.flatnonzero(points[:, 2] <= 0)
         if len(behind):
@@ -167,8 +243,10 @@ class Camera:
         Raises
         ------
         InputError
-            If the lens model cannot be inverted at a pixel (far outside the calibrated image).
+            If the lens model cannot be inverted at a pixel (far outside the calibrated image), or
+            the focal length is unknown.
         """
+        self.require_focal()
         normalized, valid = self.normalize_where_valid(points_2d)
         failed = np.flatnonzero(~valid)
         if len(failed):
@@ -200,19 +278,19 @@ class Camera:
         distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return distorted, np.ones(len(points), dtype=bool)
-        return self._undistort(distorted)
+        return undistort(distorted, self.distortion)
 
     def pixels_from_normalized(self, normalized: FloatArray) -> FloatArray:
         """Apply lens and calibration matrix to (n, 2) normalised coordinates; gives pixels."""
         if self.distortion:
-            normalized, _ = self._distort(normalized)
+            normalized, _ = distort(normalized, self.distortion)
         return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
     def distortion_jacobian(self, normalized: FloatArray) -> FloatArray:
         """Derivatives (n, 2, 2) of distorted by normalised image coordinates (n, 2)."""
         if not self.distortion:
             return np.broadcast_to(np.eye(2), (len(normalized), 2, 2))
-        return self._distort(normalized)[1]
+        return distort(normalized, self.distortion)[1]
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> npt.NDArray[np.bool_]:
         """Say which pixels (n, 2) lie inside the image by at least ``margin`` [px]; (n,) bool."""
@@ -220,64 +298,12 @@ class Camera:
         high = np.array([self.width, self.height]) - 0.5 - margin
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=1))
 
-    def _distort(self, normalized: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """OpenCV's lens model: distorted coordinates (n, 2) and their derivatives (n, 2, 2)."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion + (0.0,) * (8 - len(self.distortion))
-        x, y = normalized[:, 0], normalized[:, 1]
-        r2 = x * x + y * y
-        numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = numerator / denominator
-        # d radial / d r2
-        slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2)) / denominator - radial * (
-            k4 + r2 * (2 * k5 + 3 * k6 * r2)
-        ) / denominator
-        distorted = np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=1,
-        )
-        mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-        jacobian = np.stack(
-            [
-                np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=1),
-                np.stack([mixed, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=1),
-            ],
-            axis=1,
-        )
-        return distorted, jacobian
-
-    def _undistort(self, distorted: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Invert the lens model by Newton's method, and say where that succeeded."""
-        normalized = distorted.copy()
-        active = np.arange(len(distorted))
-        for _ in range(50):
-            value, jacobian = self._distort(normalized[active])
-            error = value - distorted[active]
-            (a, b), (c, d) = jacobian.transpose(1, 2, 0)
-            determinant = a * d - b * c
-            # Past the fold of the lens model the search would find a point that is not seen.
-            going = (np.abs(error).max(axis=1) >= 1e-14) & (determinant > 0)
-            going &= np.isfinite(determinant)
-            active, error = active[going], error[going]
-            if not len(active):
-                break
-            a, b, c, d, determinant = (row[going] for row in (a, b, c, d, determinant))
-            x, y = error.T
-            step = np.stack([d * x - b * y, a * y - c * x], axis=1) / determinant[:, None]
-            normalized[active] -= step
-        lost = ~np.isfinite(normalized).all(axis=1)
-        normalized[lost] = distorted[lost]
-        error = np.abs(self._distort(normalized)[0] - distorted).max(axis=1, initial=0.0)
-        return normalized, np.asarray((error < 1e-9) & ~lost)
-
     def to_dict(self) -> dict[str, Any]:
         """Write the camera as COLMAP does: ``{"model", "width", "height", "params"}``.
 
         COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so the principal point there
-        is larger by half a pixel than ``cx`` and ``cy`` here.
+        is larger by half a pixel than ``cx`` and ``cy`` here. An unknown focal length is None,
+        ``null`` in JSON.
 
         Examples
         --------
@@ -285,10 +311,11 @@ class Camera:
         [500.0, 500.0, 320.0, 240.0]
         """
         model = {0: "PINHOLE", 4: "OPENCV"}.get(len(self.distortion), "FULL_OPENCV")
+        values: dict[str, float | None]
         values = dict(zip(_DISTORTION_NAMES, self.distortion, strict=False))
         values |= {
-            "fx": self.fx,
-            "fy": self.fy,
+            "fx": self.fx if self.focal_known else None,
+            "fy": self.fy if self.focal_known else None,
             "cx": self.cx + _COLMAP_PIXEL_CENTRE,
             "cy": self.cy + _COLMAP_PIXEL_CENTRE,
         }
@@ -307,7 +334,9 @@ class Camera:
         ----------
         data : mapping
             ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV),
-            ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention.
+            ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
+            the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
+            `without_focal`.
 
         Raises
         ------
@@ -322,6 +351,8 @@ class Camera:
         """
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
+        if set(data) == {"width", "height"}:
+            return cls.without_focal(data["width"], data["height"])
         missing = [key for key in ("model", "width", "height", "params") if key not in data]
         if missing:
             raise InputError(
@@ -343,20 +374,19 @@ class Camera:
                 where="camera.params",
                 fix=f"give {', '.join(names)}",
             )
-        for name, value in zip(names, params, strict=True):
-            if not _is_number(value):
-                raise InputError(f"{name} is {value!r}, not a finite number", where="camera.params")
         values = dict(zip(names, params, strict=True))
+        focals = [name for name in names if name.startswith("f")]
+        is_known = any(values[name] is not None for name in focals)
+        for name, value in values.items():
+            if not _is_number(value) and (is_known or name not in focals):
+                raise InputError(f"{name} is {value!r}, not a finite number", where="camera.params")
         coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
-        return cls(
-            width=data["width"],
-            height=data["height"],
-            fx=values["fx"] if "fx" in values else values["f"],
-            fy=values["fy"] if "fy" in values else values["f"],
-            cx=values["cx"] - _COLMAP_PIXEL_CENTRE,
-            cy=values["cy"] - _COLMAP_PIXEL_CENTRE,
-            distortion=coefficients if any(coefficients[4:]) else coefficients[:4],
-        )
+        cx, cy = values["cx"] - _COLMAP_PIXEL_CENTRE, values["cy"] - _COLMAP_PIXEL_CENTRE
+        distortion = coefficients if any(coefficients[4:]) else coefficients[:4]
+        size = data["width"], data["height"]
+        if not is_known:
+            return cls.without_focal(*size, cx=cx, cy=cy, distortion=distortion)
+        return cls(*size, values[focals[0]], values[focals[-1]], cx, cy, distortion)
 
 
 _SIZE_FIX = "give the image size in whole pixels"

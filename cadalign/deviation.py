@@ -10,6 +10,8 @@ from cadalign.alignment import Alignment
 from cadalign.validation import FloatArray
 
 _WEAK_SCALE = 0.1  # relative standard deviation worth a warning
+_WEAK_FOCAL = 0.02
+_SHALLOW = 0.5  # differences of depth over the distance
 _WEAK_ROTATION_DEG = 10.0
 _WEAK_DISTANCE = 0.1  # standard deviation of the translation over its length
 _THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
@@ -28,15 +30,18 @@ class Deviation:
         Along the camera's axes [model units].
     scale : tuple of 3 float
         Of the scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known.
+    focal : float
+        Of the focal length, relative; 0 where it is known.
     """
 
     rotation_deg: float
     translation: tuple[float, float, float]
     scale: tuple[float, float, float]
+    focal: float = 0.0
 
 
 def deviation_of(covariance: FloatArray, known_axis: str) -> Deviation:
-    """Standard deviations in readable terms from a covariance (8, 8)."""
+    """Standard deviations in readable terms from a covariance (8, 8) or (9, 9)."""
     variance = np.maximum(covariance.diagonal(), 0.0)
     scale = [0.0, 0.0, 0.0]
     for place, axis in enumerate(unknown_axes(known_axis)):
@@ -46,6 +51,7 @@ def deviation_of(covariance: FloatArray, known_axis: str) -> Deviation:
         rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
         translation=(x, y, z),
         scale=(scale[0], scale[1], scale[2]),
+        focal=float(np.sqrt(variance[8:].sum())),
     )
 
 
@@ -56,7 +62,12 @@ def unknown_axes(known_axis: str) -> tuple[int, int]:
 
 
 def warnings_of(
-    points_3d: FloatArray, alignment: Alignment, deviation: Deviation, *, redundancy: int
+    points_3d: FloatArray,
+    alignment: Alignment,
+    deviation: Deviation,
+    *,
+    redundancy: int,
+    doubt: str | None = None,
 ) -> tuple[str, ...]:
     """Which stretch or motion the keypoints leave uncertain, and why.
 
@@ -69,6 +80,8 @@ def warnings_of(
         Its predicted standard deviations.
     redundancy : int
         Equations minus unknowns.
+    doubt : str, optional
+        Why the estimated focal length is doubtful, however well determined it looks.
 
     Returns
     -------
@@ -81,6 +94,13 @@ def warnings_of(
             f"{len(points_3d)} keypoints fit exactly whatever they are: "
             "the residuals say nothing about the quality of the fit"
         )
+    if deviation.focal > _WEAK_FOCAL:
+        warnings.append(
+            f"the focal length is known only to +-{_percent(deviation.focal)}: "
+            f"{_why_focal_is_weak(points_3d, alignment)}"
+        )
+    if doubt is not None:
+        warnings.append(doubt)
     for axis, relative in enumerate(deviation.scale):
         if relative > _WEAK_SCALE:
             warnings.append(
@@ -99,6 +119,16 @@ def warnings_of(
             f"+-{max(deviation.translation):.2g} model units{share}"
         )
     return tuple(warnings)
+
+
+def _why_focal_is_weak(points_3d: FloatArray, alignment: Alignment) -> str:
+    in_camera = alignment.apply(points_3d)
+    thickness = np.linalg.svd(in_camera - in_camera.mean(axis=0), compute_uv=False)
+    if thickness[-1] < _THIN * thickness[0]:
+        return "the keypoints lie nearly in one plane"
+    if np.ptp(in_camera[:, 2]) < _SHALLOW * in_camera[:, 2].mean():
+        return "the keypoints differ little in depth for their distance"
+    return "the keypoints show little perspective for their noise"
 
 
 def _why_scale_is_weak(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:

@@ -19,7 +19,7 @@ def solver_error(
     status : int
         See `cadalign.solvers.status`.
     undetermined : int
-        Which of the solvers' 8 unknowns is not determined, or -1.
+        Which of the solvers' unknowns is not determined, or -1.
     points_3d : (n, 3) float
     options : Options
     """

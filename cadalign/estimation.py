@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from cadalign.camera import Camera
 from cadalign.diagnosis import no_redundancy_error, solver_error
 from cadalign.errors import CadalignError
+from cadalign.focal_search import Minima, search_focal
 from cadalign.options import LOSSES, Options
 from cadalign.problems import Problems
 from cadalign.solvers.batch import aepnp_batch, optimal_batch, reproject_batch
@@ -29,6 +32,7 @@ _ONE_MINIMUM = np.array([1, 0, 1, -1])
 
 
 Solver = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+Search = Callable[[FloatArray], Minima]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class Solutions:
         Packed alignments, the best first.
     costs : (B, k) float
         Their whitened squared errors with sigma; infinite where there is none.
-    covariances : (B, 8, 8) float or None
+    covariances : (B, 8, 8) or (B, 9, 9) float or None
     sigmas : (B,) float or None
         Standard deviations [px] where there is one for all keypoints of a problem.
     statuses : (B,) int
@@ -52,6 +56,8 @@ class Solutions:
         Projected minus observed [px].
     errors : dict of int to CadalignError
         Why a problem has no solution.
+    focals : (B, k) float, optional
+        The focal lengths of the poses [px], where they were estimated.
     """
 
     poses: FloatArray
@@ -62,6 +68,12 @@ class Solutions:
     info: IntArray
     residuals: FloatArray
     errors: dict[int, CadalignError]
+    focals: FloatArray | None = None
+
+    def camera(self, problems: Problems, minimum: int) -> Camera:
+        """The camera that goes with a minimum of the only problem."""
+        camera = problems.cameras[0]
+        return camera if self.focals is None else camera.with_focal(self.focals[0, minimum])
 
 
 def solve(problems: Problems, options: Options, sigmas: Sequence[Sigma] | None = None) -> Solutions:
@@ -70,21 +82,25 @@ def solve(problems: Problems, options: Options, sigmas: Sequence[Sigma] | None =
     ``sigmas``, one for each problem, takes the place of the options' sigma.
     """
     errors: dict[int, CadalignError] = {}
-    rays = _rays(problems, errors)
     points = problems.points_3d
     if options.known_axis != "x":
         points = np.ascontiguousarray(points[:, options.axis_order])
+    if options.focal == "known":
+        for camera in problems.cameras:
+            camera.require_focal()
     if options.method == "optimal":
-        solutions = _solve_optimal(problems, options, points, rays, sigmas, errors)
+        solutions = _solve_optimal(problems, options, points, sigmas, errors)
     elif options.method == "aepnp":
-        poses, statuses = aepnp_batch(points, rays, problems.offsets)
+        poses, statuses = aepnp_batch(points, _rays(problems, errors), problems.offsets)
         solutions = _without_statistics(problems, poses, statuses, errors)
     else:
-        poses = _solve_one_by_one(problems, options, points, rays, errors)
+        poses = _solve_one_by_one(problems, options, points, _rays(problems, errors), errors)
         statuses = np.zeros(len(problems), dtype=np.int64)
         solutions = _without_statistics(problems, poses, statuses, errors)
     if options.known_axis != "x":
         _restore_axes(solutions, options)
+    if solutions.focals is not None:
+        problems = problems.with_focals(solutions.focals[:, 0])
     _reproject(problems, solutions)
     if np.count_nonzero(solutions.statuses):
         for b in np.flatnonzero(solutions.statuses).tolist():
@@ -130,52 +146,75 @@ def _solve_optimal(
     problems: Problems,
     options: Options,
     points: FloatArray,
-    rays: FloatArray,
     sigmas: Sequence[Sigma] | None,
     errors: dict[int, CadalignError],
 ) -> Solutions:
-    whitening = _whitening(problems, options, rays, sigmas)
+    if options.focal == "estimate":
+        search: Search = partial(search_focal, problems, options, points, sigmas, errors)
+    else:
+        search = _search_at_known_focal(problems, options, points, sigmas, errors)
     estimate = options.sigma is None and sigmas is None
     scales = np.ones(len(problems))
     for _ in range(_SIGMA_ROUNDS if estimate else 1):
-        poses, costs, covariances, statuses, info = optimal_batch(
-            points,
-            rays,
-            whitening,
-            problems.offsets,
-            LOSSES[options.loss],
-            options.loss_scale * scales,
-            options.prior_weight * scales**2,
-            options.free,
-            options.min_points,
-        )
+        minima = search(scales)
         if estimate:
             previous = scales
-            scales = _estimate_sigmas(problems, options, points, poses[:, 0])
+            seen = problems if minima.focals is None else problems.with_focals(minima.focals[:, 0])
+            scales = _estimate_sigmas(seen, options, points, minima.poses[:, 0])
             if not options.estimates_in_rounds or np.allclose(
                 scales, previous, rtol=_SIGMA_TOLERANCE, atol=0
             ):
                 break
     if estimate:
-        costs /= scales[:, None] ** 2
-        covariances *= (scales**2)[:, None, None]
+        minima.costs[:] /= scales[:, None] ** 2
+        minima.covariances[:] *= (scales**2)[:, None, None]
         for b in np.flatnonzero(2 * problems.counts <= options.unknowns).tolist():
             errors[b] = no_redundancy_error(int(problems.counts[b]))
-    exact = (2 * problems.counts == options.unknowns) & (info[:, 0] > 1)
+    exact = (2 * problems.counts == options.unknowns) & (minima.info[:, 0] > 1)
     if exact.any():
         for b in np.flatnonzero(exact).tolist():
-            _sort_exact_solutions(poses[b], costs[b], int(info[b, 0]))
+            _sort_exact_solutions(minima, b)
     known = isinstance(options.sigma, int | float) and sigmas is None
     return Solutions(
-        poses=poses,
-        costs=costs,
-        covariances=covariances,
+        poses=minima.poses,
+        costs=minima.costs,
+        covariances=minima.covariances,
         sigmas=scales if estimate else np.full(len(problems), options.sigma) if known else None,
-        statuses=statuses,
-        info=info,
+        statuses=minima.statuses,
+        info=minima.info,
         residuals=np.empty_like(problems.points_2d),
         errors=errors,
+        focals=minima.focals,
     )
+
+
+def _search_at_known_focal(
+    problems: Problems,
+    options: Options,
+    points: FloatArray,
+    sigmas: Sequence[Sigma] | None,
+    errors: dict[int, CadalignError],
+) -> Search:
+    """The search as a function of the noises (B,) that priors and loss scales are multiplied by."""
+    rays = _rays(problems, errors)
+    whitening = _whitening(problems, options, rays, sigmas)
+
+    def search(noises: FloatArray) -> Minima:
+        return Minima(
+            *optimal_batch(
+                points,
+                rays,
+                whitening,
+                problems.offsets,
+                LOSSES[options.loss],
+                options.loss_scale * noises,
+                options.prior_weight * noises**2,
+                options.free,
+                options.min_points,
+            )
+        )
+
+    return search
 
 
 def _estimate_sigmas(
@@ -204,13 +243,16 @@ def _estimate_sigmas(
     return sigmas
 
 
-def _sort_exact_solutions(poses: FloatArray, costs: FloatArray, minima: int) -> None:
+def _sort_exact_solutions(minima: Minima, problem: int) -> None:
     """Put solutions that all fit exactly into the order of least stretch."""
-    exact = int((costs[:minima] < _EXACT_COST).sum())
+    poses, costs = minima.poses[problem], minima.costs[problem]
+    exact = int((costs[: minima.info[problem, 0]] < _EXACT_COST).sum())
     stretch = (np.log(poses[:exact, 13:]) ** 2).sum(axis=1)
     order = np.argsort(stretch, kind="stable")
     poses[:exact] = poses[:exact][order]
     costs[:exact] = costs[:exact][order]
+    if minima.focals is not None:
+        minima.focals[problem, :exact] = minima.focals[problem, :exact][order]
 
 
 def _solve_one_by_one(
@@ -276,7 +318,7 @@ def _restore_axes(solutions: Solutions, options: Options) -> None:
     poses[..., :9] = poses[..., :9].reshape(shape)[..., place].reshape(*shape[:2], 9)
     poses[..., 12:] = poses[..., 12:][..., place]
     if solutions.covariances is not None and options.known_axis == "y":  # solved as z, x
-        swapped = [0, 1, 2, 3, 4, 5, 7, 6]
+        swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: solutions.covariances.shape[1]]
         solutions.covariances[:] = solutions.covariances[:, swapped][:, :, swapped]
 
 

@@ -12,21 +12,18 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.alignment import Alignment
 from cadalign.batch import BatchResult
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation import Solutions, solve
+from cadalign.estimation import solve
+from cadalign.focal import FocalPrior
 from cadalign.options import Options
 from cadalign.problems import Problems, pack_many, pack_one
-from cadalign.result import Alternative, FitResult, FitStats
-from cadalign.robust import RansacOptions, find_consensus, residuals_of
-from cadalign.validation import BoolArray, FloatArray
+from cadalign.result import FitResult
+from cadalign.robust import RansacOptions
+from cadalign.single_fit import fit_all, fit_robustly
+from cadalign.validation import FloatArray
 from cadalign.whitening import Sigma
-
-LEAST_LIKELIHOOD = 1e-3
-"""Relative likelihood above which another minimum is reported as an alternative."""
-_INLIER_ROUNDS = 5
 
 
 def fit(
@@ -41,6 +38,8 @@ def fit(
     stretch: str | None = None,
     scale_prior_sigma: float | None = None,
     known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
     ransac: RansacOptions | None = None,
     confidences: npt.ArrayLike | None = None,
 ) -> FitResult:
@@ -53,7 +52,8 @@ def fit(
     points_2d : (n, 2) float
         The same keypoints in the image [px]; integers are pixel centres.
     camera : Camera
-        The calibrated camera. Lens distortion is honoured.
+        The calibrated camera. Lens distortion is honoured. Where the focal length is estimated,
+        that of the camera counts for nothing: `Camera.without_focal` has none.
     method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
         - ``optimal``: the maximum-likelihood alignment, searched for globally. From 5 points up;
           4 points give every alignment that reprojects exactly, that with the least stretch
@@ -77,6 +77,13 @@ def fit(
         It keeps keypoints in one plane, or seen end-on, solvable.
     known_axis : {"x", "y", "z"}
         The model's axis whose length is right. One image alone does not tell size from distance.
+    focal : {"known", "estimate"}
+        Whether the camera's focal length is right, or is estimated too: a ninth unknown, for which
+        5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
+        pixels are the camera's.
+    focal_prior : FocalPrior, optional
+        What is known of the focal length to be estimated, from EXIF for example:
+        `FocalPrior.from_exif`.
     ransac : RansacOptions, optional
         Search for the alignment that the most keypoints support, and fit to these: for keypoints of
         which some are wrong. ``result.inliers`` tells which were kept.
@@ -105,13 +112,30 @@ def fit(
     >>> result = fit(problem.points_3d, problem.points_2d, problem.camera)
     >>> bool(np.allclose(result.alignment.scale, problem.alignment.scale))
     True
+
+    The same photo without its focal length, which is 150 px:
+
+    >>> camera = Camera.without_focal(640, 480)
+    >>> result = fit(problem.points_3d, problem.points_2d, camera, focal="estimate")
+    >>> round(result.camera.fx, 3)
+    150.0
     """
     start = time.perf_counter()
-    options = Options(method, sigma, loss, loss_scale, stretch, scale_prior_sigma, known_axis)
+    options = Options(
+        method,
+        sigma,
+        loss,
+        loss_scale,
+        stretch,
+        scale_prior_sigma,
+        known_axis,
+        focal,
+        focal_prior,
+    )
     problems = pack_one(points_3d, points_2d, camera)
     if ransac is None:
         _refuse_confidences(confidences)
-        return _fit_all(problems, options, start)
+        return fit_all(problems, options, start)
     return fit_robustly(problems, options, ransac, confidences, start)
 
 
@@ -127,6 +151,8 @@ def fit_batch(
     stretch: str | None = None,
     scale_prior_sigma: float | None = None,
     known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
     ransac: RansacOptions | None = None,
     confidences: Sequence[npt.ArrayLike] | None = None,
     workers: int = 1,
@@ -143,8 +169,8 @@ def fit_batch(
         One for all problems, or one each.
     sigma : float, None, or sequence of B
         As for `fit`, for all problems; a sequence gives each problem its own.
-    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, ransac
-        As for `fit`.
+    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior, ransac
+        As for `fit`; every problem has a focal length of its own.
     confidences : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
     workers : int
@@ -182,6 +208,8 @@ def fit_batch(
         stretch,
         scale_prior_sigma,
         known_axis,
+        focal,
+        focal_prior,
     )
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
@@ -235,122 +263,9 @@ def _fits(
         one = problems.part(b, b + 1)
         try:
             if ransac is None:
-                fits.append(_fit_all(one, own, start))
+                fits.append(fit_all(one, own, start))
             else:
                 fits.append(fit_robustly(one, own, ransac, trusted, start))
         except CadalignError as error:
             fits.append(error)
     return fits
-
-
-def fit_robustly(
-    problems: Problems,
-    options: Options,
-    ransac: RansacOptions,
-    confidences: npt.ArrayLike | None,
-    start: float,
-) -> FitResult:
-    """Fit the only problem to the keypoints that support its best alignment."""
-    if options.method != "optimal":
-        raise InputError(
-            f"the method {options.method!r} does not go with ransac",
-            where="method",
-            fix="leave the method alone; RansacOptions(minimal=...) names the minimal solver",
-        )
-    consensus = find_consensus(problems, options, ransac, confidences)
-    inliers = consensus.inliers
-    if not ransac.refine:
-        result = _unrefined(problems, options, consensus.alignment)
-    else:
-        result = _fit_inliers(problems, options, inliers, start)
-        for _ in range(_INLIER_ROUNDS):
-            residuals = residuals_of(problems, result.alignment)
-            kept = np.linalg.norm(residuals, axis=1) < ransac.max_reproj_error
-            if (kept == inliers).all() or kept.sum() < inliers.sum():
-                break
-            inliers = kept
-            result = _fit_inliers(problems, options, inliers, start)
-    residuals = residuals_of(problems, result.alignment)
-    return replace(
-        result,
-        points_3d=problems.points_3d.copy(),
-        residuals=residuals,
-        inliers=inliers,
-        method=f"ransac-{ransac.minimal}" if not ransac.refine else "ransac-optimal",
-        stats=FitStats(
-            iterations=consensus.iterations,
-            hypotheses=consensus.hypotheses,
-            seconds=time.perf_counter() - start,
-            inlier_ratio=float(inliers.mean()),
-            score=consensus.score,
-        ),
-    )
-
-
-def _fit_inliers(
-    problems: Problems, options: Options, inliers: BoolArray, start: float
-) -> FitResult:
-    """The optimum for some of the only problem's keypoints."""
-    sigma = options.sigma
-    if sigma is not None and np.ndim(sigma) > 0:
-        sigma = np.asarray(sigma)[inliers]
-    some = Problems(
-        problems.points_3d[inliers],
-        problems.points_2d[inliers],
-        np.array([0, int(inliers.sum())]),
-        problems.cameras,
-    )
-    return _fit_all(some, replace(options, sigma=sigma), start)
-
-
-def _unrefined(problems: Problems, options: Options, alignment: Alignment) -> FitResult:
-    """The best hypothesis as the minimal solver left it."""
-    count = len(problems.points_3d)
-    return FitResult(
-        alignment=alignment,
-        points_3d=problems.points_3d,
-        residuals=np.zeros((count, 2)),
-        inliers=np.ones(count, dtype=bool),
-        method=options.method,
-        known_axis=options.known_axis,
-        stretched_axes=options.stretched_axes,
-    )
-
-
-def _fit_all(problems: Problems, options: Options, start: float) -> FitResult:
-    """Fit the only problem to all its keypoints."""
-    solutions = solve(problems, options)
-    if solutions.errors:
-        raise solutions.errors[0]
-    alignment = Alignment.from_packed(solutions.poses[0, 0])
-    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    count = len(problems.points_3d)
-    return FitResult(
-        alignment=alignment,
-        points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
-        residuals=solutions.residuals,
-        inliers=np.ones(count, dtype=bool),
-        method=options.method,
-        sigma=None if solutions.sigmas is None else float(solutions.sigmas[0]),
-        covariance=None if solutions.covariances is None else solutions.covariances[0],
-        known_axis=options.known_axis,
-        stretched_axes=options.stretched_axes,
-        alternatives=_alternatives(solutions, minima, options, count) if minima > 1 else (),
-        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
-    )
-
-
-def _alternatives(
-    solutions: Solutions, minima: int, options: Options, count: int
-) -> tuple[Alternative, ...]:
-    """The other minima that are likely enough."""
-    costs = solutions.costs[0, :minima]
-    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        ratios = (max(costs[0], 1e-300) / np.maximum(costs, 1e-300)) ** count
-    else:
-        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
-    return tuple(
-        Alternative(Alignment.from_packed(solutions.poses[0, k]), float(ratios[k]))
-        for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD
-    )

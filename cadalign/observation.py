@@ -6,7 +6,8 @@ The file holds one object::
       "camera": {"model": "PINHOLE", "width": 640, "height": 480,
                  "params": [935.0, 935.0, 320.0, 240.0]},
       "keypoints": [
-        {"xyz": [0.11, 0.42, -0.08], "uv": [351.2, 204.9], "sigma": 1.0, "semantic_id": 3},
+        {"xyz": [0.11, 0.42, -0.08], "uv": [351.2, 204.9], "sigma": 1.0, "semantic_id": 3,
+         "name": "back, top left", "confidence": 0.93},
         ...
       ],
       "image": "photo.png",
@@ -14,14 +15,16 @@ The file holds one object::
     }
 
 ``camera`` is COLMAP's form, principal point in COLMAP's convention (the top-left corner of the
-image is (0, 0)), see `cadalign.Camera.from_dict`. ``xyz`` is in model units, ``uv`` in pixels with
-integers at pixel centres. ``sigma`` [px] and ``semantic_id`` are optional, given for all keypoints
-or for none. ``image`` and ``model`` are optional paths, relative to the file.
+image is (0, 0)), see `cadalign.Camera.from_dict`; an unknown focal length is ``null`` there, or
+``{"width": 640, "height": 480}`` is all that is given. ``xyz`` is in model units, ``uv`` in pixels
+with integers at pixel centres, of the photo as it is seen: turned upright where EXIF says so.
+``sigma`` [px], ``semantic_id``, ``name`` and ``confidence`` (a detector's score, not negative) are
+optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
+relative to the file.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,11 +34,22 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.camera import Camera
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError
+from cadalign.json_file import (
+    as_index,
+    as_number,
+    as_object,
+    as_text,
+    in_file,
+    read_json,
+    refuse_unknown,
+    write_json,
+    written_path,
+)
 from cadalign.validation import FloatArray, IntArray, as_floats, as_points
 
 _FIELDS = {"camera", "keypoints", "image", "model"}
-_KEYPOINT_FIELDS = {"xyz", "uv", "sigma", "semantic_id"}
+_KEYPOINT_FIELDS = {"xyz", "uv", "sigma", "semantic_id", "name", "confidence"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +67,10 @@ class Observation:
         Standard deviation of each image point [px].
     semantic_ids : (n,) int, optional
         What each keypoint means; the same number on all models of a category.
+    names : tuple of n str, optional
+        What each keypoint is called.
+    confidences : (n,) float, optional
+        How much each keypoint is trusted, for the ``confidences`` of `cadalign.fit`.
     image, model : Path, optional
         The photo and the CAD model.
     """
@@ -62,6 +80,8 @@ class Observation:
     camera: Camera
     sigma: FloatArray | None = None
     semantic_ids: IntArray | None = None
+    names: tuple[str, ...] | None = None
+    confidences: FloatArray | None = None
     image: Path | None = None
     model: Path | None = None
 
@@ -70,9 +90,11 @@ class Observation:
         points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
-        if self.sigma is not None:
-            sigma = as_floats(self.sigma, name="sigma", shape=(len(points_3d),))
-            object.__setattr__(self, "sigma", sigma)
+        for name in ("sigma", "confidences"):
+            value = getattr(self, name)
+            if value is not None:
+                checked = as_floats(value, name=name, shape=(len(points_3d),))
+                object.__setattr__(self, name, checked)
 
     @classmethod
     def load(cls, path: str | Path) -> Observation:
@@ -85,28 +107,15 @@ class Observation:
             message names file and field.
         """
         path = Path(path)
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise DataError("no such file", where=str(path)) from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"cannot be read ({error})", where=str(path)) from None
-        except json.JSONDecodeError as error:
-            raise DataError(
-                f"not valid JSON: {error.msg}", where=f"{path}, line {error.lineno}"
-            ) from None
-        try:
+        data = read_json(path)
+        with in_file(path):
             return cls.from_dict(data, folder=path.parent)
-        except CadalignError as error:
-            where = f"{path}: {error.where}" if error.where else str(path)
-            raise DataError(error.what, where=where, fix=error.fix) from None
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        if not isinstance(data, Mapping):
-            raise DataError(f"expected an object, got {type(data).__name__}")
-        _refuse_unknown(data, _FIELDS, where="top level")
+        data = as_object(data, where=None)
+        refuse_unknown(data, _FIELDS, where="top level")
         for name in ("camera", "keypoints"):
             if name not in data:
                 raise DataError("missing", where=name)
@@ -115,12 +124,15 @@ class Observation:
             raise DataError("expected a list of at least one keypoint", where="keypoints")
         for i, keypoint in enumerate(keypoints):
             _check_keypoint(keypoint, where=f"keypoints[{i}]")
+        names = _column(keypoints, "name", np.str_)
         return cls(
             points_3d=np.array([keypoint["xyz"] for keypoint in keypoints], dtype=float),
             points_2d=np.array([keypoint["uv"] for keypoint in keypoints], dtype=float),
             camera=Camera.from_dict(data["camera"]),
             sigma=_column(keypoints, "sigma", np.float64),
             semantic_ids=_column(keypoints, "semantic_id", np.int64),
+            names=None if names is None else tuple(names.tolist()),
+            confidences=_column(keypoints, "confidence", np.float64),
             image=_path(data, "image", folder),
             model=_path(data, "model", folder),
         )
@@ -131,49 +143,41 @@ class Observation:
             {"xyz": xyz, "uv": uv}
             for xyz, uv in zip(self.points_3d.tolist(), self.points_2d.tolist(), strict=True)
         ]
-        for name, values in (("sigma", self.sigma), ("semantic_id", self.semantic_ids)):
+        for name, values in (
+            ("sigma", self.sigma),
+            ("semantic_id", self.semantic_ids),
+            ("name", self.names),
+            ("confidence", self.confidences),
+        ):
             if values is not None:
-                for keypoint, value in zip(keypoints, values.tolist(), strict=True):
+                listed = values.tolist() if isinstance(values, np.ndarray) else values
+                for keypoint, value in zip(keypoints, listed, strict=True):
                     keypoint[name] = value
         data: dict[str, Any] = {"camera": self.camera.to_dict(), "keypoints": keypoints}
         for name, path in (("image", self.image), ("model", self.model)):
             if path is not None:
-                data[name] = _relative(path, folder)
+                data[name] = written_path(path, folder=folder)
         return data
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
-        data = self.to_dict(folder=Path(path).parent)
-        Path(path).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
-def _refuse_unknown(data: Mapping[str, Any], known: set[str], *, where: str) -> None:
-    unknown = sorted(set(data) - known)
-    if unknown:
-        raise DataError(
-            f"unknown field {unknown[0]!r}",
-            where=where,
-            fix=f"known are {', '.join(sorted(known))}",
-        )
+        write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
 
 def _check_keypoint(keypoint: Any, *, where: str) -> None:
     """Refuse a keypoint that lacks a field or holds something else than finite numbers."""
-    if not isinstance(keypoint, Mapping):
-        raise DataError(f"expected an object, got {type(keypoint).__name__}", where=where)
-    _refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
+    keypoint = as_object(keypoint, where=where)
+    refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
     for name, length in (("xyz", 3), ("uv", 2)):
         if name not in keypoint:
             raise DataError("missing", where=f"{where}.{name}")
         as_floats(keypoint[name], name=f"{where}.{name}", shape=(length,))
-    if (
-        "sigma" in keypoint
-        and not as_floats(keypoint["sigma"], name=f"{where}.sigma", shape=()) > 0
-    ):
+    if "sigma" in keypoint and not as_number(keypoint["sigma"], where=f"{where}.sigma") > 0:
         raise DataError("is not positive", where=f"{where}.sigma")
-    identity = keypoint.get("semantic_id", 0)
-    if not isinstance(identity, int) or isinstance(identity, bool):
-        raise DataError(f"{identity!r} is not a whole number", where=f"{where}.semantic_id")
+    if as_number(keypoint.get("confidence", 0.0), where=f"{where}.confidence") < 0:
+        raise DataError("is negative", where=f"{where}.confidence")
+    as_text(keypoint.get("name", "none"), where=f"{where}.name")
+    as_index(keypoint.get("semantic_id", 0), where=f"{where}.semantic_id")
 
 
 def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | None:
@@ -188,13 +192,6 @@ def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | No
             fix="give it for all keypoints or for none",
         )
     return np.array([keypoint[name] for keypoint in keypoints], dtype=kind)
-
-
-def _relative(path: Path, folder: Path | None) -> str:
-    """A path as it is written: without the folder that it is read relative to."""
-    if folder is None or not path.is_relative_to(folder):
-        return str(path)
-    return str(path.relative_to(folder))
 
 
 def _path(data: Mapping[str, Any], name: str, folder: Path | None) -> Path | None:

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.errors import InputError
+from cadalign.focal import FocalPrior
 from cadalign.solvers.objective import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.validation import FloatArray
 from cadalign.whitening import Sigma
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
+FOCALS = ("known", "estimate")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 
 
@@ -26,6 +28,8 @@ class Options:
     stretch: str | None = None
     scale_prior_sigma: float | None = None
     known_axis: str = "x"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -49,6 +53,8 @@ class Options:
         prior = self.scale_prior_sigma
         if prior is not None and not 0 < prior < np.inf:
             raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
+        if self.focal != "known" or self.focal_prior is not None:
+            self._check_focal()
         if self.method != "optimal" and (
             self.loss != "linear"
             or prior is not None
@@ -68,6 +74,31 @@ class Options:
                 f"{self.stretch!r} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",
                 fix=f"give one of {', '.join(allowed)}",
+            )
+
+    def _check_focal(self) -> None:
+        if self.focal not in FOCALS:
+            raise InputError(
+                f"unknown choice {self.focal!r}", where="focal", fix=f"give {' or '.join(FOCALS)}"
+            )
+        if self.focal == "estimate" and self.method != "optimal":
+            raise InputError(
+                f"the method {self.method!r} needs a known focal length",
+                where="focal",
+                fix="use the method 'optimal'",
+            )
+        if self.focal_prior is None:
+            return
+        if not isinstance(self.focal_prior, FocalPrior):
+            raise InputError(
+                f"expected a cadalign.FocalPrior, got {type(self.focal_prior).__name__}",
+                where="focal_prior",
+            )
+        if self.focal != "estimate":
+            raise InputError(
+                "given for a known focal length",
+                where="focal_prior",
+                fix='give focal="estimate" with it',
             )
 
     @property
@@ -102,18 +133,19 @@ class Options:
         return (
             self.method == "optimal"
             and self.sigma is None
-            and (self.loss != "linear" or self.prior_weight > 0)
+            and (self.loss != "linear" or self.prior_weight > 0 or self.focal_prior is not None)
         )
 
     @property
     def unknowns(self) -> int:
         """How many unknowns are estimated."""
-        return 6 + len(self.stretched_axes)
+        return 6 + len(self.stretched_axes) + (self.focal == "estimate")
 
     @property
     def min_points(self) -> int:
         """How many keypoints the method needs."""
         if self.method == "optimal":
             prior = len(self.stretched_axes) if self.scale_prior_sigma is not None else 0
+            prior += self.focal_prior is not None
             return (self.unknowns - prior + 1) // 2
         return 4 if self.method == "epnp" else 6

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from cadalign.box import Box
 from cadalign.camera import Camera
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError
 from cadalign.observation import Observation
+from cadalign.photo import read_photo
 from cadalign.render import draw_overlay
 from cadalign.render.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
@@ -21,20 +21,14 @@ from cadalign.validation import FloatArray
 
 
 def read_image(path: Path, camera: Camera) -> ByteImage:
-    """Read a photo as RGB (h, w, 3) uint8.
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
 
     Raises
     ------
     DataError
         If it is missing, is not an image, or has another size than the camera.
     """
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB"))
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
+    pixels = read_photo(path)
     height, width = pixels.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise DataError(
@@ -67,7 +61,7 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
 
     The box is the model's; without a model it is the box of the keypoints.
     """
-    camera = observation.camera
+    camera = result.camera
     if observation.image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
     else:

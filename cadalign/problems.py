@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +62,14 @@ class Problems:
         if not any(camera.distortion for camera in self.cameras):
             return ()
         return self.cameras if len(self.cameras) > 1 else self.cameras * len(self)
+
+    def with_focals(self, focals: FloatArray) -> Problems:
+        """The same problems seen with the focal lengths (B,); NaN leaves a camera as it is."""
+        cameras = tuple(
+            self.camera(b) if math.isnan(focal) else self.camera(b).with_focal(focal)
+            for b, focal in enumerate(focals.tolist())
+        )
+        return replace(self, cameras=cameras)
 
     def part(self, first: int, last: int) -> Problems:
         """Problems ``first`` to ``last``, that one left out."""

@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.alignment import Alignment
+from cadalign.camera import Camera
 from cadalign.deviation import Deviation, deviation_of, warnings_of
 from cadalign.errors import InputError
+from cadalign.focal import FocalPrior, focal_doubt
 from cadalign.validation import FloatArray, as_floats, as_points
 
 
@@ -26,10 +28,13 @@ class Alternative:
     alignment : Alignment
     relative_likelihood : float
         Its likelihood over that of the best alignment, 1 for an equally good one.
+    camera : Camera
+        The camera that goes with it; the best alignment's, unless the focal length was estimated.
     """
 
     alignment: Alignment
     relative_likelihood: float
+    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -72,18 +77,24 @@ class FitResult:
         The keypoints that the alignment was fitted to.
     method : str
         The method that found it.
+    camera : Camera
+        The camera it was fitted with; with the estimated focal length, where that was unknown.
     sigma : float, optional
         Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
         its own.
-    covariance : (8, 8) float, optional
-        Of the rotation vector in the camera frame [rad], the translation [model units] and the
-        logarithms of the two unknown scales, in the order of the axes; zero for what was held
-        fixed. The inverse of the Fisher information at the optimum. None for the methods that are
-        not statistical.
+    covariance : (8, 8) or (9, 9) float, optional
+        Of the rotation vector in the camera frame [rad], the translation [model units], the
+        logarithms of the two unknown scales, in the order of the axes, and, where it was
+        estimated, the logarithm of the focal length; zero for what was held fixed. The inverse of
+        the Fisher information at the optimum. None for the methods that are not statistical.
     known_axis : {"x", "y", "z"}
         The model's axis whose scale was taken as 1.
     stretched_axes : str
         The axes whose scale was estimated.
+    focal : {"known", "estimate"}
+        Whether the focal length was estimated.
+    focal_prior : FocalPrior, optional
+        What was known of it beforehand.
     alternatives : tuple of Alternative
         Other alignments that explain the keypoints as well: with 4 points all other exact
         solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
@@ -95,10 +106,13 @@ class FitResult:
     residuals: FloatArray
     inliers: npt.NDArray[np.bool_]
     method: str
+    camera: Camera
     sigma: float | None = None
     covariance: FloatArray | None = None
     known_axis: str = "x"
     stretched_axes: str = "yz"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = FitStats(0, 0, 0.0)
 
@@ -122,8 +136,14 @@ class FitResult:
         if std is None:
             return ()
         kept = self.points_3d[self.inliers]
-        redundancy = 2 * len(kept) - 6 - len(self.stretched_axes)
-        return warnings_of(kept, self.alignment, std, redundancy=redundancy)
+        unknowns = 6 + len(self.stretched_axes) + (self.focal == "estimate")
+        return warnings_of(
+            kept,
+            self.alignment,
+            std,
+            redundancy=2 * len(kept) - unknowns,
+            doubt=focal_doubt(self.camera, self.focal_prior) if self.focal == "estimate" else None,
+        )
 
     def __str__(self) -> str:
         count = int(self.inliers.sum())
@@ -148,6 +168,9 @@ class FitResult:
                 for text, deviation in zip(scale, std.scale, strict=True)
             ]
         lines.append(f"  scale        ({', '.join(scale)})")
+        if self.focal == "estimate":
+            known_to = "" if std is None else f" +- {100 * std.focal:.2g} %"
+            lines.append(f"  focal length {self.camera.fx:.4g} px{known_to}")
         lines.extend(
             f"  also likely  ({other.relative_likelihood:.2g} x): scale "
             f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
@@ -161,6 +184,7 @@ class FitResult:
         std = self.std
         return {
             "method": self.method,
+            "camera": self.camera.to_dict(),
             "alignment": self.alignment.to_dict(),
             "rms": self.rms,
             "points_3d": self.points_3d.tolist(),
@@ -171,10 +195,13 @@ class FitResult:
             "std": None if std is None else asdict(std),
             "known_axis": self.known_axis,
             "stretched_axes": self.stretched_axes,
+            "focal": self.focal,
+            "focal_prior": None if self.focal_prior is None else asdict(self.focal_prior),
             "alternatives": [
                 {
                     "alignment": other.alignment.to_dict(),
                     "relative_likelihood": other.relative_likelihood,
+                    "camera": other.camera.to_dict(),
                 }
                 for other in self.alternatives
             ],
@@ -193,21 +220,28 @@ class FitResult:
         """
         try:
             covariance = data["covariance"]
+            prior = data["focal_prior"]
+            unknowns = 8 if data["focal"] == "known" else 9
             return cls(
                 alignment=Alignment.from_dict(data["alignment"]),
                 points_3d=as_points(data["points_3d"], name="points_3d", dimension=3),
                 residuals=as_floats(data["residuals"], name="residuals", shape=(None, 2)),
                 inliers=np.array(data["inliers"], dtype=bool),
                 method=data["method"],
+                camera=Camera.from_dict(data["camera"]),
                 sigma=data["sigma"],
                 covariance=None
                 if covariance is None
-                else as_floats(covariance, name="covariance", shape=(8, 8)),
+                else as_floats(covariance, name="covariance", shape=(unknowns, unknowns)),
                 known_axis=data["known_axis"],
                 stretched_axes=data["stretched_axes"],
+                focal=data["focal"],
+                focal_prior=None if prior is None else FocalPrior(**prior),
                 alternatives=tuple(
                     Alternative(
-                        Alignment.from_dict(other["alignment"]), other["relative_likelihood"]
+                        Alignment.from_dict(other["alignment"]),
+                        other["relative_likelihood"],
+                        Camera.from_dict(other["camera"]),
                     )
                     for other in data["alternatives"]
                 ),

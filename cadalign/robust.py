@@ -9,10 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.alignment import Alignment
+from cadalign.camera import Camera
 from cadalign.errors import InputError, NoConsensusError
 from cadalign.estimation import unpack
+from cadalign.focal_views import focal_views, log_limits, log_prior
 from cadalign.options import Options
 from cadalign.problems import Problems
+from cadalign.solvers.focal_ransac import ransac_focal_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import LINEAR, Objective
 from cadalign.solvers.ransac import AEPNP, AP4P, SAMPLE_SIZES, ransac_kernel
@@ -83,6 +86,8 @@ class Consensus:
     Parameters
     ----------
     alignment : Alignment
+    camera : Camera
+        With the focal length that goes with it, where that was unknown.
     inliers : (n,) bool
     score : float
         Sum of squared errors, each at most the threshold's square [px^2].
@@ -90,6 +95,7 @@ class Consensus:
     """
 
     alignment: Alignment
+    camera: Camera
     inliers: BoolArray
     score: float
     iterations: int
@@ -108,7 +114,7 @@ def find_consensus(
     ----------
     problems : Problems
     options : Options
-        Known axis and stretch.
+        Known axis, stretch, and whether the focal length is known.
     ransac : RansacOptions
     confidences : (n,) float, optional
         How much each keypoint is trusted; samples are drawn from the highest first.
@@ -130,42 +136,67 @@ def find_consensus(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
         )
     order = _by_confidence(confidences, count)
-    rays = rays_of(np.ascontiguousarray(points_2d[order]), camera)
-    objective = Objective(
-        np.ascontiguousarray(points[order]),
-        rays,
-        whitening_of(1.0, rays, camera),
-        LINEAR,
-        1.0,
-        options.prior_weight,
-        options.free,
-    )
+    guided = order is not None
+    if order is None:
+        order = np.arange(count)
+    ordered_3d, ordered_2d = np.ascontiguousarray(points[order]), points_2d[order].copy()
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
     pose = np.zeros(15)
     inliers = np.zeros(count, dtype=bool)
-    score, iterations, hypotheses = ransac_kernel(
-        objective,
-        float(ransac.max_reproj_error),
-        MINIMAL_SOLVERS[ransac.minimal],
-        _MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations),
-        _MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations),
-        float(ransac.success_prob),
-        int(ransac.seed),
-        exhaustive,
-        confidences is not None,
-        ransac.refine,
-        pose,
-        inliers,
-    )
+    max_iterations = _MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations)
+    min_iterations = _MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations)
+    threshold = float(ransac.max_reproj_error)
+    if options.focal == "known":
+        camera.require_focal()
+        rays = rays_of(ordered_2d, camera)
+        weights = whitening_of(1.0, rays, camera)
+        objective = _objective(ordered_3d, rays, weights, options)
+        score, iterations, hypotheses = ransac_kernel(
+            objective,
+            threshold,
+            MINIMAL_SOLVERS[ransac.minimal],
+            max_iterations,
+            min_iterations,
+            float(ransac.success_prob),
+            int(ransac.seed),
+            exhaustive,
+            guided,
+            ransac.refine,
+            pose,
+            inliers,
+        )
+    else:
+        views = focal_views(ordered_2d, camera, options.focal_prior)
+        objective = _objective(ordered_3d, views.rays[0], views.whitening[0], options)
+        score, log_focal, iterations, hypotheses = ransac_focal_kernel(
+            objective,
+            views.rays,
+            views.whitening,
+            np.log(views.focals),
+            *log_limits(camera, options.focal_prior),
+            *log_prior(options.focal_prior),
+            threshold,
+            max_iterations,
+            min_iterations,
+            float(ransac.success_prob),
+            int(ransac.seed),
+            exhaustive,
+            guided,
+            ransac.refine,
+            pose,
+            inliers,
+        )
+        camera = camera.with_focal(math.exp(log_focal))
     rotation, translation, scale = unpack(pose)
     place = np.argsort(options.axis_order)
     alignment = Alignment.from_solver(rotation[:, place], translation, scale[place])
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     support = int(kept.sum())
-    errors = np.linalg.norm(residuals_of(problems, alignment)[kept], axis=1)
+    errors = np.linalg.norm(residuals_of(problems, alignment, camera)[kept], axis=1)
     extent = np.ptp(points_2d, axis=0) + 2 * ransac.max_reproj_error
     area = min(float(np.prod(extent)), float(camera.width * camera.height))
+    size += options.focal == "estimate"  # which half a keypoint determines
     if not np.isfinite(score) or _expected_by_chance(errors, count, size, area) > _CHANCE:
         raise NoConsensusError(
             f"no alignment is supported: the best has {support} of {count} keypoints within "
@@ -176,13 +207,19 @@ def find_consensus(
             score=float(score),
             inliers=support,
         )
-    return Consensus(alignment, kept, float(score), int(iterations), int(hypotheses))
+    return Consensus(alignment, camera, kept, float(score), int(iterations), int(hypotheses))
 
 
-def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp]:
-    """The order of falling confidence; the given order where there are none."""
+def _objective(
+    points: FloatArray, rays: FloatArray, whitening: FloatArray, options: Options
+) -> Objective:
+    return Objective(points, rays, whitening, LINEAR, 1.0, options.prior_weight, options.free)
+
+
+def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
+    """The order of falling confidence; None where there are none, or all are alike."""
     if confidences is None:
-        return np.arange(count)
+        return None
     values = as_floats(confidences, name="confidences", shape=(count,))
     if (values < 0).any():
         raise InputError(
@@ -190,7 +227,7 @@ def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray
             where="confidences",
             fix="give numbers that are not negative",
         )
-    return np.argsort(-values, kind="stable")
+    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None
 
 
 def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) -> float:
@@ -230,12 +267,12 @@ def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
 
 
-def residuals_of(problems: Problems, alignment: Alignment) -> FloatArray:
+def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> FloatArray:
     """Projected minus observed keypoints (n, 2) of the only problem; infinite behind the camera."""
     in_camera = alignment.apply(problems.points_3d)
     ahead = in_camera[:, 2] > 0
     residuals = np.full((len(in_camera), 2), np.inf)
     rays = in_camera[ahead, :2] / in_camera[ahead, 2:]
-    projected = problems.cameras[0].pixels_from_normalized(rays)
+    projected = camera.pixels_from_normalized(rays)
     residuals[ahead] = projected - problems.points_2d[ahead]
     return residuals

@@ -402,3 +402,92 @@ def test_project_refuses_what_are_no_points(points: Any, text: str) -> None:
 def test_no_points_have_no_projections() -> None:
     assert PLAIN.project(np.empty((0, 3))).shape == (0, 2)
     assert camera_with(LENSES["opencv4"]).normalize(np.empty((0, 2))).shape == (0, 2)
+
+
+# --- without focal length ---------------------------------------------------------------------
+
+
+def test_camera_without_focal_length_has_its_principal_point_in_the_centre() -> None:
+    camera = Camera.without_focal(641, 480)
+    assert (camera.cx, camera.cy) == (320.0, 239.5)
+    assert not camera.focal_known
+    assert camera.fx == camera.fy
+    given = Camera.without_focal(640, 480, cx=300.0, cy=200.0, distortion=(0.1, 0, 0, 0))
+    assert (given.cx, given.cy, given.distortion) == (300.0, 200.0, (0.1, 0.0, 0.0, 0.0))
+
+
+def test_focal_length_once_given_is_known() -> None:
+    camera = Camera.without_focal(640, 480).with_focal(700)
+    assert camera == Camera(640, 480, 700, 700, 319.5, 239.5)
+    assert camera != Camera.without_focal(640, 480)
+    stretched = Camera(640, 480, 500, 550, 320, 240).with_focal(1000)
+    assert (stretched.fx, stretched.fy) == (1000.0, 1100.0)
+
+
+@pytest.mark.parametrize("use", ["project", "normalize"])
+def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> None:
+    camera = Camera.without_focal(640, 480)
+    points = [[0.0, 0.0, 2.0]] if use == "project" else [[3.0, 4.0]]
+    with pytest.raises(InputError) as caught:
+        getattr(camera, use)(points)
+    assert str(caught.value) == (
+        'camera: the focal length is unknown; estimate it with focal="estimate", '
+        "or give it: camera.with_focal(...)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [
+        ((0, 480), "camera.width: 0 x 480 is not a size; give the image size in whole pixels"),
+        ((640, "high"), "camera.width: 640 x 'high' is not a size; "),
+        ((640.5, 480), "camera.width: 640.5 is not a size; "),
+    ],
+)
+def test_sizes_that_are_none_are_refused_without_a_focal_length_too(size: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.without_focal(*size)
+    assert str(caught.value).startswith(text)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"width": 640, "height": 480},
+        {
+            "model": "SIMPLE_PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [None, 320.0, 240.0],
+        },
+        {
+            "model": "PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [None, None, 320.0, 240.0],
+        },
+    ],
+)
+def test_unknown_focal_length_is_null_in_files(data: dict[str, Any]) -> None:
+    camera = Camera.from_dict(data)
+    assert camera == Camera.without_focal(640, 480)
+    assert camera.to_dict() == {
+        "model": "PINHOLE",
+        "width": 640,
+        "height": 480,
+        "params": [None, None, 320.0, 240.0],
+    }
+    assert Camera.from_dict(camera.to_dict()) == camera
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ([500.0, None, 320, 240], "camera.params: fy is None, not a finite number"),
+        ([None, None, None, 240], "camera.params: cx is None, not a finite number"),
+    ],
+)
+def test_half_a_focal_length_is_refused(params: list[Any], text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.from_dict({"model": "PINHOLE", "width": 640, "height": 480, "params": params})
+    assert str(caught.value) == text

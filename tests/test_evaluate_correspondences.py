@@ -310,6 +310,7 @@ class TestRows:
             residuals=np.zeros((4, 2)),
             inliers=np.array([True, False, True, True]),
             method="",
+            camera=CAMERA,
         )
         labels = {"image": "a", "draw": 0, "outliers": 0.25}
         row = CorrespondenceOutcome.of_fit(est, truth, method="ransac-optimal", **labels)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign import Alignment, FitResult, fit
+from cadalign import Alignment, FitResult, FocalPrior, fit
 from cadalign.errors import InputError
 from cadalign.result import Alternative, FitStats
-from cadalign.simulation import Problem, simulate_problem
+from cadalign.simulation import SIMULATION_CAMERA, Problem, simulate_problem
 
 
 def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5) -> Problem:
@@ -30,9 +30,12 @@ MADE = FitResult(
     residuals=np.array([[3.0, 4.0]] + [[0.0, 0.0]] * 5),
     inliers=np.array([False, True, True, True, True, True]),
     method="optimal",
+    camera=SIMULATION_CAMERA,
     sigma=1.0,
     covariance=np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0.0001, 0.0225]),
-    alternatives=(Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125),),
+    alternatives=(
+        Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125, SIMULATION_CAMERA),
+    ),
     stats=FitStats(12, 34, 0.5),
 )
 
@@ -55,6 +58,7 @@ def test_text_of_a_result_without_statistics() -> None:
         residuals=MADE.residuals,
         inliers=np.ones(6, dtype=bool),
         method="aepnp",
+        camera=SIMULATION_CAMERA,
     )
     assert str(plain) == (
         "aepnp: 6 keypoints, rms 2.04 px\n"
@@ -71,8 +75,9 @@ def test_text_of_a_result_without_statistics() -> None:
         fit_problem(problem_of(0, points=5, noise_px=1.0), sigma=np.full(5, 1.5)),
         fit_problem(problem_of(0), method="aepnp"),
         fit_problem(problem_of(0), known_axis="y", stretch="x"),
+        fit_problem(problem_of(0), focal="estimate", focal_prior=FocalPrior(140.0, 0.1)),
     ],
-    ids=["made", "alternatives", "linear", "known axis"],
+    ids=["made", "alternatives", "linear", "known axis", "unknown focal length"],
 )
 def test_json_brings_back_the_same_result(result: FitResult) -> None:
     text = result.to_json()
@@ -80,6 +85,7 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
     assert again.to_json() == text
     assert str(again) == str(result)
     assert again.alignment == result.alignment
+    assert again.camera == result.camera
     assert again.stats == result.stats
     assert again.inliers.dtype == bool
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
@@ -117,6 +123,7 @@ def test_warnings_look_at_the_inliers_alone() -> None:
         residuals=np.zeros((7, 2)),
         inliers=np.array([True] * 6 + [False]),
         method="optimal",
+        camera=SIMULATION_CAMERA,
         covariance=MADE.covariance,
     )
     assert result.warnings == (

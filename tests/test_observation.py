@@ -109,7 +109,8 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("keypoints.3.uv", ...), "{path}: keypoints[3].uv: missing"),
         (
             changed("keypoints.2.uvw", 3),
-            "{path}: keypoints[2]: unknown field 'uvw'; known are semantic_id, sigma, uv, xyz",
+            "{path}: keypoints[2]: unknown field 'uvw'; "
+            "known are confidence, name, semantic_id, sigma, uv, xyz",
         ),
         (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: shape (2,), expected (3)"),
         (

@@ -248,3 +248,12 @@ def test_real_correspondences(share: float, draws: int, wanted: float, max_itera
                 rotation_error(est=est, gt=gt) < 0.5 and scale_error(est=est, gt=gt).max() < 0.01
             )
     assert np.mean(succeeded) >= wanted
+
+
+def test_confidences_that_are_all_alike_guide_nothing() -> None:
+    problem, points_2d, _ = spoiled(3, points=60, outliers=20)
+    options = RansacOptions()
+    alike = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=np.full(60, 0.7))
+    blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
+    assert alike.alignment == blind.alignment
+    assert alike.stats.iterations == blind.stats.iterations

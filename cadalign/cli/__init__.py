@@ -15,6 +15,7 @@ from cadalign.cli.doctor import Doctor
 from cadalign.cli.evaluate import Evaluate
 from cadalign.cli.fit import Fit
 from cadalign.cli.library import LibraryCommand
+from cadalign.cli.observe import Observe
 from cadalign.cli.render import Render
 from cadalign.cli.report import Report
 from cadalign.cli.retrieve import Retrieve
@@ -24,6 +25,7 @@ from cadalign.errors import CadalignError
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Observe, tyro.conf.subcommand("observe")]
     | Annotated[Annotate, tyro.conf.subcommand("annotate")]
     | Annotated[Retrieve, tyro.conf.subcommand("retrieve")]
     | Annotated[LibraryCommand, tyro.conf.subcommand("library")]

@@ -6,7 +6,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -38,16 +38,30 @@ class Fit:
     """Some keypoints may be wrong: fit to those that agree (RANSAC)."""
     max_reproj_error: float = 4.0
     """With --robust, the largest reprojection error of a keypoint that is kept, in pixels."""
+    focal: Literal["known", "estimate"] | None = None
+    """Whether the file's focal length is right or is to be estimated too; by default it is right,
+    where there is one."""
+    exif: bool = True
+    """Estimate the focal length with what the photo's EXIF data say of it, if they do."""
 
     def run(self) -> int:
         """Run the fit; returns the exit code."""
         from cadalign.fitting import fit
+        from cadalign.focal import FocalPrior
         from cadalign.observation import Observation
         from cadalign.picture import draw_observation, write_image
         from cadalign.robust import RansacOptions
 
         observation = Observation.load(self.observation)
         console = new_console()
+        focal = self.focal or ("known" if observation.camera.focal_known else "estimate")
+        prior = None
+        if focal == "estimate" and self.exif and observation.image is not None:
+            prior = FocalPrior.from_exif(observation.image)
+        if prior is not None:
+            sigma = 100 * prior.relative_sigma
+            text = f"Focal length by the photo's EXIF data: {prior.focal:.4g} px +-{sigma:.2g} %"
+            console.print(text, markup=False)
         with console.status("fitting (the first time after an installation takes a minute)"):
             result = fit(
                 observation.points_3d,
@@ -58,6 +72,9 @@ class Fit:
                 ransac=RansacOptions(max_reproj_error=self.max_reproj_error)
                 if self.robust
                 else None,
+                confidences=observation.confidences if self.robust else None,
+                focal=focal,
+                focal_prior=prior,
             )
         picture = draw_observation(observation, result)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")

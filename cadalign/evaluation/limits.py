@@ -8,6 +8,8 @@ from cadalign.alignment import Alignment
 from cadalign.camera import Camera
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.symmetry import rotation_about
+from cadalign.focal_views import focal_slopes
+from cadalign.solvers.focal import focal_covariance
 from cadalign.solvers.objective import LINEAR, UNKNOWNS, Objective
 from cadalign.solvers.optimal import covariance_of
 from cadalign.validation import FloatArray
@@ -18,7 +20,12 @@ _LARGEST_LOG = 50.0
 
 
 def cramer_rao_bound(
-    points_3d: FloatArray, camera: Camera, gt: Alignment, *, sigma: Sigma = 1.0
+    points_3d: FloatArray,
+    camera: Camera,
+    gt: Alignment,
+    *,
+    sigma: Sigma = 1.0,
+    focal: str = "known",
 ) -> FloatArray:
     """The least covariance that any unbiased estimate of an alignment can have.
 
@@ -34,11 +41,14 @@ def cramer_rao_bound(
         The truth, with the scale 1 along x.
     sigma : float, (n,) float or (n, 2, 2) float
         The keypoints' noise, as for `cadalign.fit` [px].
+    focal : {"known", "estimate"}
+        Whether the focal length is known to the estimator; the camera's is the truth.
 
     Returns
     -------
-    (8, 8) float
-        Rotation vector in the camera frame [rad], translation [model units], log s_y and log s_z.
+    (8, 8) or (9, 9) float
+        Rotation vector in the camera frame [rad], translation [model units], log s_y and log s_z,
+        and, where it is estimated, the logarithm of the focal length.
 
     Raises
     ------
@@ -57,8 +67,14 @@ def cramer_rao_bound(
         np.ones(UNKNOWNS),
     )
     pose = np.concatenate([gt.rotation.ravel(), gt.translation, gt.scale])
-    covariance = np.zeros((UNKNOWNS, UNKNOWNS))
-    if covariance_of(objective, pose, covariance) >= 0:
+    unknowns = UNKNOWNS + (focal == "estimate")
+    covariance = np.zeros((unknowns, unknowns))
+    if focal == "known":
+        undetermined = covariance_of(objective, pose, covariance)
+    else:
+        slopes = focal_slopes(camera.project(in_camera), camera, rays)
+        undetermined = focal_covariance(objective, slopes, 0.0, pose, covariance)
+    if undetermined >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
     return covariance
 

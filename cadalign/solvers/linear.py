@@ -100,7 +100,7 @@ def describe_plane(points_3d: FloatArray) -> str | None:
 
 
 @fast_sums
-def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
+def moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
     """Add up the 40 sums into which all data enter.
 
     Row k of ``products`` (10, 4) is the k-th of the products 11, 1x, 1y, 1z, xx, xy, xz, yy, yz,
@@ -244,7 +244,7 @@ def aepnp_kernel(
         return rotation, translation, scale, DEGENERATE
     mean = np.empty(5)
     products = np.empty((10, 4))
-    _moments(points, rays, mean, products)
+    moments(points, rays, mean, products)
     status = aepnp_from_moments(mean, products, rotation, translation, scale)
     return rotation, translation, scale, status
 
@@ -258,9 +258,32 @@ def aepnp_from_moments(
     scale: FloatArray,
 ) -> int:
     """Solve from the sums alone; fills the last three arguments and returns a status."""
+    spread = np.empty(3)
+    rows = np.empty((3, 4))
+    status = affine_rows(mean, products, spread, rows)
+    if status != OK:
+        return status
+    lengths = _split_scale(rows[:, 1:], spread, rotation)
+    for j in range(3):
+        scale[j] = lengths[j] / lengths[0]
+    for i in range(3):
+        translation[i] = rows[i, 0] / lengths[0]
+        for j in range(3):
+            translation[i] -= rotation[i, j] * scale[j] * mean[j]
+    return OK
+
+
+@kernel
+def affine_rows(
+    mean: FloatArray, products: FloatArray, spread: FloatArray, rows: FloatArray
+) -> int:
+    """Solve for the affine map to the camera frame, up to a factor; returns a status.
+
+    Row i of ``rows`` (3, 4) times (1, x - mean) is coordinate i. ``spread`` (3,) receives the
+    points' extent along their axes.
+    """
     factor = np.empty((4, 4))
     _unpack(products, 0, factor)
-    spread = np.empty(3)
     largest = 0.0
     for k in range(3):
         spread[k] = np.sqrt(factor[k + 1, k + 1])
@@ -294,7 +317,6 @@ def aepnp_from_moments(
         if system[k, k] < system[best, best]:
             best = k
 
-    rows = np.empty((3, 4))
     for i in range(4):
         rows[2, i] = vectors[i, best]
         rows[0, i] = 0.0
@@ -309,12 +331,4 @@ def aepnp_from_moments(
     for i in range(4):
         rows[0, i] += mean[3] * rows[2, i]
         rows[1, i] += mean[4] * rows[2, i]
-
-    lengths = _split_scale(rows[:, 1:], spread, rotation)
-    for j in range(3):
-        scale[j] = lengths[j] / lengths[0]
-    for i in range(3):
-        translation[i] = rows[i, 0] / lengths[0]
-        for j in range(3):
-            translation[i] -= rotation[i, j] * scale[j] * mean[j]
     return OK

@@ -65,7 +65,7 @@ def evaluate(
     cost = 0.0
     for start in range(0, objective.points.shape[0], BLOCK):
         size = min(BLOCK, objective.points.shape[0] - start)
-        cost += _jacobian_rows(objective, pose, start, size, rows)
+        cost += jacobian_rows(objective, pose, start, size, rows)
         if not cost < np.inf:
             return np.inf
         _add_products(rows, 2 * size, hessian, gradient)
@@ -87,7 +87,7 @@ def evaluate(
 
 
 @kernel
-def _jacobian_rows(
+def jacobian_rows(
     objective: Objective,
     pose: FloatArray,
     start: int,

@@ -58,8 +58,8 @@ def optimal_kernel(
     if minima == 0:
         return 0, iterations, hypotheses, -1
     for k in range(minima):
-        _orthonormalize(poses[k])
-        _uncenter(poses[k], center, unit)
+        orthonormalize(poses[k])
+        uncenter(poses[k], center, unit)
     return minima, iterations, hypotheses, covariance_of(objective, poses[0], covariance)
 
 
@@ -72,7 +72,7 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
     center, unit = _center_and_unit(objective.points)
     local = _with_points(objective, (objective.points - center) / unit)
     centered = pose.copy()
-    _uncenter(centered, -center, 1.0)
+    uncenter(centered, -center, 1.0)
     for c in range(3):
         centered[9 + c] /= unit
     undetermined = _invert_information(local, centered, covariance)
@@ -262,7 +262,7 @@ def _descend(
             objective, _PROBE_ITERATIONS if stage == 0 else _MAX_ITERATIONS, pose
         )
         iterations += used
-        if not cost < np.inf or _has_collapsed(pose):
+        if not cost < np.inf or has_collapsed(pose):
             return minima, iterations
         if converged or _find(pose, poses, minima) >= 0:
             break
@@ -285,7 +285,7 @@ def _descend(
 
 
 @kernel
-def _has_collapsed(pose: FloatArray) -> bool:
+def has_collapsed(pose: FloatArray) -> bool:
     """Say whether the refinement ran off to a model without thickness, or without end.
 
     With few points the likelihood may rise forever as a scale goes to zero. No real object is
@@ -311,7 +311,7 @@ def _find(pose: FloatArray, poses: FloatArray, minima: int) -> int:
 
 
 @kernel
-def _orthonormalize(pose: FloatArray) -> None:
+def orthonormalize(pose: FloatArray) -> None:
     """Take the rounding errors of the steps out of the rotation."""
     rotation = np.empty((3, 3))
     polish_rotation(pose[:9].reshape(3, 3), rotation)
@@ -321,7 +321,7 @@ def _orthonormalize(pose: FloatArray) -> None:
 
 
 @kernel
-def _uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
+def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
     """Turn the pose of points (x - center) / unit into the pose of points x."""
     for c in range(3):
         pose[9 + c] *= unit

@@ -106,14 +106,16 @@ def ransac_kernel(
             if iterations > 0 and not next_subset(chosen, n):
                 break
         else:
-            if guided:
-                grow_pool(growth, size, n, iterations)
-            _draw(state, growth, guided, n, chosen)
+            # The most trusted points may all lie on one side: every other sample is of all points.
+            from_pool = guided and iterations % 2 == 0
+            if from_pool:
+                grow_pool(growth, size, n, iterations // 2)
+            draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
-        found = _solve_sample(objective, minimal, chosen, candidates)
+        found = solve_sample(objective, minimal, chosen, candidates)
         hypotheses += found
         for k in range(found):
-            score, support, seen = _score(
+            score, support, seen = score_pose(
                 objective, order, candidates[k], limit, best, best_support / n, random_support
             )
             if seen < n and seen > 0:  # given up: learn how much support a wrong one finds
@@ -137,15 +139,15 @@ def ransac_kernel(
             elif good > 0.0:
                 # A rejection test that errs once in _REJECTION costs that many more samples.
                 good *= 1.0 - 1.0 / _REJECTION
-                needed = np.log(1.0 - success_prob) / np.log1p(-good)
+                needed = np.log(1.0 - success_prob) / np.log1p(-good) * (2.0 if guided else 1.0)
     if best < np.inf and optimize:
         best = _finish(objective, threshold, order, best, pose)
-    _find_inliers(objective, threshold, pose, inliers)
+    find_inliers(objective, threshold, pose, inliers)
     return best, iterations, hypotheses
 
 
 @kernel
-def _draw(
+def draw_sample(
     state: StateArray, growth: FloatArray, guided: bool, count: int, chosen: IntArray
 ) -> None:
     """Draw a sample: of the pool's points, with its newest one, or of all."""
@@ -161,7 +163,7 @@ def _draw(
 
 
 @kernel
-def _solve_sample(
+def solve_sample(
     objective: Objective, minimal: int, chosen: IntArray, candidates: FloatArray
 ) -> int:
     """Solve a minimal set; returns the number of hypotheses."""
@@ -203,7 +205,7 @@ def squared_error(objective: Objective, pose: FloatArray, i: int) -> float:
 
 
 @kernel
-def _score(
+def score_pose(
     objective: Objective,
     order: IntArray,
     pose: FloatArray,
@@ -245,17 +247,17 @@ def _optimize_locally(
     """Refine a pose on its inliers, first the wider ones; returns its score and support."""
     for r in range(_LOCAL_ROUNDS):
         factor = _WIDE + (1.0 - _WIDE) * r / (_LOCAL_ROUNDS - 1)
-        some = _inliers_of(objective, order, factor * threshold, pose, _LOCAL_POINTS)
+        some = inliers_of(objective, order, factor * threshold, pose, _LOCAL_POINTS)
         if some.points.shape[0] < 5:
             break
         refine(some, _LOCAL_ITERATIONS, pose)
     limit = threshold * threshold
-    score, support, _ = _score(objective, order, pose, limit, np.inf, 0.0, 1.0)
+    score, support, _ = score_pose(objective, order, pose, limit, np.inf, 0.0, 1.0)
     return score, support
 
 
 @kernel
-def _inliers_of(
+def inliers_of(
     objective: Objective, order: IntArray, threshold: float, pose: FloatArray, most: int
 ) -> Objective:
     """The objective of the first ``most`` points that lie within a threshold."""
@@ -295,11 +297,11 @@ def _finish(
     support = -1
     limit = threshold * threshold
     for _ in range(_FINAL_ROUNDS):
-        some = _inliers_of(objective, order, threshold, trial, order.shape[0])
+        some = inliers_of(objective, order, threshold, trial, order.shape[0])
         if some.points.shape[0] < 4:
             return best
         refine(some, _FINAL_ITERATIONS, trial)
-        score, inside, _ = _score(objective, order, trial, limit, np.inf, 0.0, 1.0)
+        score, inside, _ = score_pose(objective, order, trial, limit, np.inf, 0.0, 1.0)
         if score > best * (1.0 + 1e-9):
             return best
         pose[:] = trial
@@ -311,7 +313,7 @@ def _finish(
 
 
 @kernel
-def _find_inliers(
+def find_inliers(
     objective: Objective, threshold: float, pose: FloatArray, inliers: BoolArray
 ) -> None:
     """Say which points lie within the threshold."""

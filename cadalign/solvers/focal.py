@@ -1,0 +1,273 @@
+"""The ninth unknown: refinement and covariance where the focal length is estimated too.
+
+The focal length is written as a reference one times exp(log_ratio). The reference's objective holds
+rays and weights at log_ratio 0; at another focal length the rays shrink and the weights grow by the
+ratio. Given the focal length, the other 8 unknowns are refined as ever, so the ninth is found by
+Newton's method on what is left, the least error as a function of the focal length alone (variable
+projection).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.solvers.jit import kernel
+from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.linear import MIN_POINTS, affine_rows, moments
+from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate, jacobian_rows
+from cadalign.solvers.optimal import covariance_of
+from cadalign.solvers.refine import move_pose, refine
+from cadalign.solvers.status import OK
+from cadalign.validation import FloatArray
+
+_ROUNDS = 60
+_POSE_ITERATIONS = 100
+_LARGEST_STEP = 0.5
+_CONVERGED_STEP = 1e-9
+_RELATIVE_DECREASE = 1e-12
+_ABSOLUTE_DECREASE = 1e-16
+_HALVINGS = 12
+_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
+_UNOBSERVABLE = 1e-11  # share of the focal length's information that the other unknowns leave
+
+
+@kernel
+def linear_focal(points: FloatArray, rays: FloatArray) -> float:
+    """Estimate the focal length linearly, as a multiple of that which the rays were made with.
+
+    The 3 x 3 block of the linear solution is diag(1, 1, 1 / ratio) R diag(scale) up to a factor, so
+    for two of its columns m and n, (m_x n_x + m_y n_y) / ratio^2 + m_z n_z = 0; the least-squares
+    solution over the three pairs. NaN where the points do not span a volume or no ratio is real.
+    """
+    if points.shape[0] < MIN_POINTS:
+        return np.nan
+    mean = np.empty(5)
+    products = np.empty((10, 4))
+    moments(points, rays, mean, products)
+    spread = np.empty(3)
+    rows = np.empty((3, 4))
+    if affine_rows(mean, products, spread, rows) != OK:
+        return np.nan
+    mixed = squares = 0.0
+    for i in range(3):
+        j = (i + 1) % 3
+        weight = spread[i] * spread[j]
+        across = weight * (rows[0, 1 + i] * rows[0, 1 + j] + rows[1, 1 + i] * rows[1, 1 + j])
+        along = weight * rows[2, 1 + i] * rows[2, 1 + j]
+        mixed -= across * along
+        squares += across * across
+    return float(np.sqrt(squares / mixed)) if mixed > 0.0 else np.nan
+
+
+@kernel
+def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Objective:
+    """The objective at exp(log_ratio) times the focal length that its rays were made with.
+
+    ``slopes`` (n, 2), or (0, 2) for a lens without distortion, says by how much the undistorted
+    pixels, over the reference focal length, change with the logarithm of the focal length.
+    """
+    ratio = np.exp(log_ratio)
+    rays = objective.rays / ratio
+    if slopes.shape[0] > 0:
+        rays += slopes * (log_ratio / ratio)
+    return Objective(
+        objective.points,
+        rays,
+        objective.whitening * ratio,
+        objective.loss,
+        objective.loss_scale,
+        objective.prior_weight,
+        objective.free,
+    )
+
+
+@kernel
+def focal_system(
+    here: Objective,
+    slopes: FloatArray,
+    ratio: float,
+    pose: FloatArray,
+    hessian: FloatArray,
+    gradient: FloatArray,
+) -> tuple[float, float]:
+    """Build the Gauss-Newton system of all 9 unknowns at a pose, without the focal length's prior.
+
+    Parameters
+    ----------
+    here : Objective
+        What `at_focal` gives for the ratio.
+    slopes, ratio : (n, 2) or (0, 2) float, float
+        As for `at_focal`.
+    pose : (15,) float
+    hessian, gradient : (9, 8), (8,) float
+        Receive the 8 x 8 system, and in the last row the focal length's products with the others.
+
+    Returns
+    -------
+    information, slope : float
+        The focal length's own entries of J' W J and J' W r.
+    """
+    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
+    evaluate(here, pose, rows, hessian[:UNKNOWNS], gradient)
+    hessian[UNKNOWNS] = 0.0
+    information = slope = 0.0
+    each = here.whitening.shape[0] > 1
+    for start in range(0, here.points.shape[0], BLOCK):
+        size = min(BLOCK, here.points.shape[0] - start)
+        jacobian_rows(here, pose, start, size, rows)
+        for b in range(size):
+            i = start + b
+            depth = pose[11]
+            for j in range(3):
+                depth += pose[6 + j] * pose[12 + j] * here.points[i, j]
+            # A longer focal length moves a point's image as a smaller depth does.
+            across = -rows[5, b] * depth
+            down = -rows[5, size + b] * depth
+            if slopes.shape[0] > 0:
+                w = i if each else 0
+                weighted = here.whitening[w]
+                root = rows[3, b] * depth / weighted[0]  # of the loss's weight
+                dx, dy = root * slopes[i, 0] / ratio, root * slopes[i, 1] / ratio
+                across -= weighted[0] * dx + weighted[1] * dy
+                down -= weighted[2] * dy
+            for k in range(UNKNOWNS):
+                if here.free[k] != 0.0:
+                    hessian[UNKNOWNS, k] += rows[k, b] * across + rows[k, size + b] * down
+            information += across * across + down * down
+            slope += rows[UNKNOWNS, b] * across + rows[UNKNOWNS, size + b] * down
+    return information, slope
+
+
+@kernel
+def refine_focal(
+    objective: Objective,
+    slopes: FloatArray,
+    prior_center: float,
+    prior_weight: float,
+    low: float,
+    high: float,
+    max_rounds: int,
+    pose: FloatArray,
+    log_ratio: float,
+) -> tuple[float, float, int]:
+    """Improve ``pose`` (15,) in place, and the focal length with it.
+
+    Parameters
+    ----------
+    objective, slopes
+        As for `at_focal`.
+    prior_center, prior_weight : float
+        Mean and inverse variance of the prior on log_ratio; the weight 0 for none.
+    low, high : float
+        Bounds on log_ratio.
+    max_rounds : int
+        Most steps of the focal length.
+    pose : (15,) float
+    log_ratio : float
+        Where to start.
+
+    Returns
+    -------
+    cost, log_ratio : float
+        At the minimum; the cost is infinite if a point lies behind the camera at the start.
+    iterations : int
+    """
+    hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
+    gradient = np.empty(UNKNOWNS)
+    shift = np.empty(UNKNOWNS)
+    trial = np.empty(pose.shape[0])
+    here = at_focal(objective, slopes, log_ratio)
+    cost, iterations, _ = refine(here, _POSE_ITERATIONS, pose)
+    cost += prior_weight * (log_ratio - prior_center) ** 2
+    if not cost < np.inf:
+        return np.inf, log_ratio, iterations
+    for _ in range(min(max_rounds, _ROUNDS)):
+        own, slope = focal_system(here, slopes, np.exp(log_ratio), pose, hessian, gradient)
+        slope += prior_weight * (log_ratio - prior_center)
+        curvature = own + prior_weight
+        whole = curvature
+        # The pose follows the focal length by shift, which lessens both slope and curvature.
+        if not _factor(hessian[:UNKNOWNS]):
+            return cost, log_ratio, iterations
+        shift[:] = -hessian[UNKNOWNS]
+        solve_cholesky(hessian[:UNKNOWNS], UNKNOWNS, shift)
+        for k in range(UNKNOWNS):
+            curvature += hessian[UNKNOWNS, k] * shift[k]
+            slope += gradient[k] * shift[k]
+        if curvature > _UNOBSERVABLE * whole:
+            step = -slope / curvature
+        else:
+            step = -np.sign(slope) * _LARGEST_STEP
+        step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
+        step = min(max(step, low - log_ratio), high - log_ratio)
+        improved = False
+        for _ in range(_HALVINGS):
+            if abs(step) < _CONVERGED_STEP:
+                break
+            move_pose(pose, step * shift, trial)
+            there = at_focal(objective, slopes, log_ratio + step)
+            moved_cost, used, _ = refine(there, _POSE_ITERATIONS, trial)
+            iterations += used
+            moved_cost += prior_weight * (log_ratio + step - prior_center) ** 2
+            if moved_cost <= cost:
+                improved = True
+                break
+            step *= 0.3
+        if not improved:
+            break
+        decrease = cost - moved_cost
+        pose[:] = trial
+        here = there
+        log_ratio += step
+        cost = moved_cost
+        if decrease <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost:
+            break
+    return cost, log_ratio, iterations
+
+
+@kernel
+def _factor(hessian: FloatArray) -> bool:
+    """Factor an 8 x 8 system in place; unknowns that the points tell nothing about are held."""
+    floor = 1e-300
+    for k in range(UNKNOWNS):
+        floor = max(floor, _LEAST_INFORMATION * hessian[k, k])
+    for k in range(UNKNOWNS):
+        hessian[k, k] += floor
+    return cholesky(hessian, UNKNOWNS, 0.0)
+
+
+@kernel
+def focal_covariance(
+    objective: Objective,
+    slopes: FloatArray,
+    prior_weight: float,
+    pose: FloatArray,
+    covariance: FloatArray,
+) -> int:
+    """Write the inverse information of all 9 unknowns, at log_ratio 0, into (9, 9).
+
+    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
+    number of an unknown that the points do not determine.
+    """
+    given = np.empty((UNKNOWNS, UNKNOWNS))
+    covariance[:] = 0.0
+    undetermined = covariance_of(objective, pose, given)
+    if undetermined >= 0:
+        return undetermined
+    hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
+    gradient = np.empty(UNKNOWNS)
+    own, _ = focal_system(objective, slopes, 1.0, pose, hessian, gradient)
+    shift = np.zeros(UNKNOWNS)
+    information = own + prior_weight
+    for k in range(UNKNOWNS):
+        for m in range(UNKNOWNS):
+            shift[k] -= given[k, m] * hessian[UNKNOWNS, m]
+        information += hessian[UNKNOWNS, k] * shift[k]
+    # Where nothing is left, the deviation is as large as rounding errors let it be known.
+    variance = 1.0 / max(information, _UNOBSERVABLE * (own + prior_weight))
+    covariance[UNKNOWNS, UNKNOWNS] = variance
+    for k in range(UNKNOWNS):
+        covariance[k, UNKNOWNS] = covariance[UNKNOWNS, k] = variance * shift[k]
+        for m in range(UNKNOWNS):
+            covariance[k, m] = given[k, m] + variance * shift[k] * shift[m]
+    return -1

@@ -1,0 +1,196 @@
+"""Files of a model's named keypoints: a round trip, and every way in which one can be wrong."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Mesh
+from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints, load_mesh
+from cadalign.errors import DataError
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+DATA: dict[str, Any] = {
+    "format": "cadalign model keypoints",
+    "version": 1,
+    "model": "tetrahedron.obj",
+    "keypoints": [
+        {"name": "top", "xyz": [0, 0, 1], "semantic_id": 7},
+        {
+            "name": "floor",
+            "xyz": [0.25, 0.5, 0],
+            "face_index": 0,
+            "barycentric": [0.25, 0.25, 0.5],
+        },
+        {"name": "slope", "face_index": 3, "barycentric": [0.2, 0.3, 0.5], "semantic_id": 2},
+    ],
+}
+
+
+def write(path: Path, data: Any = DATA) -> Path:
+    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
+    (path.parent / "tetrahedron.obj").write_text(TETRAHEDRON)
+    return path
+
+
+def changed(row: int, **fields: Any) -> dict[str, Any]:
+    """The data with fields of one keypoint replaced; removed where the value is `...`."""
+    data = copy.deepcopy(DATA)
+    entry = data["keypoints"][row]
+    for name, value in fields.items():
+        if value is ...:
+            entry.pop(name, None)
+        else:
+            entry[name] = value
+    return data
+
+
+def test_fields_arrive_and_faces_become_places(tmp_path: Path) -> None:
+    keypoints = ModelKeypoints.load(write(tmp_path / "a.keypoints.json"))
+    assert keypoints.names == ("top", "floor", "slope")
+    assert keypoints.semantic_ids == (7, None, 2)
+    assert keypoints.model == tmp_path / "tetrahedron.obj"
+    np.testing.assert_allclose(
+        keypoints.xyz, [[0, 0, 1], [0.25, 0.5, 0], [0.2, 0.3, 0.5]], atol=1e-15
+    )
+    assert keypoints.keypoints[1].barycentric == (0.25, 0.25, 0.5)
+    assert len(keypoints) == 3
+
+
+def test_mesh_at_hand_takes_the_place_of_the_named_one(tmp_path: Path) -> None:
+    data = {name: value for name, value in DATA.items() if name != "model"}
+    path = write(tmp_path / "a.keypoints.json", data)
+    mesh = load_mesh(tmp_path / "tetrahedron.obj")
+    doubled = Mesh(2 * mesh.vertices, mesh.faces)
+    keypoints = ModelKeypoints.load(path, mesh=doubled)
+    np.testing.assert_allclose(keypoints.xyz[2], [0.4, 0.6, 1.0])
+    np.testing.assert_allclose(keypoints.xyz[0], [0, 0, 1])  # xyz counts where it is given
+
+
+def test_load_undoes_save_exactly(tmp_path: Path) -> None:
+    written = ModelKeypoints.load(write(tmp_path / "a.keypoints.json"))
+    written.save(tmp_path / "b.keypoints.json")
+    assert ModelKeypoints.load(tmp_path / "b.keypoints.json") == written
+    data = json.loads((tmp_path / "b.keypoints.json").read_text())
+    assert data["model"] == "tetrahedron.obj"
+    (tmp_path / "below").mkdir()
+    written.save(tmp_path / "below" / "c.keypoints.json")
+    assert ModelKeypoints.load(tmp_path / "below" / "c.keypoints.json").model == written.model
+
+
+def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_path: Path) -> None:
+    model = next(iter(KeypointNet(sample_root)["chair"]))
+    ids = model.keypoints.semantic_ids.tolist()
+    keypoints = ModelKeypoints.of_model(model, names={ids[1]: "back, top left"})
+    keypoints.save(tmp_path / "chair.keypoints.json")
+    again = ModelKeypoints.load(tmp_path / "chair.keypoints.json")
+    assert again == keypoints
+    assert again.names[:2] == (f"keypoint {ids[0]}", "back, top left")
+    assert again.semantic_ids == tuple(ids)
+    data = json.loads((tmp_path / "chair.keypoints.json").read_text())
+    for entry in data["keypoints"]:
+        del entry["xyz"]
+    (tmp_path / "faces.keypoints.json").write_text(json.dumps(data))
+    rebuilt = ModelKeypoints.load(tmp_path / "faces.keypoints.json").xyz
+    np.testing.assert_allclose(rebuilt, keypoints.xyz, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        ([1], "{path}: expected an object, got list"),
+        (
+            DATA | {"format": "other"},
+            "{path}: format: 'other' is not 'cadalign model keypoints'; "
+            "give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
+        ),
+        (
+            DATA | {"version": 2},
+            "{path}: version: 2 is not 1; it was written by another version of cadalign",
+        ),
+        (
+            DATA | {"points": 3},
+            "{path}: top level: unknown field 'points'; "
+            "known are format, keypoints, model, version",
+        ),
+        (DATA | {"keypoints": {}}, "{path}: keypoints: expected a list"),
+        (DATA | {"model": 3}, "{path}: model: 3 is not a path"),
+        (changed(1, name=...), "{path}: keypoints[1].name: missing"),
+        (changed(1, name=""), "{path}: keypoints[1].name: '' is not a text"),
+        (changed(1, name=4), "{path}: keypoints[1].name: 4 is not a text"),
+        (
+            changed(1, name="top"),
+            "{path}: keypoints[1].name: 'top' occurs twice, first in keypoints[0]",
+        ),
+        (
+            changed(1, semantic_id=7),
+            "{path}: keypoints[1].semantic_id: 7 occurs twice, first in keypoints[0]",
+        ),
+        (
+            changed(1, semantic_id="seven"),
+            "{path}: keypoints[1].semantic_id: 'seven' is not a whole number",
+        ),
+        (
+            changed(0, xyz=...),
+            "{path}: keypoints[0].xyz: missing; or give face_index and barycentric",
+        ),
+        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: shape (2,), expected (3)"),
+        (
+            changed(0, xyz=[1, 2, None]),
+            "{path}: keypoints[0].xyz: NaN or infinite values in row 2; remove or repair these",
+        ),
+        (
+            changed(1, barycentric=...),
+            "{path}: keypoints[1].barycentric: missing; give both or neither",
+        ),
+        (
+            changed(1, face_index=...),
+            "{path}: keypoints[1].face_index: missing; give both or neither",
+        ),
+        (
+            changed(1, barycentric=[1, 1, 1]),
+            "{path}: keypoints[1].barycentric: [1.0, 1.0, 1.0] sum to 3, not to 1",
+        ),
+        (
+            changed(2, face_index=4),
+            "{path}: keypoints[2].face_index: face 4 is not in {mesh}, which has faces 0 to 3",
+        ),
+        (changed(2, face_index=0.5), "{path}: keypoints[2].face_index: 0.5 is not a whole number"),
+        (
+            changed(0, colour="red"),
+            "{path}: keypoints[0]: unknown field 'colour'; "
+            "known are barycentric, face_index, name, semantic_id, xyz",
+        ),
+        (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: expected an object, got int"),
+        (
+            {name: value for name, value in DATA.items() if name != "model"},
+            "{path}: keypoints[2]: neither xyz nor a model that the face belongs to; "
+            "give xyz, or name the mesh file under model",
+        ),
+        ("{", "{path}, line 1: not valid JSON: Expecting property name enclosed in double quotes"),
+        ("[" * 100_000, "{path}: not valid JSON: nested too deeply"),
+    ],
+)
+def test_malformed_files_are_refused_by_file_and_field(
+    tmp_path: Path, data: Any, text: str
+) -> None:
+    path = write(tmp_path / "a.keypoints.json", data)
+    with pytest.raises(DataError) as caught:
+        ModelKeypoints.load(path)
+    assert str(caught.value) == text.format(path=path, mesh=tmp_path / "tetrahedron.obj")
+
+
+def test_files_that_cannot_be_read_or_written_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nothing\.json: no such file"):
+        ModelKeypoints.load(tmp_path / "nothing.json")
+    one = ModelKeypoints((ModelKeypoint("a", (0.0, 0.0, 0.0)),))
+    with pytest.raises(DataError, match=r"no/such\.json: cannot be written \(No such file"):
+        one.save(tmp_path / "no" / "such.json")
+    path = write(tmp_path / "a.keypoints.json", DATA | {"model": "missing.obj"})
+    with pytest.raises(DataError, match=r"missing\.obj: no such mesh file"):
+        ModelKeypoints.load(path)

@@ -21,7 +21,7 @@ from cadalign.render import look_at
 from cadalign.report.looks import METRICS, method_dict
 from cadalign.report.page import render_page
 
-HOSTILE = "<img src=x onerror=alert(1)>"
+HOSTILE = "<img src=x onerror=alert(1)><b>&lt;"
 METHODS = ("optimal", "aepnp", "aepnp-paper")
 REASON = "too few keypoints: 3, needs 4"
 WARNING = "the stretch along z is known to 5 % only: that axis is seen end-on"

@@ -190,6 +190,7 @@ def test_a_thousand_instances_are_usable_within_two_seconds(opened: Opened, tmp_
     expect(page.locator("#gallery .found")).to_have_text("333 instances of 1,000")
 
 
+@pytest.mark.slow
 def test_ten_thousand_instances_with_assets_open_and_scroll(opened: Opened, tmp_path: Path) -> None:
     payload = payload_of(Recipe(instances=10_000, exhibits=False, categories=("chair",)))
     payload["tables"]["instances"]["exhibit"] = list(range(10_000))

@@ -125,6 +125,8 @@ def test_texts_from_data_stay_texts(opened: Opened, tmp_path: Path) -> None:
         details.evaluate("(details) => { details.open = true; }")
     page.locator("input[type=search]").fill("<img")
     expect(page.locator("#gallery .found")).to_have_text("2 instances of 48")
+    # The charts' own markup is no way in either: names are drawn letter by letter.
+    expect(page.locator("#plot-cumulative .xtitle")).to_contain_text(HOSTILE)
     page.locator("#plot-cumulative").hover()
     page.locator(".card").first.click()
     dialog = page.locator("dialog[open]")

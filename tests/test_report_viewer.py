@@ -135,6 +135,7 @@ def test_keys_walk_through_and_close(opened: Opened, plain: str) -> None:
     expect(page.locator("dialog[open] h2")).to_have_text(order[2])
     page.go_back()
     expect(page.locator("dialog[open]")).to_have_count(0)
+    expect(page.locator("#gallery")).to_be_visible()
 
 
 def test_the_scene_is_drawn_and_orbits(opened: Opened, plain: str) -> None:

@@ -303,7 +303,7 @@ export class Viewer {
   }
 
   drawSolid(exhibit, mesh, method, fresh) {
-    this.solid.hidden = !exhibit;
+    this.solid.hidden = this.layers.hidden = !exhibit;
     if (!exhibit) return;
     try {
       this.scene ??= new Scene3D(this.canvas);

@@ -143,11 +143,25 @@ class App {
     const pair = this.state?.pairs.find((one) => one.pair === this.selected);
     if (!pair?.uv) return false;
     const now = performance.now();
-    if (!(now - this.nudgedAt < PAUSE) || this.nudged !== pair.pair) this.gesture += 1;
-    [this.nudgedAt, this.nudged] = [now, pair.pair];
-    pair.uv = this.photo.clamp([pair.uv[0] + x, pair.uv[1] + y]);
+    if (!(now - this.nudgedAt < PAUSE) || this.nudged?.pair !== pair.pair) this.gesture += 1;
+    this.nudgedAt = now;
+    // Answers to earlier nudges may still be on their way: go on from where the last one led.
+    const under = this.nudged?.pair === pair.pair && this.nudged.waiting > 0;
+    const from = under ? this.nudged.uv : pair.uv;
+    this.nudged = {
+      pair: pair.pair,
+      uv: this.photo.clamp([from[0] + x, from[1] + y]),
+      waiting: (under ? this.nudged.waiting : 0) + 1,
+    };
+    const { uv } = this.nudged;
+    this.photo.dragged = { pair: pair.pair, uv };
     this.photo.invalidate();
-    this.act({ do: "move", pair: pair.pair, uv: pair.uv, gesture: this.gesture });
+    this.act({ do: "move", pair: pair.pair, uv, gesture: this.gesture }).then(() => {
+      if (this.nudged?.pair !== pair.pair) return;
+      this.nudged.waiting -= 1;
+      if (this.nudged.waiting === 0) this.photo.dragged = null;
+      this.photo.invalidate();
+    });
     return true;
   }
 

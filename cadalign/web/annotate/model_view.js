@@ -115,6 +115,7 @@ export class ModelView {
   /** Place on the page of a point of the model. */
   toPage(xyz) {
     const { left, top, width, height } = this.stage.canvas.getBoundingClientRect();
+    this.stage.camera.updateMatrixWorld(); // it may have moved since it was last drawn
     const point = new Vector3(...xyz).project(this.stage.camera);
     return { x: left + ((point.x + 1) / 2) * width, y: top + ((1 - point.y) / 2) * height };
   }

@@ -27,6 +27,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers and rend
 	$(BIN)/python -m pytest tests/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/benchmark_render.py
 ifneq ($(CADALIGN_DATA),)
+	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello
 endif
 

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import eigh
 
 from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
-from cadalign.evaluation.retrieval import RetrievalTask, observe_model
+from cadalign.evaluation.retrieval_tasks import RetrievalTask, observe_model
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.bounds import error_bound
 from cadalign.retrieval.candidates import gather_field, observe
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import rank
@@ -383,6 +385,22 @@ def test_no_pose_has_errors_below_the_bound(
     errors = pixels - seen
     cost = np.einsum("ni,nij,nj->", errors, np.linalg.inv(covariances), errors)
     assert field.bounds[0] <= cost * (1 + 1e-9) + 1e-9
+
+
+def test_the_bound_is_the_eigenvalue_over_the_largest_leverage() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        points, rays = rng.uniform(-0.3, 0.3, (9, 3)), rng.uniform(-0.2, 0.2, (9, 2))
+        seen, weights = rng.permutation(9), rng.uniform(1, 4, 9)
+        a = np.hstack([np.ones((9, 1)), points])
+        w, (u, v) = weights[seen], rays[seen].T
+        p = (a.T * w) @ a
+        p_u, p_v = (a.T * (w * u)) @ a, (a.T * (w * v)) @ a
+        s = (a.T * (w * (u**2 + v**2))) @ a
+        s -= p_u @ np.linalg.solve(p, p_u) + p_v @ np.linalg.solve(p, p_v)
+        leverage = np.einsum("ni,ij,nj->n", a, np.linalg.inv(p), a)
+        expected = eigh(s, p, eigvals_only=True)[0] / leverage.max()
+        assert error_bound(points, seen, rays, weights) == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_bound_spares_most_of_the_work() -> None:

@@ -15,16 +15,14 @@ from cadalign import Box, Library
 from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation import retrieval_report
-from cadalign.evaluation.retrieval import (
+from cadalign.evaluation.retrieval import RetrievalExperiment, run_retrieval, same_shapes
+from cadalign.evaluation.retrieval_report import summarize_retrieval, write_retrieval_report
+from cadalign.evaluation.retrieval_tasks import (
     RetrievalEvaluation,
-    RetrievalExperiment,
     RetrievalTask,
     observe_model,
     retrieval_tasks,
-    run_retrieval,
-    same_shapes,
 )
-from cadalign.evaluation.retrieval_report import summarize_retrieval, write_retrieval_report
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.tables import read_table
 from cadalign.metrics import box_iou

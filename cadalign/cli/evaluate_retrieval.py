@@ -63,7 +63,8 @@ class EvaluateRetrieval:
 
     def run(self) -> int:
         """Run the evaluation; returns the exit code."""
-        from cadalign.evaluation.retrieval import RetrievalEvaluation, run_retrieval
+        from cadalign.evaluation.retrieval import run_retrieval
+        from cadalign.evaluation.retrieval_tasks import RetrievalEvaluation
         from cadalign.evaluation.run import RunFolder
 
         options = RetrievalEvaluation(

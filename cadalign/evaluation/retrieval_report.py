@@ -161,7 +161,7 @@ def draw_curves(
         queries = sorted({summary.queries for summary in summaries})
         count = f"{queries[0]:,} to {queries[-1]:,}" if len(queries) > 1 else f"{queries[0]:,}"
         axes.set_title(f"{title}; {count} queries each", fontsize=9, color="0.35", loc="left")
-        figure.legend(loc="outside lower center", ncols=2)
+        figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
         return save_figure(figure, path)
 
 

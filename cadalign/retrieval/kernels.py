@@ -6,30 +6,25 @@ library's keypoints lie one after the other, each model's in the order of their 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
-from cadalign.solvers.linalg import cholesky, eigenvectors_4
+from cadalign.retrieval.bounds import error_bound, least_weights
+from cadalign.retrieval.jit import kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
 from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts
 from cadalign.validation import FloatArray, IntArray
 
-F = TypeVar("F", bound=Callable[..., Any])
-
 LEAST_SHARED = 4
 """Fewer keypoints than this determine no alignment."""
 _BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
 _PROBE_ITERATIONS = 4
 _GRID_ROTATIONS = 48
-_CANCELLATION = 1e-10
-_HOPELESS = 4.0  # so many times the least cost, and ...
-_HOPELESS_EXCESS = 100.0  # ... so much more of it, is not made up for after the first steps
+_HOPELESS = 2.0  # so many times the least cost, and ...
+_HOPELESS_EXCESS = 20.0  # ... so much more of it, is not made up for after the first steps
 _SAME_CHORD = 1e-3
 
 
@@ -87,17 +82,7 @@ class Candidates(NamedTuple):
     spans: IntArray
 
 
-def _kernel(function: F) -> F:
-    """Like the solvers' `kernel`, and compiled anew when this file changes."""
-    dispatcher: Any = kernel(function)
-    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if cache_file is not None:
-        own = Path(__file__).stat()
-        cache_file._source_stamp = (*cache_file._source_stamp, own.st_mtime, own.st_size)
-    return cast(F, dispatcher)
-
-
-@_kernel
+@kernel
 def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatArray, IntArray]:
     """Lower bounds of the costs (c,), gains (c,), and numbers of shared keypoints (c,)."""
     count = candidates.spans.shape[0]
@@ -107,18 +92,18 @@ def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatAr
     room = query.ids.shape[0]
     points = np.empty((room, 3))
     seen = np.empty(room, dtype=np.int64)
-    weights = _least_weights(query)
+    weights = least_weights(query.whitening, room)
     for c in range(count):
         n = _gather(query, candidates, c, points, seen)
         shared[c] = n
         for i in range(n):
             gains[c] += query.gains[seen[i]]
         if n >= _BOUNDED_FROM:
-            bounds[c] = _bound(points[:n], seen, query.rays, weights)
+            bounds[c] = error_bound(points[:n], seen, query.rays, weights)
     return bounds, gains, shared
 
 
-@_kernel
+@kernel
 def search_all(
     query: Query,
     candidates: Candidates,
@@ -153,7 +138,7 @@ def search_all(
     return poses, costs
 
 
-@_kernel
+@kernel
 def _centred_objective(
     query: Query, points: FloatArray, seen: IntArray, mean: FloatArray
 ) -> Objective:
@@ -174,7 +159,7 @@ def _centred_objective(
     )
 
 
-@_kernel
+@kernel
 def _gather(
     query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
 ) -> int:
@@ -199,96 +184,7 @@ def _gather(
     return n
 
 
-@_kernel
-def _least_weights(query: Query) -> FloatArray:
-    """How much a squared error of a ray counts at least, whatever its direction, (n,)."""
-    n = query.ids.shape[0]
-    weights = np.empty(n)
-    for i in range(n):
-        w = i if query.whitening.shape[0] > 1 else 0
-        a, b, c = query.whitening[w, 0], query.whitening[w, 1], query.whitening[w, 2]
-        trace = a * a + b * b + c * c
-        determinant = (a * c) ** 2
-        weights[i] = 0.5 * (trace - np.sqrt(max(trace * trace - 4.0 * determinant, 0.0)))
-    return weights
-
-
-@_kernel
-def _bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: FloatArray) -> float:
-    """A lower bound of the sum of squared whitened errors over all poses and stretches.
-
-    Let a_i = (1, x_i), and let a general linear camera take it to (c_x . a_i, c_y . a_i) / d_i with
-    the depth d_i = c_z . a_i; poses of stretched models are some of these cameras. With w_i the
-    weights and r_i the errors, the sum of w_i d_i^2 |r_i|^2 over all cameras with c_z' P c_z = 1,
-    where P is the sum of w_i a_i a_i', is at least the smallest eigenvalue of the 4 x 4 problem of
-    `cadalign.solvers.aepnp`. By Cauchy and Schwarz d_i^2 <= a_i' P^-1 a_i, the leverage of point
-    i. So that eigenvalue over the largest leverage bounds the sum of w_i |r_i|^2.
-    """
-    n = points.shape[0]
-    mean = np.zeros(5)
-    total = 0.0
-    for i in range(n):
-        w = weights[seen[i]]
-        total += w
-        for j in range(3):
-            mean[j] += w * points[i, j]
-        for j in range(2):
-            mean[3 + j] += w * rays[seen[i], j]
-    mean /= total
-    p = np.zeros((4, 4))
-    a = np.empty((n, 4))
-    for i in range(n):
-        a[i, 0] = 1.0
-        for j in range(3):
-            a[i, 1 + j] = points[i, j] - mean[j]
-        w = weights[seen[i]]
-        for j in range(4):
-            for k in range(j + 1):
-                p[j, k] += w * a[i, j] * a[i, k]
-    if not cholesky(p, 4, _CANCELLATION):
-        return 0.0
-    system = np.zeros((4, 4))
-    u_matrix = np.zeros((4, 4))
-    v_matrix = np.zeros((4, 4))
-    leverage = 0.0
-    white = np.empty(4)
-    for i in range(n):  # in the basis that whitens a, P is the identity
-        square = 0.0
-        for j in range(4):
-            value = a[i, j]
-            for k in range(j):
-                value -= p[j, k] * white[k]
-            white[j] = value / p[j, j]
-            square += white[j] * white[j]
-        leverage = max(leverage, square)
-        w = weights[seen[i]]
-        u = rays[seen[i], 0] - mean[3]
-        v = rays[seen[i], 1] - mean[4]
-        for j in range(4):
-            for k in range(j, 4):
-                product = w * white[j] * white[k]
-                u_matrix[j, k] += u * product
-                v_matrix[j, k] += v * product
-                system[j, k] += (u * u + v * v) * product
-    for j in range(4):
-        for k in range(j):
-            u_matrix[j, k] = u_matrix[k, j]
-            v_matrix[j, k] = v_matrix[k, j]
-    largest = 0.0
-    for j in range(4):
-        largest = max(largest, system[j, j])
-        for k in range(j, 4):
-            for m in range(4):
-                system[j, k] -= u_matrix[j, m] * u_matrix[m, k] + v_matrix[j, m] * v_matrix[m, k]
-            system[k, j] = system[j, k]
-    eigenvectors_4(system, np.empty((4, 4)))
-    least = system[0, 0]
-    for j in range(1, 4):
-        least = min(least, system[j, j])
-    return float(max(0.0, (least - 1e-12 * largest) / leverage))
-
-
-@_kernel
+@kernel
 def _search(
     objective: Objective,
     max_stretch: float,
@@ -324,7 +220,7 @@ def _search(
     return least
 
 
-@_kernel
+@kernel
 def _within_limits(
     objective: Objective, max_stretch: float, iterations: int, pose: FloatArray, cost: float
 ) -> float:
@@ -353,7 +249,7 @@ def _within_limits(
     return cost
 
 
-@_kernel
+@kernel
 def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
     """Write where a refinement may start; returns how many."""
     points, rays, free = objective.points, objective.rays, objective.free
@@ -371,7 +267,7 @@ def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
     return count
 
 
-@_kernel
+@kernel
 def _probe(objective: Objective, starts: FloatArray, probed: FloatArray) -> FloatArray:
     """Take a few steps from each of the best starts; their costs, infinite where there are none."""
     scores = np.empty(starts.shape[0])

@@ -40,6 +40,7 @@ class Library:
     Examples
     --------
     >>> import cadalign
+    >>> import numpy as np
     >>> rng = np.random.default_rng(0)
     >>> models = [
     ...     LibraryModel("box", f"{number}", rng.uniform(-0.3, 0.3, (9, 3)), np.arange(9),

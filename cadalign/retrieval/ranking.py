@@ -4,7 +4,7 @@ A candidate's log-likelihood is at most what a lower bound of its errors leaves 
 (`kernels.bound_all`). In the order of these limits candidates are searched in growing batches,
 until the limits of all others lie 20 below the best log-likelihood found. So every match that has
 a score of more than 1e-8 is where it would be if all candidates had been searched. If these are
-fewer than the top list holds, up to 1,024 more candidates are searched to fill it, so that in a
+fewer than the top list holds, up to 768 more candidates are searched to fill it, so that in a
 library of that size the whole list is exact.
 
 Each candidate is searched by itself, in the same way: nothing depends on the order of the library
@@ -39,7 +39,7 @@ _PIECE = 32  # candidates that a thread gets at a time
 # probability.
 _NEGLIGIBLE = 20.0
 # How many candidates are searched at most to fill the rest of the top list.
-_TO_FILL = 1024
+_TO_FILL = 768
 _FILL_BATCH = 256
 _GUESS = 3.0  # errors are some 6 times their bound
 # 4-subsets for the minimal solver, refined starts, iterations. 1 to 3 % of all candidates miss

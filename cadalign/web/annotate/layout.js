@@ -1,5 +1,5 @@
 // The page around the views: bar, messages, help.
-import { button, element } from "./dom.js";
+import { button, h } from "../common/dom.js";
 
 const KEYS = [
   ["Click, then click", "the photo and the model at the same place, in either order: a pair"],
@@ -22,37 +22,37 @@ const KEYS = [
 export class Layout {
   /** @param {object} handlers - undo, redo, previous, next */
   constructor(handlers, panel) {
-    this.title = element("h1");
-    this.place = element("span", { className: "soft" });
-    this.saved = element("span", { className: "saved", role: "status" });
+    this.title = h("h1");
+    this.place = h("span", { class: "soft" });
+    this.saved = h("span", { class: "saved", role: "status" });
     this.previous = button("‹ Previous", handlers.previous, { title: "Page up" });
     this.next = button("Next ›", handlers.next, { title: "Page down" });
     this.undo = button("Undo", handlers.undo, { title: "Ctrl+Z" });
     this.redo = button("Redo", handlers.redo, { title: "Ctrl+Y" });
-    this.photos = element("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next);
+    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next);
     this.help = helpDialog();
-    this.message = element("p", { className: "message", role: "alert", hidden: true });
-    this.photo = element("div", { className: "host" });
-    this.model = element("div", { className: "host" });
-    this.shown = element("span", { className: "soft" });
+    this.message = h("p", { class: "message", role: "alert", hidden: true });
+    this.photo = h("div", { class: "host" });
+    this.model = h("div", { class: "host" });
+    this.shown = h("span", { class: "soft" });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
     document.body.append(
-      element(
+      h(
         "header",
         {},
         this.title,
         this.photos,
         this.saved,
-        element(
+        h(
           "div",
-          { className: "tools" },
+          { class: "tools" },
           this.undo,
           this.redo,
           button("Help", () => this.help.showModal(), { title: "?", "aria-haspopup": "dialog" }),
         ),
       ),
       this.message,
-      element(
+      h(
         "main",
         {},
         view("Photo", this.photo, handlers.photo),
@@ -93,24 +93,24 @@ function savedText({ path, at, trouble }) {
 }
 
 function view(name, host, { zoom, fit }, ...extra) {
-  const tools = element(
+  const tools = h(
     "div",
-    { className: "zoom", role: "group", "aria-label": `Zoom of the ${name.toLowerCase()}` },
+    { class: "zoom", role: "group", "aria-label": `Zoom of the ${name.toLowerCase()}` },
     extra,
     button("−", () => zoom(1 / 1.4), { "aria-label": "Zoom out" }),
     button("+", () => zoom(1.4), { "aria-label": "Zoom in" }),
     button("Fit", fit, { "aria-label": `Show the whole ${name.toLowerCase()}` }),
   );
-  return element("section", { className: "view", "aria-label": name }, element("h2", {}, name), tools, host);
+  return h("section", { class: "view", "aria-label": name }, h("h2", {}, name), tools, host);
 }
 
 function helpDialog() {
-  const rows = KEYS.map(([key, text]) => element("div", {}, element("dt", {}, key), element("dd", {}, text)));
-  const dialog = element("dialog", { "aria-labelledby": "help-title" });
+  const rows = KEYS.map(([key, text]) => h("div", {}, h("dt", {}, key), h("dd", {}, text)));
+  const dialog = h("dialog", { "aria-labelledby": "help-title" });
   dialog.append(
-    element("h2", { id: "help-title" }, "Keys and mouse"),
-    element("dl", {}, rows),
-    element(
+    h("h2", { id: "help-title" }, "Keys and mouse"),
+    h("dl", {}, rows),
+    h(
       "p",
       {},
       "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Every change is saved at once.",

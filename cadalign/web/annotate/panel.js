@@ -1,20 +1,20 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
-import { button, element } from "./dom.js";
+import { button, h } from "../common/dom.js";
 
 export class Panel {
   /** @param {object} handlers - act(action), select(pair), suggested() */
   constructor(handlers) {
     this.handlers = handlers;
-    this.alignment = element("div", { className: "alignment" });
+    this.alignment = h("div", { class: "alignment" });
     this.focal = this.makeFocal();
-    this.advice = element("div", { className: "advice" });
-    this.keypoints = element("ul", { className: "keypoints" });
-    this.keypointsTitle = element("summary");
-    this.details = element("details", {}, this.keypointsTitle, this.keypoints);
-    this.rows = element("tbody");
-    this.root = element(
+    this.advice = h("div", { class: "advice" });
+    this.keypoints = h("ul", { class: "keypoints" });
+    this.keypointsTitle = h("summary");
+    this.details = h("details", {}, this.keypointsTitle, this.keypoints);
+    this.rows = h("tbody");
+    this.root = h(
       "section",
-      { className: "panel", "aria-label": "Results" },
+      { class: "panel", "aria-label": "Results" },
       card("Alignment", this.alignment, this.focal),
       card("Next keypoint", this.advice, this.details),
       card("Pairs", this.makeTable()),
@@ -32,38 +32,38 @@ export class Panel {
 
   showAlignment(alignment) {
     if (alignment.status !== "done") {
-      this.alignment.replaceChildren(element("p", { className: "soft" }, alignment.message));
+      this.alignment.replaceChildren(h("p", { class: "soft" }, alignment.message));
       return;
     }
     const facts = alignment.facts.map(({ label, value, note }) =>
-      element(
+      h(
         "div",
         {},
-        element("dt", {}, label),
-        element("dd", {}, element("strong", {}, value), note ? element("span", {}, note) : null),
+        h("dt", {}, label),
+        h("dd", {}, h("strong", {}, value), note ? h("span", {}, note) : null),
       ),
     );
-    const notes = alignment.notes.map((note) => element("li", {}, note));
+    const notes = alignment.notes.map((note) => h("li", {}, note));
     this.alignment.replaceChildren(
-      element("dl", { className: "facts" }, facts),
-      notes.length ? element("ul", { className: "notes" }, notes) : "",
+      h("dl", { class: "facts" }, facts),
+      notes.length ? h("ul", { class: "notes" }, notes) : "",
     );
   }
 
   makeFocal() {
     const choose = () => this.chooseFocal();
-    this.estimate = element("input", { type: "radio", name: "focal", id: "focal-estimate", onchange: choose });
-    this.known = element("input", { type: "radio", name: "focal", id: "focal-known", onchange: choose });
-    this.pixels = element("input", {
+    this.estimate = h("input", { type: "radio", name: "focal", id: "focal-estimate", onchange: choose });
+    this.known = h("input", { type: "radio", name: "focal", id: "focal-known", onchange: choose });
+    this.pixels = h("input", {
       type: "number", min: "1", step: "any", inputMode: "decimal", "aria-label": "Focal length in pixels", onchange: choose,
     });
-    this.note = element("p", { className: "soft" });
-    return element(
+    this.note = h("p", { class: "soft" });
+    return h(
       "fieldset",
-      { className: "focal" },
-      element("legend", {}, "Focal length"),
-      element("label", {}, this.estimate, " unknown: estimate it"),
-      element("label", {}, this.known, " known: ", this.pixels, " px"),
+      { class: "focal" },
+      h("legend", {}, "Focal length"),
+      h("label", {}, this.estimate, " unknown: estimate it"),
+      h("label", {}, this.known, " known: ", this.pixels, " px"),
       this.note,
     );
   }
@@ -92,14 +92,14 @@ export class Panel {
         alignment.status === "done"
           ? "No other visible point would help."
           : "Mark the same place in the photo and on the model; either comes first. Four pairs give the first alignment.";
-      this.advice.replaceChildren(element("p", { className: "soft" }, text));
+      this.advice.replaceChildren(h("p", { class: "soft" }, text));
       return;
     }
     this.advice.replaceChildren(
-      element("p", {}, suggestion.text),
-      element(
+      h("p", {}, suggestion.text),
+      h(
         "p",
-        { className: "soft" },
+        { class: "soft" },
         "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
       ),
       button("Use this model point", this.handlers.suggested, { title: "N" }),
@@ -112,18 +112,18 @@ export class Panel {
     this.keypointsTitle.textContent = `Keypoints of the model not yet marked (${free.length})`;
     this.keypoints.replaceChildren(
       ...free.map(({ keypoint, name }) =>
-        element("li", {}, button(name, () => this.handlers.act({ do: "place_keypoint", keypoint }))),
+        h("li", {}, button(name, () => this.handlers.act({ do: "place_keypoint", keypoint }))),
       ),
     );
   }
 
   makeTable() {
     const head = ["Pair", "Name", "Photo", "Off by", ""].map((text) =>
-      element("th", { scope: "col" }, text || element("span", { className: "visually-hidden" }, "Actions")),
+      h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions")),
     );
-    this.empty = element("p", { className: "soft" }, "No pairs yet.");
-    this.table = element("table", {}, element("thead", {}, element("tr", {}, head)), this.rows);
-    return element("div", { className: "scroll" }, this.empty, this.table);
+    this.empty = h("p", { class: "soft" }, "No pairs yet.");
+    this.table = h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows);
+    return h("div", { class: "scroll" }, this.empty, this.table);
   }
 
   showPairs(pairs, selected) {
@@ -137,21 +137,21 @@ export class Panel {
   row(pair, selected) {
     const { act, select } = this.handlers;
     const number = button(String(pair.position), () => select(pair.pair), {
-      className: pair.off === null ? "badge" : "badge wrong",
+      class: pair.off === null ? "badge" : "badge wrong",
       "aria-pressed": String(selected),
       "aria-label": `Select pair ${pair.position}`,
       "data-key": `select ${pair.pair}`,
     });
-    const row = element(
+    const row = h(
       "tr",
-      { className: selected ? "selected" : "", onclick: (event) => event.target.closest("button, input") || select(pair.pair) },
-      element("td", {}, number),
-      element("td", { className: "name" }, this.name(pair)),
-      element("td", { className: "number place" }, pair.uv ? pair.uv.map((value) => value.toFixed(1)).join(", ") : element("em", {}, "click the photo")),
-      element("td", { className: "number" }, pair.residual ? `${Math.hypot(...pair.residual).toFixed(1)} px` : "–"),
-      element(
+      { class: selected ? "selected" : "", onclick: (event) => event.target.closest("button, input") || select(pair.pair) },
+      h("td", {}, number),
+      h("td", { class: "name" }, this.name(pair)),
+      h("td", { class: "number place" }, pair.uv ? pair.uv.map((value) => value.toFixed(1)).join(", ") : h("em", {}, "click the photo")),
+      h("td", { class: "number" }, pair.residual ? `${Math.hypot(...pair.residual).toFixed(1)} px` : "–"),
+      h(
         "td",
-        { className: "actions" },
+        { class: "actions" },
         pair.keypoint !== null && pair.uv
           ? button("Repick", () => act({ do: "release", pair: pair.pair }, pair.pair), {
               "aria-label": `Choose another model point for pair ${pair.position}`,
@@ -168,11 +168,11 @@ export class Panel {
   }
 
   name(pair) {
-    if (pair.keypoint === null) return element("em", {}, "click the model");
-    return element("input", {
+    if (pair.keypoint === null) return h("em", {}, "click the model");
+    return h("input", {
       value: pair.name,
       maxLength: 80,
-      spellcheck: false,
+      spellcheck: "false",
       "aria-label": `Name of pair ${pair.position}`,
       "data-key": `name ${pair.pair}`,
       onchange: (event) => this.handlers.act({ do: "rename", pair: pair.pair, name: event.target.value }),
@@ -182,15 +182,15 @@ export class Panel {
 
 function wrong(pair) {
   const text = `Pair ${pair.position} contradicts the others: ${pair.off.toFixed(0)} px off`;
-  return element("tr", { className: "wrong" }, element("td", { colSpan: 5 }, text));
+  return h("tr", { class: "wrong" }, h("td", { colSpan: 5 }, text));
 }
 
 function card(title, ...content) {
   const id = `card-${title.toLowerCase().replaceAll(" ", "-")}`;
-  return element(
+  return h(
     "section",
-    { className: "card", "aria-labelledby": id },
-    element("h2", { id }, title),
+    { class: "card", "aria-labelledby": id },
+    h("h2", { id }, title),
     content,
   );
 }

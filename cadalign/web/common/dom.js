@@ -36,3 +36,8 @@ export function debounced(action, wait) {
     timer = setTimeout(() => action(...given), wait);
   };
 }
+
+/** A button. */
+export function button(text, onclick, attributes = {}) {
+  return h("button", { type: "button", onclick, ...attributes }, text);
+}

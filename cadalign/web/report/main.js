@@ -1,5 +1,8 @@
 import "../common/theme.css";
 import "./page.css";
+import "./results.css";
+import "./forms.css";
+import "./narrow.css";
 import "./gallery.css";
 import "./viewer.css";
 import "./print.css";

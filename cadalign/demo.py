@@ -10,12 +10,12 @@ from pathlib import Path
 from cadalign import __version__
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError
-from cadalign.evaluation.files import write_json, write_text
 from cadalign.evaluation.keypoint_tasks import KeypointTask
 from cadalign.evaluation.keypointnet import KeypointNetExperiment, Trial
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.tables import write_rows
+from cadalign.files import write_json, write_text
 
 METHOD = "optimal"
 """What the demonstration aligns with."""

@@ -20,8 +20,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from cadalign import files
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.evaluation import files
 from cadalign.evaluation.parallel import KILLED_REASON, InProcess, LocalProcesses
 from cadalign.evaluation.run import Progress, RunFolder, execute, workers_of
 from cadalign.evaluation.tables import ROW_GROUP, read_table, write_tables

@@ -21,7 +21,7 @@ from cadalign.camera import Camera
 from cadalign.datasets.annotations import parse_entry, read_entries
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError
-from cadalign.evaluation.files import write_json, write_whole
+from cadalign.files import write_json, write_whole
 from cadalign.json_file import as_index, as_numbers, as_object, read_json, refuse_unknown
 from cadalign.mesh import Mesh
 from cadalign.observation import Observation

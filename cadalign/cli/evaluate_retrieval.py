@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cadalign.cli.output import new_console
+from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
@@ -88,7 +89,9 @@ class EvaluateRetrieval:
                 dask=self.dask,
                 on_progress=on_progress,
             )
-        return conclude_retrieval(folder, json=self.json)
+        code = conclude_retrieval(folder, json=self.json)
+        write_run_report(folder)
+        return code
 
 
 def conclude_retrieval(folder: RunFolder, *, json: bool) -> int:

@@ -57,7 +57,7 @@ class Report:
         if self.out is None:
             sys.stdout.write(text)
         else:
-            from cadalign.evaluation.files import write_text
+            from cadalign.files import write_text
 
             write_text(self.out, text)
         return 0

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.evaluation.files import write_text, writing
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.style import (
@@ -24,6 +23,7 @@ from cadalign.evaluation.style import (
     save_figure,
 )
 from cadalign.evaluation.tables import read_table
+from cadalign.files import write_text, writing
 from cadalign.validation import FloatArray
 
 if TYPE_CHECKING:

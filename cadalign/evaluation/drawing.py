@@ -14,10 +14,10 @@ from cadalign.box import Box
 from cadalign.camera import Camera
 from cadalign.errors import RenderError
 from cadalign.evaluation.exhibit import exhibit_stem
-from cadalign.evaluation.files import write_whole
 from cadalign.evaluation.instance import Instance
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.sketch import write_sketch
+from cadalign.files import write_whole
 from cadalign.picture import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.color import ByteImage

@@ -34,10 +34,10 @@ import numpy as np
 from cadalign.alignment import Alignment
 from cadalign.deviation import Deviation
 from cadalign.errors import CadalignError
-from cadalign.evaluation.files import dense_json
 from cadalign.evaluation.instance import Instance
 from cadalign.evaluation.outcome import OK, Outcome
 from cadalign.evaluation.work import Columns, Row
+from cadalign.files import dense_json
 from cadalign.result import Alternative, FitResult
 from cadalign.validation import FloatArray
 

@@ -10,7 +10,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from cadalign.errors import DataError
-from cadalign.evaluation.files import write_text, writing
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.style import (
@@ -28,6 +27,7 @@ from cadalign.evaluation.summary import (
     summarize_cells,
     summary_csv,
 )
+from cadalign.files import write_text, writing
 from cadalign.validation import FloatArray
 
 _BAR_METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.evaluation.files import write_text, writing
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.retrieval_outcome import LEAVE_IN, LEAVE_OUT, NO_VIEW
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.style import look_of, new_figure, save_figure
 from cadalign.evaluation.tables import read_table
+from cadalign.files import write_text, writing
 
 ALL = "all"
 """What the summary over all categories is called."""

@@ -39,10 +39,10 @@ from typing import Any, TypeVar
 
 from cadalign import __version__
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.files import write_json, writing
 from cadalign.evaluation.parallel import Chunk, InProcess, LocalProcesses, Workers
 from cadalign.evaluation.tables import read_table, write_rows, write_tables
 from cadalign.evaluation.work import Columns, Exhibiting, Experiment
+from cadalign.files import write_json, writing
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.evaluation.files import dense_json, write_text
+from cadalign.files import dense_json, write_text
 from cadalign.mesh import Mesh
 from cadalign.validation import FloatArray, IntArray
 

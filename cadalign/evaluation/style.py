@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.evaluation.files import write_whole
 from cadalign.evaluation.methods import LIMIT, method_names
+from cadalign.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.evaluation.files import write_text, writing
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.run import RunFolder
 from cadalign.evaluation.style import (
@@ -23,6 +22,7 @@ from cadalign.evaluation.style import (
 )
 from cadalign.evaluation.sweep import SWEEP_METRICS, SweepKind
 from cadalign.evaluation.tables import read_table
+from cadalign.files import write_text, writing
 from cadalign.validation import FloatArray
 
 if TYPE_CHECKING:

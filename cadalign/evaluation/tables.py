@@ -9,8 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cadalign.errors import DataError
-from cadalign.evaluation.files import write_whole
 from cadalign.evaluation.work import Columns, Row
+from cadalign.files import write_whole
 
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 16

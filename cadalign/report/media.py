@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from cadalign.errors import DataError
 from cadalign.evaluation.exhibit import exhibit_stem
-from cadalign.evaluation.files import dense_json, write_text, write_whole, writing
+from cadalign.files import dense_json, write_text, write_whole, writing
 from cadalign.report.instances import InstanceName, InstanceTable
 from cadalign.report.runs import Run
 

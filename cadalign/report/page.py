@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.files import dense_json, write_text, writing
+from cadalign.files import dense_json, write_text, writing
 from cadalign.report.headline import headline_of
 from cadalign.report.instances import instance_table
 from cadalign.report.media import INLINE_LIMIT, Shelf, inline_bytes

@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError
-from cadalign.evaluation.files import write_json, write_text
+from cadalign.files import write_json, write_text
 from cadalign.picture import write_image
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.color import ByteImage

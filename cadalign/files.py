@@ -1,4 +1,4 @@
-"""Files of a run: written whole or not at all, and errors that say what to do."""
+"""Files written whole or not at all, and errors that say what to do."""
 
 from __future__ import annotations
 
@@ -79,5 +79,5 @@ def writing(path: Path) -> Iterator[None]:
         raise DataError(
             f"cannot be written ({error.strerror or error})",
             where=str(path),
-            fix="make room or choose another folder; started again, the same run goes on",
+            fix="make room or choose another folder; what was written before is kept",
         ) from None

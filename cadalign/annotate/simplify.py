@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cadalign.clustering import merge_vertices
 from cadalign.mesh import Mesh
 from cadalign.validation import FloatArray, IntArray
 
@@ -35,9 +36,8 @@ class Simplified:
 def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
     """Make a mesh of at most so many triangles; unchanged if it has no more.
 
-    Vertices in the same cell of a grid are replaced by their mean (Rossignac, Borrel,
-    "Multi-resolution 3D approximations for rendering complex scenes", 1993); the grid is made
-    coarser or finer until about as many triangles are left as may be.
+    Vertices in the same cell of a grid become one; the grid is made coarser or finer until about as
+    many triangles are left as may be.
 
     Parameters
     ----------
@@ -74,10 +74,7 @@ def _clustered(mesh: Mesh, cells: float) -> Simplified:
     size = float((high - low).max()) or 1.0
     # Vertices that no face uses may lie anywhere.
     place = np.clip((mesh.vertices - low) / size, 0, 1) * cells
-    keys = place.astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
-    _, cluster, count = np.unique(keys, return_inverse=True, return_counts=True)
-    sums = [np.bincount(cluster, weights=axis, minlength=len(count)) for axis in mesh.vertices.T]
-    vertices = np.stack(sums, axis=1) / count[:, None]
+    vertices, cluster = merge_vertices(mesh.vertices, place.astype(np.int64))
     faces = cluster[mesh.faces]
     a, b, c = faces.T
     kept = np.flatnonzero((a != b) & (b != c) & (c != a))

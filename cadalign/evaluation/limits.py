@@ -88,10 +88,12 @@ def sample_limit(
     -------
     dict
         ``rotation_error_deg``, ``translation_error``, ``scale_y_error``, ``scale_z_error``, each
-        (draws,) float, in the units of `cadalign.metrics`.
+        (draws,) float, in the units of `cadalign.metrics`; ``focal_error``, relative, if the bound
+        is that of an unknown focal length.
     """
-    errors = rng.multivariate_normal(np.zeros(UNKNOWNS), bound, size=draws, method="eigh")
-    return {
+    errors = rng.multivariate_normal(np.zeros(len(bound)), bound, size=draws, method="eigh")
+    focal = {"focal_error": np.abs(np.expm1(errors[:, 8]))} if len(bound) > UNKNOWNS else {}
+    return focal | {
         "rotation_error_deg": np.degrees(np.linalg.norm(errors[:, :3], axis=1)),
         "translation_error": np.linalg.norm(errors[:, 3:6], axis=1),
         "scale_y_error": np.abs(np.expm1(errors[:, 6])),

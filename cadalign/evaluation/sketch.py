@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.clustering import merge_vertices
 from cadalign.files import dense_json, write_text
 from cadalign.mesh import Mesh
 from cadalign.validation import FloatArray, IntArray
@@ -111,11 +111,7 @@ def _merged(
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
     places = np.floor((vertices - low) * (cells / max(size, 1e-300)) + 0.5).astype(np.int64)
-    span = int(cells) + 2
-    keys = (places[:, 0] * span + places[:, 1]) * span + places[:, 2]
-    _, cell, count = np.unique(keys, return_inverse=True, return_counts=True)
-    mean = partial(np.bincount, cell)
-    centers = np.stack([mean(weights=column) / count for column in vertices.T], axis=1)
+    centers, cell = merge_vertices(vertices, places)
     faces = cell[faces]
     ordered = np.sort(faces, axis=1)
     solid = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.files import dense_json, write_text, writing
-from cadalign.report.headline import headline_of
+from cadalign.report.headlines import headline_of
 from cadalign.report.instances import instance_table
 from cadalign.report.media import INLINE_LIMIT, Shelf, inline_bytes
 from cadalign.report.payload import all_methods, payload_of

@@ -8,7 +8,7 @@ from typing import Any
 from cadalign.evaluation.correspondences_report import ERRORS, TIME, Quartiles
 from cadalign.evaluation.sweep import SWEEP_METRICS
 from cadalign.evaluation.sweep_report import TIME_METRIC, VALUE_LABELS
-from cadalign.report.headline import correspondence_summaries, sweep_kind, sweep_summaries
+from cadalign.report.headlines import correspondence_summaries, sweep_kind, sweep_summaries
 from cadalign.report.instances import compact
 from cadalign.report.retrieval import retrieval_plots
 from cadalign.report.runs import CORRESPONDENCES, RETRIEVAL, SIMULATION, Run

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from cadalign.errors import InputError
 from cadalign.evaluation.style import look_of
-from cadalign.report.headline import Column, Headline, HeadlineRow, headline_of
+from cadalign.report.headline import Column, Headline, HeadlineRow
+from cadalign.report.headlines import headline_of
 from cadalign.report.runs import read_runs
 
 FORMATS = ("md", "csv", "latex")

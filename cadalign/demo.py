@@ -13,7 +13,7 @@ from cadalign.errors import DataError
 from cadalign.evaluation.keypoint_tasks import KeypointTask
 from cadalign.evaluation.keypointnet import KeypointNetExperiment, Trial
 from cadalign.evaluation.outcome import Outcome
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import write_rows
 from cadalign.files import write_json, write_text
 

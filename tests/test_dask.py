@@ -13,7 +13,8 @@ import pytest
 from cadalign.errors import DataError
 from cadalign.evaluation.api import run_sweep, simulate, sweep_of
 from cadalign.evaluation.cluster import DaskWorkers
-from cadalign.evaluation.run import Progress, RunFolder
+from cadalign.evaluation.run import Progress
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.sweep import SweepExperiment
 
 distributed = pytest.importorskip(

@@ -35,7 +35,7 @@ from cadalign.evaluation.correspondences_report import (
     write_correspondences_report,
 )
 from cadalign.evaluation.methods import fit_with
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import read_table
 from cadalign.result import FitResult
 from cadalign.robust import RansacOptions

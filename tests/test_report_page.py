@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, expect
 from report_payloads import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
 from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.report import write_report
 from cadalign.web import asset
 

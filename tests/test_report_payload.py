@@ -25,7 +25,7 @@ from cadalign.evaluation.keypoint_tasks import KeypointTasks
 from cadalign.evaluation.keypointnet import KeypointNetExperiment
 from cadalign.evaluation.methods import fit_with
 from cadalign.evaluation.retrieval import RetrievalEvaluation, run_retrieval
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import read_table
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.report import media, write_report

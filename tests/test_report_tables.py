@@ -13,7 +13,7 @@ import pytest
 from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run_sweep, sweep_of
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.report import FORMATS, headline_text
 from cadalign.report.headline import Column, Headline, HeadlineRow
 from cadalign.report.tables import table_text

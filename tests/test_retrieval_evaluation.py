@@ -23,7 +23,7 @@ from cadalign.evaluation.retrieval_tasks import (
     observe_model,
     retrieval_tasks,
 )
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import read_table
 from cadalign.metrics import box_iou
 from cadalign.retrieval import LibraryModel

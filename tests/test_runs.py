@@ -23,7 +23,8 @@ import pytest
 from cadalign import files
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.parallel import KILLED_REASON, InProcess, LocalProcesses
-from cadalign.evaluation.run import Progress, RunFolder, execute, workers_of
+from cadalign.evaluation.run import Progress, execute, workers_of
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import ROW_GROUP, read_table, write_tables
 from cadalign.evaluation.work import AbortError, Columns, Result, evaluate_chunk
 

@@ -16,7 +16,7 @@ from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.run import RunFolder
+    from cadalign.evaluation.run_folder import RunFolder
     from cadalign.evaluation.summary import CategorySummary
 
 
@@ -70,7 +70,7 @@ class EvaluateKeypointNet:
         """Run the evaluation; returns the exit code."""
         from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet
         from cadalign.evaluation.keypointnet_report import write_keypointnet_report
-        from cadalign.evaluation.run import RunFolder
+        from cadalign.evaluation.run_folder import RunFolder
 
         options = KeypointNetOptions(
             categories=self.categories,
@@ -112,7 +112,7 @@ class EvaluateShow:
         """Show the run; returns the exit code, that of the run."""
         from cadalign.errors import DataError
         from cadalign.evaluation.keypointnet_report import write_keypointnet_report
-        from cadalign.evaluation.run import RunFolder
+        from cadalign.evaluation.run_folder import RunFolder
 
         folder = RunFolder(self.run_folder)
         config = folder.read_config()

@@ -15,7 +15,7 @@ from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
     from cadalign.evaluation.correspondences_report import CorrespondenceSummary, Quartiles
-    from cadalign.evaluation.run import RunFolder
+    from cadalign.evaluation.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class EvaluateCorrespondences:
         """Run the evaluation; returns the exit code."""
         from cadalign.evaluation.correspondences import CorrespondenceOptions, run_correspondences
         from cadalign.evaluation.correspondences_report import write_correspondences_report
-        from cadalign.evaluation.run import RunFolder
+        from cadalign.evaluation.run_folder import RunFolder
 
         options = CorrespondenceOptions(
             outliers=self.outliers,

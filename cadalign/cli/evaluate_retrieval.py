@@ -15,7 +15,7 @@ from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
     from cadalign.evaluation.retrieval_report import RetrievalSummary
-    from cadalign.evaluation.run import RunFolder
+    from cadalign.evaluation.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class EvaluateRetrieval:
         """Run the evaluation; returns the exit code."""
         from cadalign.evaluation.retrieval import run_retrieval
         from cadalign.evaluation.retrieval_tasks import RetrievalEvaluation
-        from cadalign.evaluation.run import RunFolder
+        from cadalign.evaluation.run_folder import RunFolder
 
         options = RetrievalEvaluation(
             categories=self.categories,

@@ -13,7 +13,7 @@ from cadalign.cli.output import new_console
 from cadalign.errors import InputError
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.run import RunFolder
+    from cadalign.evaluation.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class _Sweep:
     def run(self) -> int:
         """Run the simulation; returns the exit code."""
         from cadalign.evaluation.api import run_sweep, sweep_of
-        from cadalign.evaluation.run import RunFolder
+        from cadalign.evaluation.run_folder import RunFolder
         from cadalign.evaluation.sweep_report import write_sweep_report
 
         kind = sweep_of(

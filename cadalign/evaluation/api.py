@@ -14,7 +14,8 @@ from cadalign.errors import InputError
 from cadalign.evaluation.keypoint_tasks import AUTO, VISIBILITIES, KeypointTasks
 from cadalign.evaluation.keypointnet import KeypointNetExperiment
 from cadalign.evaluation.methods import LIMIT, check_methods
-from cadalign.evaluation.run import Progress, RunFolder, execute, workers_of
+from cadalign.evaluation.run import Progress, execute, workers_of
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.sweep import (
     SWEEPS,
     SweepExperiment,

@@ -23,7 +23,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.correspondence_outcome import CorrespondenceOutcome
 from cadalign.evaluation.methods import LIMIT, check_methods, fit_with
 from cadalign.evaluation.outcome import FAILED
-from cadalign.evaluation.run import Progress, RunFolder, execute, workers_of
+from cadalign.evaluation.run import Progress, execute, workers_of
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.work import Columns, Result, reason_of
 from cadalign.robust import RansacOptions
 from cadalign.seeding import instance_rng

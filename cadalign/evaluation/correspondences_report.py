@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.evaluation.outcome import OK
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.style import (
     METRIC_LABELS,
     PERCENT_METRICS,

@@ -15,7 +15,7 @@ from cadalign.camera import Camera
 from cadalign.errors import RenderError
 from cadalign.evaluation.exhibit import exhibit_stem
 from cadalign.evaluation.instance import Instance
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.sketch import write_sketch
 from cadalign.files import write_whole
 from cadalign.picture import write_image

@@ -18,7 +18,7 @@ from cadalign.evaluation.keypoint_tasks import KeypointTask
 from cadalign.evaluation.limits import limit_estimate
 from cadalign.evaluation.methods import LIMIT, fit_batch_with, fit_with, has_statistics
 from cadalign.evaluation.outcome import Outcome
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.symmetry import SymmetryGroup
 from cadalign.evaluation.work import AbortError, Columns, Result, Row, reason_of
 from cadalign.validation import FloatArray

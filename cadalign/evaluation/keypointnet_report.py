@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from cadalign.errors import DataError
 from cadalign.evaluation.outcome import OK
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.style import (
     METRIC_LABELS,
     PERCENT_METRICS,

@@ -12,7 +12,8 @@ from pathlib import Path
 from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet, run_sweep, sweep_of
 from cadalign.evaluation.keypointnet_report import write_keypointnet_report
 from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.run import Progress, RunFolder
+from cadalign.evaluation.run import Progress
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.summary import ALL, CategorySummary
 from cadalign.evaluation.sweep import SWEEPS
 from cadalign.evaluation.sweep_report import write_sweep_report

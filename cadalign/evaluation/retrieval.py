@@ -35,7 +35,8 @@ from cadalign.evaluation.retrieval_tasks import (
     observe_model,
     retrieval_tasks,
 )
-from cadalign.evaluation.run import Progress, RunFolder, execute, workers_of
+from cadalign.evaluation.run import Progress, execute, workers_of
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.work import Columns, Result, reason_of
 from cadalign.retrieval.library import Library
 from cadalign.retrieval.models import LibraryModel, ModelKey

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.retrieval_outcome import LEAVE_IN, LEAVE_OUT, NO_VIEW
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.style import look_of, new_figure, save_figure
 from cadalign.evaluation.tables import read_table
 from cadalign.files import write_text, writing

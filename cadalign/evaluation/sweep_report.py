@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.evaluation.outcome import OK
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.style import (
     METRIC_LABELS,
     PERCENT_METRICS,

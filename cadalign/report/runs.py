@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.run import RunFolder
+from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import read_table
 
 INSTANCES = "instances"

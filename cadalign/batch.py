@@ -111,11 +111,12 @@ class BatchResult:
         )
 
     @classmethod
-    def of_fits(cls, problems: Problems, fits: Sequence[FitResult | CadalignError]) -> BatchResult:
+    def of_fits(
+        cls, problems: Problems, fits: Sequence[FitResult | CadalignError], *, focal: str
+    ) -> BatchResult:
         """Arrange single results, or the errors in their place."""
         count, total = len(problems), len(problems.points_3d)
-        found = [fit for fit in fits if isinstance(fit, FitResult)]
-        unknowns = 9 if any(fit.focal == "estimate" for fit in found) else 8
+        unknowns = 9 if focal == "estimate" else 8
         batch = cls(
             rotation=np.full((count, 3, 3), np.nan),
             translation=np.full((count, 3), np.nan),

@@ -217,6 +217,12 @@ def fit_batch(
         sigmas = list(sigma)  # type: ignore[arg-type]
         if len(sigmas) != len(problems):
             raise InputError(f"{len(problems)} problems but {len(sigmas)} values", where="sigma")
+    if ransac is None:
+        _refuse_confidences(confidences)
+    elif confidences is not None and len(confidences) != len(problems):
+        raise InputError(
+            f"{len(problems)} problems but {len(confidences)} sets", where="confidences"
+        )
     if workers == -1:
         workers = os.cpu_count() or 1
     if workers < 1:
@@ -230,7 +236,8 @@ def fit_batch(
         if ransac is None and not options.estimates_in_rounds:
             return BatchResult.of_solutions(some, solve(some, options, own))
         trusted = None if confidences is None else confidences[part[0] : part[1]]
-        return BatchResult.of_fits(some, _fits(some, options, ransac, own, trusted))
+        fits = _fits(some, options, ransac, own, trusted)
+        return BatchResult.of_fits(some, fits, focal=options.focal)
 
     if len(parts) < 2:
         return run((0, len(problems)))

@@ -11,6 +11,8 @@ from typing import Any
 from cadalign.errors import CadalignError, DataError
 from cadalign.validation import as_floats
 
+_LARGEST_INDEX = 2**63 - 1
+
 
 def read_json(path: Path) -> Any:
     """Read a JSON file.
@@ -30,6 +32,8 @@ def read_json(path: Path) -> Any:
         raise DataError(
             f"not valid JSON: {error.msg}", where=f"{path}, line {error.lineno}"
         ) from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise DataError(f"not valid JSON: {error}", where=str(path)) from None
     except RecursionError:
         raise DataError("not valid JSON: nested too deeply", where=str(path)) from None
 
@@ -80,6 +84,8 @@ def as_index(value: Any, *, where: str) -> int:
     """Refuse what is not a whole number."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise DataError(f"{value!r} is not a whole number", where=where)
+    if abs(value) > _LARGEST_INDEX:
+        raise DataError("the number is too large", where=where)
     return value
 
 

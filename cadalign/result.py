@@ -267,6 +267,6 @@ class FitResult:
         """
         try:
             data = json.loads(text)
-        except json.JSONDecodeError as error:
+        except ValueError as error:
             raise InputError(f"not valid JSON: {error}", where="fit result") from None
         return cls.from_dict(data)

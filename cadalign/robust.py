@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from cadalign.alignment import Alignment
 from cadalign.camera import Camera
-from cadalign.errors import InputError, NoConsensusError
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import unpack
 from cadalign.focal_views import focal_views, log_limits, log_prior
 from cadalign.options import Options
@@ -25,6 +25,7 @@ from cadalign.whitening import rays_of, whitening_of
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.1  # expected number of models with as much support by chance
+_FLAT = 1e-6  # thickness over extent of what counts as a plane
 _LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
 
 
@@ -43,7 +44,8 @@ class RansacOptions:
     seed : int
         The same seed gives the same result, bit for bit.
     minimal : {"ap4p", "aepnp"}
-        The minimal solver: on 4 points, or the linear one on 6, as in the AEPnP paper.
+        The minimal solver: on 4 points, or the linear one on 6, as in the AEPnP paper, which wants
+        the focal length known. Neither finds anything where all keypoints lie in one plane.
     refine : bool
         Optimise new best hypotheses locally, and the final one on all its inliers. Without it the
         best hypothesis is returned as the minimal solver left it.
@@ -122,7 +124,10 @@ def find_consensus(
     Raises
     ------
     InputError
-        If there are too few keypoints, or a confidence is negative or NaN.
+        If there are too few keypoints, a confidence is negative or NaN, or the minimal solver wants
+        a focal length that is unknown.
+    DegenerateError
+        If all keypoints lie in one plane.
     NoConsensusError
         If no alignment has more support than chance gives; it carries the best score reached.
     """
@@ -134,6 +139,12 @@ def find_consensus(
     if count < size:
         raise InputError(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
+        )
+    if options.focal == "estimate" and ransac.minimal != "ap4p":
+        raise InputError(
+            f"{ransac.minimal!r} does not estimate the focal length",
+            where="minimal",
+            fix="leave it at 'ap4p'",
         )
     order = _by_confidence(confidences, count)
     guided = order is not None
@@ -187,6 +198,12 @@ def find_consensus(
             inliers,
         )
         camera = camera.with_focal(math.exp(log_focal))
+    if not hypotheses and _are_in_one_plane(points):
+        raise DegenerateError(
+            "all keypoints lie in one plane, where the samples of ransac determine nothing",
+            where="points_3d",
+            fix="leave ransac away: use loss='cauchy', with stretch= or scale_prior_sigma=",
+        )
     rotation, translation, scale = unpack(pose)
     place = np.argsort(options.axis_order)
     alignment = Alignment.from_solver(rotation[:, place], translation, scale[place])
@@ -214,6 +231,12 @@ def _objective(
     points: FloatArray, rays: FloatArray, whitening: FloatArray, options: Options
 ) -> Objective:
     return Objective(points, rays, whitening, LINEAR, 1.0, options.prior_weight, options.free)
+
+
+def _are_in_one_plane(points: FloatArray) -> bool:
+    """Whether points that do not all coincide lie in a plane or on a line."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[0] > 0 and spread[2] <= _FLAT * spread[0])
 
 
 def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:

@@ -38,7 +38,7 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     """
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"not an array of numbers ({error})", where=name) from None
     if np.ndim(value) == 0:
         array = array.reshape(())

@@ -77,13 +77,14 @@ def _annotations(data: Mapping[str, Any]) -> list[ImageKeypoints]:
     for entry, where in _entries(data, "annotations"):
         if entry.get("num_keypoints") == 0:
             continue
-        category = entry.get("category_id")
-        found = _detection(entry, where, names=None if category is None else names.get(category))
+        has_category = entry.get("category_id") is not None
+        category = names.get(_key(entry, "category_id", where)) if has_category else None
+        found = _detection(entry, where, names=category)
         if images:
             image_id = _key(entry, "image_id", where)
             if image_id not in images:
                 raise DataError(f"there is no image {image_id!r}", where=f"{where}.image_id")
-            found = _in_image(found, *images[image_id])
+            found = replace(_in_image(found, *images[image_id]), images=len(images))
         objects.append(found)
     return objects
 
@@ -115,7 +116,7 @@ def _mmpose_predictions(data: Mapping[str, Any]) -> list[ImageKeypoints]:
         # One entry for each frame of a video, or the objects of the only image themselves.
         frame = entry.get("frame_id")
         instances = _entries(entry, "instances", within=where) if "instances" in entry else None
-        for instance, place in instances or [(entry, where)]:
+        for instance, place in [(entry, where)] if instances is None else instances:
             found = _detection(instance, place, names=names)
             objects.append(found if frame is None else replace(found, image=str(frame)))
     return objects

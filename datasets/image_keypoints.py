@@ -39,6 +39,8 @@ class ImageKeypoints:
         Name or id of the image.
     size : (int, int), optional
         The image's width and height [px].
+    images : int
+        How many images the file lists, with keypoints or without.
     score : float, optional
         How sure the detector is of the whole object.
     source : str
@@ -52,6 +54,7 @@ class ImageKeypoints:
     sigma: FloatArray | None = None
     image: str | None = None
     size: tuple[int, int] | None = None
+    images: int = 1
     score: float | None = None
     source: str = "keypoints"
 
@@ -108,6 +111,13 @@ def choose_object(
     images = list(dict.fromkeys(found.image for found in objects))
     wanted = [found for found in objects if image is not None and _is_image(found.image, image)]
     if not wanted:
+        listed_images = max((found.images for found in objects), default=0)
+        if image is not None and listed_images > 1 and len(images) == 1:
+            raise InputError(
+                f"{listed_images} images, and no keypoints in {image!r}",
+                where="image",
+                fix=f"there are some in {images[0]}",
+            )
         if len(images) != 1:
             listed = ", ".join(str(name) for name in images[:5])
             raise InputError(
@@ -173,6 +183,8 @@ def join_keypoints(
     ------
     DataError
         If a keypoint is unknown, two are the same, or none is left.
+    InputError
+        If ``sigma_from_scores`` is not positive.
     """
     kept = [row for row in range(len(found)) if _is_found(found, row, min_score)]
     places = _places(found, model)
@@ -183,6 +195,8 @@ def join_keypoints(
             where=found.source,
             fix=f"it has {_some(model.names)}; ignore_unknown leaves out what it has not",
         )
+    if sigma_from_scores is not None and not 0 < sigma_from_scores < np.inf:
+        raise InputError(f"{sigma_from_scores} is not positive", where="sigma_from_scores")
     pairs = [(row, place) for row in kept if (place := places[row]) is not None]
     first: dict[int, int] = {}
     for row, place in pairs:

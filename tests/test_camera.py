@@ -491,3 +491,8 @@ def test_half_a_focal_length_is_refused(params: list[Any], text: str) -> None:
     with pytest.raises(InputError) as caught:
         Camera.from_dict({"model": "PINHOLE", "width": 640, "height": 480, "params": params})
     assert str(caught.value) == text
+
+
+def test_whole_numbers_beyond_all_floats_are_refused() -> None:
+    with pytest.raises(InputError, match="not a finite number"):
+        Camera(640, 480, 10**400, 500.0, 320.0, 240.0)

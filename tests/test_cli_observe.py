@@ -227,3 +227,17 @@ def test_unknown_focal_length_survives_the_file(tmp_path: Path) -> None:
     data["camera"] = {"width": 640, "height": 480}
     (tmp_path / "a.json").write_text(json.dumps(data))
     assert Observation.load(tmp_path / "a.json").camera == Camera.without_focal(640, 480)
+
+
+def test_photo_and_camera_of_different_sizes_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = folder / "camera.json"
+    camera.write_text(json.dumps(Camera(100, 50, 60.0, 60.0, 50.0, 25.0).to_dict()))
+    photo = folder / "photo.jpg"
+    options = ("--image", str(photo), "--camera", str(camera))
+    text = refusal(capsys, lambda: observe(folder, *options))
+    assert text == (
+        f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
+        "give what belongs together"
+    )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cadalign import BatchResult, Camera, fit, fit_batch
+from cadalign import BatchResult, Camera, RansacOptions, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.simulation import Problem, simulate_problem
 
@@ -275,3 +275,22 @@ def test_stack_with_nan_names_the_problem_and_the_row() -> None:
 def test_wrong_sigma_of_one_problem_is_refused_by_name(sigma: float) -> None:
     with pytest.raises(InputError, match="sigma"):
         run(RAGGED, sigma=[1.0, sigma, 1.0, 1.0, 1.0, 1.0])
+
+
+def test_threads_agree_where_all_of_a_share_fail() -> None:
+    good = problems_of([20, 20])
+    rng = np.random.default_rng(0)
+    bad = [Problem(rng.normal(size=(20, 3)), rng.uniform(0, 400, (20, 2)), p.camera, p.alignment)
+           for p in good]  # fmt: skip
+    batch = run([*good, *bad], focal="estimate", ransac=RansacOptions(max_iterations=20), workers=2)
+    assert batch.solved.tolist() == [True, True, False, False]
+    assert batch.covariance is not None
+    assert batch.covariance.shape == (4, 9, 9)
+
+
+def test_confidences_without_ransac_are_refused() -> None:
+    problems = problems_of([8, 9])
+    with pytest.raises(InputError, match="confidences: given without ransac"):
+        run(problems, confidences=[np.ones(8), np.ones(9)])
+    with pytest.raises(InputError, match="confidences: 2 problems but 1 sets"):
+        run(problems, confidences=[np.ones(8)], ransac=RansacOptions())

@@ -509,3 +509,43 @@ def test_fields_that_do_not_match_are_refused(fields: dict[str, Any], text: str)
     with pytest.raises(CadalignError) as caught:
         ImageKeypoints(**({"points_2d": np.array(POINTS)} | fields))
     assert str(caught.value) == text
+
+
+# --- what does not belong together ------------------------------------------------------------
+
+
+def test_photo_without_keypoints_does_not_get_those_of_another(tmp_path: Path) -> None:
+    data = changed("annotations.2", ...)
+    with pytest.raises(InputError, match=r"2 images, and no keypoints in 'b\.jpg'.*cats/a\.jpg"):
+        choose_object(read(tmp_path, data), image="b.jpg")
+
+
+def test_empty_frames_of_a_video_are_passed_over(tmp_path: Path) -> None:
+    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.7]}
+    frames = [
+        {"frame_id": 1, "instances": [instance]},
+        {"frame_id": 2, "instances": []},
+    ]
+    (found,) = read(tmp_path, {"meta_info": {}, "instance_info": frames})
+    assert found.image == "1"
+
+
+@pytest.mark.parametrize("value", [[1], {"a": 1}])
+def test_category_that_is_no_id_is_refused(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(DataError, match=r"annotations\[0\]\.category_id: .* is no id"):
+        read(tmp_path, changed("annotations.0.category_id", value))
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan")])
+def test_weights_need_a_positive_deviation(tmp_path: Path, sigma: float) -> None:
+    found = read(tmp_path, ANNOTATIONS)[0]
+    with pytest.raises(InputError, match=r"sigma_from_scores: .* is not positive"):
+        join_keypoints(found, MODEL, CAMERA, sigma_from_scores=sigma)
+
+
+def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
+    huge = changed("annotations.0.keypoints.0", 10**400)
+    with pytest.raises(CadalignError, match=r"keypoints: not an array of numbers"):
+        read(tmp_path, huge)
+    with pytest.raises(DataError, match="not valid JSON"):
+        read(tmp_path, '{"annotations": ' + "1" * 5000 + "}")

@@ -12,7 +12,7 @@ import pytest
 
 import cadalign
 from cadalign import Alignment, Camera, RansacOptions, fit, fit_batch
-from cadalign.errors import InputError, NoConsensusError
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.metrics import rotation_error, scale_error
 from cadalign.simulation import Problem, simulate_problem
 
@@ -257,3 +257,26 @@ def test_confidences_that_are_all_alike_guide_nothing() -> None:
     blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
     assert alike.alignment == blind.alignment
     assert alike.stats.iterations == blind.stats.iterations
+
+
+@pytest.mark.parametrize("focal", ["known", "estimate"])
+def test_keypoints_in_one_plane_are_refused_in_those_words(focal: str) -> None:
+    problem, _, _ = spoiled(0, points=30, outliers=0)
+    flat = problem.points_3d * [1, 1, 0]
+    points_2d = CAMERA.project(problem.alignment.apply(flat))
+    with pytest.raises(DegenerateError, match=r"all keypoints lie in one plane.*loss='cauchy'"):
+        fit(flat, points_2d, CAMERA, focal=focal, ransac=RansacOptions(max_iterations=200))
+    alone = fit(flat, points_2d, CAMERA, stretch="y", loss="cauchy")
+    assert alone.rms < 1e3
+
+
+def test_minimal_solver_that_wants_the_focal_length_is_refused_without() -> None:
+    problem, points_2d, _ = spoiled(0, points=30, outliers=0)
+    with pytest.raises(InputError, match="minimal: 'aepnp' does not estimate the focal length"):
+        fit(
+            problem.points_3d,
+            points_2d,
+            CAMERA,
+            focal="estimate",
+            ransac=RansacOptions(minimal="aepnp"),
+        )

@@ -74,20 +74,40 @@ class Observe:
         return 0
 
     def _camera(self, found: ImageKeypoints) -> Camera:
-        """The given camera, or one of the photo's size without focal length."""
+        """The given camera, or one of the photo's size without focal length.
+
+        Raises
+        ------
+        DataError
+            If the photo, the camera and the file of keypoints don't agree on the image's size.
+        """
         from cadalign.camera import Camera
         from cadalign.errors import DataError
         from cadalign.json_file import in_file, read_json
         from cadalign.photo import photo_size
 
+        sizes: dict[str, tuple[int, int]] = {}
+        camera = None
         if self.camera is not None:
             data = read_json(self.camera)
             with in_file(self.camera):
-                return Camera.from_dict(data)
+                camera = Camera.from_dict(data)
+            sizes[str(self.camera)] = camera.width, camera.height
         if self.image is not None:
-            return Camera.without_focal(*photo_size(self.image))
+            sizes[str(self.image)] = photo_size(self.image)
         if found.size is not None:
-            return Camera.without_focal(*found.size)
-        raise DataError(
-            "the photo's size is not known", where=found.source, fix="give --image or --camera"
-        )
+            sizes[found.source] = found.size
+        if not sizes:
+            raise DataError(
+                "the photo's size is not known", where=found.source, fix="give --image or --camera"
+            )
+        (first, size), *others = sizes.items()
+        for name, other in others:
+            if other != size:
+                raise DataError(
+                    f"the image has {other[0]} x {other[1]} pixels, that of {first} "
+                    f"{size[0]} x {size[1]}",
+                    where=name,
+                    fix="give what belongs together",
+                )
+        return camera or Camera.without_focal(*size)

@@ -3,7 +3,8 @@
 A finished chunk is a file in ``parts`` of the run's folder (`cadalign.evaluation.run_folder`),
 which appears whole or not at all. Started again, a run does the chunks that have none. Chunks are
 the same whatever the number of workers, and their rows follow from the run's seed and the tasks'
-names, so nothing in ``results.parquet`` tells how often the run was interrupted or who did the work.
+names, so nothing in ``results.parquet`` tells how often the run was interrupted or who did the
+work.
 
 To evaluate something else, write an `Experiment` (`cadalign.evaluation.work`) and a sequence of
 tasks, and call `execute`.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from cadalign.errors import CadalignError, DataError
+from cadalign.files import write_json as write_json
 from cadalign.validation import as_floats
 
 _LARGEST_INDEX = 2**63 - 1
@@ -46,20 +48,6 @@ def in_file(path: Path) -> Iterator[None]:
     except CadalignError as error:
         where = f"{path}: {error.where}" if error.where else str(path)
         raise DataError(error.what, where=where, fix=error.fix) from None
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write a JSON file.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
-    try:
-        path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"cannot be written ({error.strerror})", where=str(path)) from None
 
 
 def as_object(value: Any, *, where: str | None) -> Mapping[str, Any]:
@@ -110,13 +98,20 @@ def as_path(value: Any, *, folder: Path, where: str) -> Path:
     """A path that the file writes relative to its folder."""
     if not isinstance(value, str) or not value:
         raise DataError(f"{value!r} is not a path", where=where)
-    return folder / value
+    path = folder / value
+    # Such that a path outside the folder is the one that was written, with no ".." in its midst.
+    return path.resolve() if ".." in Path(value).parts else path
 
 
 def written_path(path: Path, *, folder: Path | None) -> str:
-    """A path as it is written into a file: without the folder that it is read relative to."""
-    if folder is not None:
-        for base in (folder, folder.resolve()):
-            if path.is_relative_to(base):
-                return str(path.relative_to(base))
-    return str(path)
+    """A path as it is written into a file: relative to the folder that it is read relative to."""
+    if folder is None:
+        return str(path)
+    for base in (folder, folder.resolve()):
+        if path.is_relative_to(base):
+            return path.relative_to(base).as_posix()
+    there = path.resolve()
+    try:
+        return Path(os.path.relpath(there, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return there.as_posix()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,33 @@ def test_fit_file_goes_with_the_alignment(case: Case) -> None:
     assert file.exists()
     for pair in (1, 2, 3):
         session.act(0, {"do": "delete", "pair": pair})
+    assert not file.exists()
+
+
+def test_fit_file_waits_for_the_solvers(case: Case) -> None:
+    place_all(case.open(), case, count=7)
+    file = case.folder / "photo_fit" / "fit.json"
+    before = file.read_bytes()
+    unready = open_session(image=case.photo, model=case.model)
+    unready.act(0, {"do": "delete", "pair": 1})
+    assert file.read_bytes() == before
+    unready.warm_up()
+    state = state_of(unready, 0)
+    assert (
+        FitResult.from_json(file.read_text()).alignment.to_dict()
+        == (state["alignment"]["alignment"])
+    )
+    assert file.read_bytes() != before
+
+
+def test_fit_file_goes_when_ready_solvers_find_no_alignment(case: Case) -> None:
+    place_all(case.open(), case, count=6)
+    file = case.folder / "photo_fit" / "fit.json"
+    unready = open_session(image=case.photo, model=case.model)
+    for pair in (1, 2, 3):
+        unready.act(0, {"do": "delete", "pair": pair})
+    assert file.exists()
+    unready.warm_up()
     assert not file.exists()
 
 
@@ -522,6 +550,55 @@ def test_observation_of_another_model_is_refused(case: Case) -> None:
         f"{case.observation}: belongs to the model table.ply, not sample_chair_000.ply; "
         "give another --observation or --out"
     )
+
+
+def namesake(case: Case) -> Path:
+    """Another model whose file has the same name."""
+    other = case.folder / "other" / case.model.name
+    other.parent.mkdir()
+    shutil.copy(case.model, other)
+    return other
+
+
+def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
+    place_all(case.open(), case)
+    other = namesake(case)
+    book = case.folder / "sample_chair_000.keypoints.json"
+    kept = case.observation.read_bytes(), book.read_bytes()
+    ours = f"belongs to the model {case.model.resolve()}, not {other.resolve()}; "
+    advice = "give another --observation or --out"
+    assert refusal(lambda: case.open(model=other)) == f"{book}: {ours}{advice}"
+    assert (case.observation.read_bytes(), book.read_bytes()) == kept
+    book.unlink()  # the observation is refused without its help
+    assert refusal(lambda: case.open(model=other)) == f"{case.observation}: {ours}{advice}"
+    assert case.observation.read_bytes() == kept[0]
+    state_of(case.open(), 0)
+
+
+def test_halves_of_pairs_of_a_namesake_are_refused(case: Case) -> None:
+    case.open().act(0, {"do": "place_keypoint", "keypoint": 0})
+    (case.folder / "sample_chair_000.keypoints.json").unlink()
+    other = namesake(case)
+    assert refusal(lambda: case.open(model=other)).startswith(
+        f"{case.observation}: belongs to the model {case.model.resolve()}, not "
+    )
+
+
+def test_model_reached_by_another_way_is_the_same(case: Case) -> None:
+    place_all(case.open(), case, count=6)
+    link = case.folder / "link"
+    link.symlink_to(case.model.parent)
+    session = case.open(model=link / case.model.name)
+    assert len(session.slides[0].document.complete_pairs) == 6
+
+
+def test_given_keypoints_without_ids_all_come(case: Case) -> None:
+    given = ModelKeypoints.load(case.keypoints).keypoints
+    bare = tuple(replace(point, semantic_id=None) for point in given)
+    ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
+    session = case.open()
+    assert [point.name for _, point in session.book] == [point.name for point in given]
+    assert len(session.book.given) == len(given)
 
 
 def test_observation_without_ids_is_matched_by_place(case: Case) -> None:

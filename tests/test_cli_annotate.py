@@ -77,6 +77,26 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
     assert message == f"{file / 'out'}: cannot be made (Not a directory); choose another --out"
 
 
+def test_folder_of_the_observation_is_made(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Refused only after the folder was made: a model that is none.
+    observation = tmp_path / "new" / "dir" / "obs.json"
+    refusal(capsys, "--image", case.photo, "--model", case.camera, "--observation", observation)
+    assert observation.parent.is_dir()
+    file = tmp_path / "file"
+    file.write_text("")
+    message = refusal(
+        capsys,
+        *("--image", case.photo, "--model", case.model),
+        *("--observation", file / "sub" / "obs.json"),
+    )
+    assert message == (
+        f"{file / 'sub' / 'obs.json'}: cannot be written (Not a directory); "
+        "make room or choose another folder; what was written before is kept"
+    )
+
+
 def test_model_is_required(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["annotate", "--image", "photo.jpg"])

@@ -223,3 +223,53 @@ def test_saved_paths_still_name_the_same_files(
         image = Observation.load(again).image
         assert image is not None
         assert image.resolve() == tmp_path / "photos" / "photo.png"
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("file", ["photos/p.json", "deep/er/p.json", "p.json", "linked/p.json"])
+def test_saved_paths_outside_the_files_folder_name_the_same_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, absolute: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("photos", "deep/er", "models/b", "elsewhere/far/off"):
+        Path(folder).mkdir(parents=True)
+    Path("linked").symlink_to("elsewhere/far/off")
+    model, image = Path("models/b/model.obj"), Path("photos/p.jpg")
+    given = (tmp_path / model, tmp_path / image) if absolute else (model, image)
+    Observation(POINTS_3D, POINTS_2D, CAMERA, model=given[0], image=given[1]).save(file)
+    loaded = Observation.load(file)
+    assert loaded.model is not None
+    assert loaded.image is not None
+    assert loaded.model.resolve() == tmp_path / model
+    assert loaded.image.resolve() == tmp_path / image
+    written = json.loads(Path(file).read_text())
+    assert not Path(written["model"]).is_absolute()
+    assert not Path(written["image"]).is_absolute()
+
+
+def test_path_that_cannot_be_relative_is_written_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other_drive(*_: object) -> str:
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr("os.path.relpath", other_drive)
+    model = tmp_path / "models" / "model.obj"
+    observation = Observation(POINTS_3D, POINTS_2D, CAMERA, model=model)
+    assert observation.to_dict(folder=tmp_path / "photos")["model"] == model.as_posix()
+
+
+def test_save_cut_short_leaves_the_file_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = write(tmp_path / "p.json", DATA)
+    before = path.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr("os.replace", full)
+        with pytest.raises(DataError, match="cannot be written"):
+            Observation(POINTS_3D, POINTS_2D, CAMERA).save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -163,6 +163,59 @@ def test_runs_are_compared_by_what_changed_most(opened: Opened, two_runs: str) -
     expect(page.locator("dialog[open] svg.overlay")).to_have_count(2)
 
 
+def without_overlaps(payload: dict[str, Any]) -> dict[str, Any]:
+    """The payload's tables with the first 6 instances of each run aligned, but without box IoU."""
+    tables = payload["tables"]
+    rows = tables["rows"]
+    for row, instance in enumerate(rows["instance"]):
+        if tables["instances"]["id"][instance] < 6:
+            rows["status"][row], rows["reason"][row], rows["box_iou"][row] = 0, -1, None
+    return tables
+
+
+def test_a_good_fit_without_a_value_is_listed_last_and_not_as_failed(
+    opened: Opened, tmp_path: Path
+) -> None:
+    tables = without_overlaps(payload_of(Recipe(failures=0.3)))
+    address = write_page(tmp_path / "report.html", Recipe(failures=0.3), tables=tables)
+    page = opened(address, viewport={"width": 1280, "height": 6000})  # all cards are in view
+    gallery = page.locator("#gallery")
+    gallery.get_by_role("combobox", name="by", exact=True).select_option("box_iou")
+    instances = listed({"tables": tables}, "box_iou")
+    failed = [i for i in instances if i["error"] is None and i["id"] >= 6]
+    fitted = sorted((i for i in instances if i["error"] is not None), key=lambda i: i["error"])
+    assert failed
+    for order, expected in (
+        ("Worst", [*failed, *fitted, *instances[:6]]),
+        ("Best", [*fitted[::-1], *failed, *instances[:6]]),
+    ):
+        page.get_by_role("button", name=order, exact=True).click()
+        assert card_names(page) == [i["model"] for i in expected]
+    card = gallery.locator(".card", has_text=instances[0]["model"])
+    expect(card.locator(".error").first).to_contain_text("\u2013")
+    expect(card.locator(".failed")).to_have_count(0)
+
+
+def test_a_fit_without_a_value_is_compared_with_nothing(opened: Opened, tmp_path: Path) -> None:
+    recipe = Recipe(runs=2, failures=0.3)
+    tables = without_overlaps(payload_of(recipe))
+    page = opened(write_page(tmp_path / "report.html", recipe, tables=tables) + "#by=box_iou")
+    page.get_by_role("button", name="Show more").click()
+    instances = listed({"tables": tables}, "box_iou")
+    for index, instance in enumerate(instances[:24]):
+        card = page.locator(".pair", has_text=instance["model"])
+        values = card.locator(".side strong").all_inner_texts()
+        nothing = card.get_by_text("nothing to compare", exact=True)
+        if index < 6:
+            assert values == ["\u2013", "\u2013"]
+        else:
+            both = (instance, instances[24 + index])
+            assert [value == "failed" for value in values] == [i["error"] is None for i in both]
+        expect(nothing).to_have_count(int(index < 6))
+    found = page.locator("#compare .found")
+    expect(found).to_have_text(re.compile(r"24 instances in both: .* the same, 6 without a value"))
+
+
 def heavier(address: str, size: int) -> str:
     """A picture's address with bytes after its end, which no reader minds."""
     head, data = address.split(",")

@@ -16,20 +16,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cadalign import Alignment, Box, Camera
+from cadalign import Alignment, Box, Camera, Library
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet, run_sweep, sweep_of
 from cadalign.evaluation.correspondences import CorrespondenceOptions, run_correspondences
+from cadalign.evaluation.exhibit import exhibit_stem
 from cadalign.evaluation.keypoint_tasks import KeypointTasks
 from cadalign.evaluation.keypointnet import KeypointNetExperiment
 from cadalign.evaluation.methods import fit_with
 from cadalign.evaluation.retrieval import RetrievalEvaluation, run_retrieval
+from cadalign.evaluation.run import Progress
 from cadalign.evaluation.run_folder import RunFolder
 from cadalign.evaluation.tables import read_table
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.report import media, write_report
 from cadalign.report.instances import compact
+from cadalign.retrieval import LibraryModel
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
 HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
@@ -295,6 +298,17 @@ def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path
     assert len(found["headline"]["rows"]) == 5 * len(METHODS)
 
 
+def test_pictures_of_different_instances_have_different_names() -> None:
+    ids = ["a", "a_1", "a_2", "a_1_1", "a_10", "a_0", "a_01", "a/1", "x" * 300 + "_1"]
+    keys = [("chair", name, view) for name in ids for view in range(12)]
+    stems = {exhibit_stem(*key) for key in keys}
+    assert len(stems) == len(keys)
+    assert all(len(stem) < 250 and "/" not in stem for stem in stems)
+    usual = "1a2b3c4d5e6f708192a3b4c5d6e7f809"
+    assert exhibit_stem("chair", usual, 3) == f"chair_{usual}_3"
+    assert exhibit_stem("chair", "sample_chair_002") == "chair_sample_chair_002"
+
+
 # --- size ------------------------------------------------------------------------------------
 
 
@@ -539,11 +553,40 @@ def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
     rates = [row["cells"]["rank_1"] for row in found["headline"]["rows"][:2]]
     assert first["traces"][0]["y"] == rates
     assert min(rates) >= 75
-    (tmp_path / "run" / "results.parquet").rename(tmp_path / "away.parquet")
-    (tmp_path / "run" / "parts").mkdir()
-    shutil.copy(tmp_path / "away.parquet", tmp_path / "run" / "parts" / "0000000.parquet")
-    with pytest.raises(DataError, match="the run is not finished yet; wait"):
-        write_report([tmp_path / "run"], tmp_path / "report.html")
+
+
+def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) -> None:
+    file = tmp_path / "library"
+    models = [
+        LibraryModel("box", f"{k:02d}", xyz, np.arange(9), np.array([[-0.3] * 3, [0.3] * 3]))
+        for k, xyz in enumerate(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 9, 3)))
+    ]
+    Library.from_models(models).save(file)
+    options = RetrievalEvaluation(keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
+
+    def stop(progress: Progress) -> None:
+        if progress.done:
+            raise KeyboardInterrupt
+
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        run_retrieval(file, options, folder, workers=0, on_progress=stop)
+    found = report(tmp_path, folder.path)
+    (run,) = found["runs"]
+    assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
+    rows = [row["cells"] for row in found["headline"]["rows"]]
+    assert [row["instances"] for row in rows] == [16, 16]
+    results = read_table(folder.part(0)).to_pylist()
+    ranks = [row["rank"] for row in results if row["protocol"] == "leave-in"]
+    assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
+    assert rows[0]["milliseconds"] > 0
+    assert found["plots"][0]["traces"][0]["y"] == [rows[0]["rank_1"]]
+    run_retrieval(file, options, folder, workers=0)
+    folder.timings.unlink()  # what was not kept is not shown
+    found = report(tmp_path, folder.path)
+    assert found["runs"][0]["state"] == "finished"
+    rows = [row["cells"] for row in found["headline"]["rows"]]
+    assert [(row["instances"], row["milliseconds"]) for row in rows] == [(20, None)] * 2
 
 
 # --- refusals --------------------------------------------------------------------------------

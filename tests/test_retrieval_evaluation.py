@@ -225,6 +225,29 @@ class TestRuns:
             run_retrieval(other, QUICK, finished)
         assert (finished.path / "library.cadalign").read_bytes() == before
 
+    def test_a_library_left_by_a_run_that_never_began_is_not_evaluated(
+        self, library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        other = tmp_path / "other"
+        Library.from_models([make_model(number) for number in range(40, 60)]).save(other)
+        folder = RunFolder(tmp_path / "run")
+
+        def die(self: RunFolder, config: dict[str, Any]) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(RunFolder, "claim", die)
+            with pytest.raises(KeyboardInterrupt):
+                run_retrieval(other, QUICK, folder, workers=0)
+        options = replace(QUICK, max_models=2, methods=("epnp",), keypoints=(8,))
+        run_retrieval(library, options, folder, workers=0)
+        evaluated = Library.open(folder.path / "library.cadalign")
+        assert evaluated.fingerprint == Library.open(library).fingerprint
+        config = folder.read_config()
+        assert config is not None
+        assert evaluated.fingerprint.startswith(config["library"])
+        assert {int(row["matched_id"]) for row in rows_of(folder)} <= set(range(30))
+
     def test_the_whole_library_can_be_searched(self, sample_root: Path, tmp_path: Path) -> None:
         options = replace(
             QUICK, categories=("chair",), whole_library=True, keypoints=(8,), methods=("optimal",)

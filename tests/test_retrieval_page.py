@@ -22,6 +22,7 @@ from cadalign.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.page import draw_match, write_retrieval
+from cadalign.retrieval.pictures import read_opacity
 from cadalign.retrieval.query import read_query
 
 
@@ -284,6 +285,51 @@ def test_a_photo_with_opacity_needs_no_cutting_out(
     assert found[0]["silhouette_iou"] == expected[0].silhouette_iou
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize("mode", ["RGBA", "P"])
+def test_opacity_is_upright_and_may_be_of_a_palette(
+    case: Case, tmp_path: Path, mode: str, orientation: int
+) -> None:
+    quarter_turns = {1: 0, 3: 2, 6: 1}[orientation]  # what makes the stored pixels of upright ones
+    mask = np.rot90(case.frame.mask, quarter_turns)
+    colors = np.rot90(case.photo, quarter_turns)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "photo.png"
+    if mode == "RGBA":
+        stored = Image.fromarray(np.dstack([colors, 255 * mask]).astype(np.uint8))
+        stored.save(path, exif=exif)
+    else:
+        stored = Image.fromarray(mask.astype(np.uint8)).convert("P")
+        stored.putpalette([255, 255, 255, 200, 60, 30])
+        stored.save(path, transparency=0, exif=exif)
+    found = read_opacity(path, CAMERA)
+    assert found.shape == (480, 640, 4)
+    np.testing.assert_array_equal(found[..., 3] > 127, case.frame.mask)
+    if mode == "RGBA":
+        np.testing.assert_array_equal(found[..., :3], case.photo)
+
+
+def test_a_photo_without_opacity_has_three_channels(case: Case, tmp_path: Path) -> None:
+    path = tmp_path / "palette.png"
+    Image.fromarray(case.photo).convert("P").save(path)
+    assert read_opacity(path, CAMERA).shape == (480, 640, 3)
+
+
+def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, gone = tmp_path / "moved.json", tmp_path / "gone.png"
+    replace(case.observation, image=gone).save(path)
+    arguments = [str(path), *case.arguments[1:], "--mask", str(case.folder / "mask.png")]
+    assert main(["retrieve", *arguments]) == 0
+    assert case.model_id in capsys.readouterr().out
+    for option in (["--out", str(tmp_path / "out")], ["--silhouette"]):
+        text = refusal(capsys, "retrieve", *arguments, *option)
+        assert text == f"{gone}: no such file"
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_page_shows_the_matches_side_by_side(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str], browser: Browser
 ) -> None:
@@ -323,6 +369,21 @@ def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None
     for top in (3, 2):
         write_retrieval(tmp_path, case.retrieve(top=top), CAMERA, title="t", library="l")
     assert len(list(tmp_path.glob("overlay_*.png"))) == 2
+
+
+def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) -> None:
+    mine = ["overlay_mine.png", "overlay_1.png", "overlay_007.png", "overlay_12_old.png"]
+    for name in (*mine, "overlay_12.png", "overlay_100.png"):
+        (tmp_path / name).touch()
+    write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
+    left = sorted(path.name for path in tmp_path.glob("overlay_*.png"))
+    assert left == sorted([*mine, "overlay_01.png"])
+
+
+def test_an_old_overlay_that_cannot_be_removed_is_one_line(case: Case, tmp_path: Path) -> None:
+    (tmp_path / "overlay_02.png").mkdir()
+    with pytest.raises(DataError, match=f"{tmp_path}: cannot be written"):
+        write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
 
 
 def test_names_are_escaped(case: Case, tmp_path: Path) -> None:

@@ -21,8 +21,15 @@ from cadalign.camera import Camera
 from cadalign.datasets.annotations import parse_entry, read_entries
 from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError
-from cadalign.files import write_json, write_whole
-from cadalign.json_file import as_index, as_numbers, as_object, read_json, refuse_unknown
+from cadalign.files import write_json
+from cadalign.json_file import (
+    as_index,
+    as_numbers,
+    as_object,
+    as_path,
+    read_json,
+    refuse_unknown,
+)
 from cadalign.mesh import Mesh
 from cadalign.observation import Observation
 from cadalign.result import FitResult
@@ -93,10 +100,8 @@ class Sheet:
             document = _with_halves(document, self.unfinished, book)
         return document, camera
 
-    def write(
-        self, document: Document, book: KeypointBook, camera: Camera, result: FitResult | None
-    ) -> None:
-        """Write all files of the photo, each whole or not at all.
+    def write(self, document: Document, book: KeypointBook, camera: Camera) -> None:
+        """Write the photo's observation and halves of pairs, each whole or not at all.
 
         Raises
         ------
@@ -116,15 +121,21 @@ class Sheet:
             image=self.image,
             model=self.model,
         )
-        write_whole(self.observation, observation.save)
+        observation.save(self.observation)
         halves = [pair for pair in document.pairs if not pair.complete]
         if halves:
             write_json(self.unfinished, _written(halves))
         else:
             self.unfinished.unlink(missing_ok=True)
-        self._write_fit(result)
 
-    def _write_fit(self, result: FitResult | None) -> None:
+    def write_fit(self, result: FitResult | None) -> None:
+        """Write the alignment; where there is none, take away its file.
+
+        Raises
+        ------
+        DataError
+            If it cannot be written.
+        """
         if result is None:
             self.fit.unlink(missing_ok=True)
             return
@@ -142,20 +153,54 @@ class Sheet:
                 camera = Camera.from_dict(data["camera"])
             except CadalignError as error:
                 raise DataError(error.what, where=f"{self.observation}: {error.where}") from None
+            if data.get("model") is not None:  # the halves of pairs are that model's
+                where = f"{self.observation}: model"
+                named = as_path(data["model"], folder=self.observation.parent, where=where)
+                refuse_other_model(named, self.model, where=self.observation)
             return Observation(np.empty((0, 3)), np.empty((0, 2)), camera)
         observation = Observation.load(self.observation)
-        if observation.model is not None and observation.model.name != self.model.name:
-            raise DataError(
-                f"belongs to the model {observation.model.name}, not {self.model.name}",
-                where=str(self.observation),
-                fix="give another --observation or --out",
-            )
+        refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
 
 
 def sigmas_of(pairs: Iterable[Pair]) -> FloatArray | None:
     """Standard deviations (n,) of complete pairs, if any has one: 1 px for the others."""
     return _filled([pair.sigma for pair in pairs])
+
+
+def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
+    """Refuse a file that names another model than the one that is annotated.
+
+    Raises
+    ------
+    DataError
+        If it does. A file that names none may be of any model.
+    """
+    if named is None or named.resolve() == model.resolve():
+        return
+    # Whole datasets call every mesh the same; only the folders tell these apart.
+    same = named.name == model.name
+    other, ours = (named.resolve(), model.resolve()) if same else (named.name, model.name)
+    raise DataError(
+        f"belongs to the model {other}, not {ours}",
+        where=str(where),
+        fix="give another --observation or --out",
+    )
+
+
+def read_own_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeypoint, ...]:
+    """Read the keypoints that an earlier session wrote, or that lie where it would write them.
+
+    Raises
+    ------
+    DataError
+        If they are another model's, or for the reasons of `read_given_keypoints`.
+    """
+    if isinstance(read_json(path), dict):
+        own = ModelKeypoints.load(path, mesh=mesh)
+        refuse_other_model(own.model, model, where=path)
+        return own.keypoints
+    return read_given_keypoints(path, model, mesh)
 
 
 def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeypoint, ...]:
@@ -213,7 +258,7 @@ def write_keypoints(path: Path, book: KeypointBook, used: frozenset[int], model:
         If the file cannot be written.
     """
     kept = tuple(point for number, point in book if number in book.given or number in used)
-    write_whole(path, ModelKeypoints(kept, model).save)
+    ModelKeypoints(kept, model).save(path)
 
 
 def _filled(values: list[float | None]) -> FloatArray | None:

@@ -13,6 +13,7 @@ from cadalign.annotate.files import (
     Sheet,
     keypoints_file,
     read_given_keypoints,
+    read_own_keypoints,
 )
 from cadalign.annotate.history import History
 from cadalign.annotate.keypoint_book import KeypointBook
@@ -88,13 +89,13 @@ def open_session(
 
 def _open_book(own: Path, source: Path, model: Path, mesh: Mesh) -> KeypointBook:
     """The keypoints that came with the model, and those that were placed or renamed before."""
-    came: dict[int | None, ModelKeypoint] = {}
+    came: tuple[ModelKeypoint, ...] = ()
     if source != own and (source.exists() or source != keypoints_file(model, model.parent)):
-        came = {p.semantic_id: p for p in read_given_keypoints(source, model, mesh)}
-    book = KeypointBook(came.values())
+        came = read_given_keypoints(source, model, mesh)
+    book = KeypointBook(came)
     if own.exists():
         low, high = mesh.bounds
-        before = read_given_keypoints(own, model, mesh)
+        before = read_own_keypoints(own, model, mesh)
         book.take_in(before, tolerance=SAME_PLACE * float(np.linalg.norm(high - low)))
     return book
 

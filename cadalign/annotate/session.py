@@ -46,6 +46,8 @@ class Slide:
     history: History
     saved_at: float | None = None
     trouble: str = ""
+    fit_waits: bool = False
+    """Whether the alignment's file is to be written once there can be one."""
     _live: tuple[Document, LiveAlignment, Suggestion | None] | None = field(
         default=None, repr=False
     )
@@ -126,6 +128,10 @@ class Session:
             _ = self.model.scene.caster, self.model.samples
         finally:  # what has failed here fails again, and is said, where it is needed
             self._ready.set()
+            with self.lock:
+                for slide in self.slides:
+                    if slide.fit_waits:
+                        self.save(slide)
 
     # --- what is there ---------------------------------------------------------------------
 
@@ -196,6 +202,8 @@ class Session:
     def save(self, slide: Slide) -> None:
         """Write the files of a photo, and those of the model; trouble is kept to be shown."""
         document = slide.document
+        ready = self.ready  # asked first: it may become so at any time
+        slide.fit_waits = not ready
         live, _ = self.live(slide)
         # What needed assumptions is shown, but not written: `cadalign fit` would refuse it.
         result = None if live.provisional else live.result
@@ -203,7 +211,9 @@ class Session:
         try:
             # First the keypoints, which the observation names.
             write_keypoints(self.keypoints_path, self.book, used, slide.sheet.model)
-            slide.sheet.write(document, self.book, slide.lens.to_write(document.focal), result)
+            slide.sheet.write(document, self.book, slide.lens.to_write(document.focal))
+            if ready:
+                slide.sheet.write_fit(result)
         except CadalignError as error:
             slide.trouble = str(error)
         else:

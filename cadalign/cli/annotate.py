@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.cli.output import make_folder, new_console
+from cadalign.files import writing
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,9 @@ class Annotate:
         with listener:
             if self.out is not None:
                 make_folder(self.out)
+            if self.observation is not None:
+                with writing(self.observation):
+                    self.observation.parent.mkdir(parents=True, exist_ok=True)
             with console.status("reading photos and model"):
                 session = open_session(
                     image=self.image,

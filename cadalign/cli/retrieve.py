@@ -71,7 +71,9 @@ class Retrieve:
         camera = query.camera
         mask = None if self.mask is None else read_mask(self.mask, camera)
         image = read_opacity(query.image, camera) if self.silhouette else None
-        photo = None if query.image is None else read_image(query.image, camera)
+        # A table needs no photo, which may have moved.
+        shown = None if self.out is None else query.image
+        photo = None if shown is None else read_image(shown, camera)
         console = new_console()
         with console.status("retrieving (the first time after an installation takes a minute)"):
             matches = library.retrieve(

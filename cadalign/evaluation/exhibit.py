@@ -25,6 +25,7 @@ dataset's times ``stretch``. ``std`` and ``sigma`` are null for methods that hav
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,6 +52,7 @@ EXHIBIT_COLUMNS: Columns = (
 _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
 _LONGEST_NAME = 200  # bytes
+_LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,8 @@ def exhibit_stem(category: str, model_id: str, view: int = 0) -> str:
     name = f"{category}_{model_id}"
     stem = name.replace("/", "_").replace("\0", "_")
     coded = name.encode("utf-8", "replace")
-    if stem != name or len(coded) > _LONGEST_NAME:  # what no file can be called
+    # What no file can be called, and what would read as another model's view.
+    if stem != name or len(coded) > _LONGEST_NAME or _LIKE_A_VIEW.search(name):
         stem = f"{stem[:40]}-{hashlib.sha256(coded).hexdigest()[:12]}"
     return stem if view == 0 else f"{stem}_{view}"
 

@@ -210,7 +210,11 @@ def run_retrieval(
     pool = workers_of(workers, dask=dask)
     folder.make()
     file = folder.path / "library.cadalign"
-    if not file.exists():  # another run's, which is to be refused, stays as it is
+    name = library.fingerprint[:16]
+    claimed = folder.read_config()
+    # One that no run.json speaks of is from a run that died before it began, perhaps another's; the
+    # library of another run, which is to be refused, stays as it is.
+    if claimed is None or claimed.get("library") == name:
         library.save(file)
     execute(
         RetrievalExperiment(str(file.absolute()), options),
@@ -219,7 +223,7 @@ def run_retrieval(
         config={
             "experiment": "retrieval",
             "root": str(Path(root).absolute()),
-            "library": library.fingerprint[:16],
+            "library": name,
             **asdict(options),
         },
         chunk_size=_CHUNK,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.retrieval_outcome import LEAVE_IN, LEAVE_OUT, NO_VIEW
@@ -103,10 +104,18 @@ def write_retrieval_report(folder: RunFolder) -> list[RetrievalSummary]:
 
 def summarize_retrieval(folder: RunFolder) -> list[RetrievalSummary]:
     """A summary for every category, protocol, method, noise and number of keypoints."""
-    table = read_table(folder.results)
-    cells = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-    seconds = read_table(folder.timings, columns=["seconds"])["seconds"]
-    cells["milliseconds"] = 1e3 * seconds.to_numpy(zero_copy_only=False).astype(float)
+    return summarize_retrieval_tables(
+        read_table(folder.results), read_table(folder.timings, columns=["seconds"])
+    )
+
+
+def summarize_retrieval_tables(results: pa.Table, timings: pa.Table) -> list[RetrievalSummary]:
+    """The same of its tables, which may be those of an unfinished run."""
+    cells = {name: results[name].to_numpy(zero_copy_only=False) for name in results.column_names}
+    seconds = np.full(len(results), np.nan)
+    if len(timings) == len(results):  # they may not have been kept
+        seconds = timings["seconds"].to_numpy(zero_copy_only=False).astype(float)
+    cells["milliseconds"] = 1e3 * seconds
     categories = sorted(set(cells["category"].tolist()))
     groups = [*categories, ALL] if len(categories) > 1 else [ALL]
     return [

@@ -101,9 +101,9 @@ def retrieval_plots(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def _summaries(run: Run) -> list[RetrievalSummary]:
-    from cadalign.evaluation.retrieval_report import summarize_retrieval
+    from cadalign.evaluation.retrieval_report import summarize_retrieval_tables
 
-    return summarize_retrieval(run.folder)
+    return summarize_retrieval_tables(run.results, run.timings)
 
 
 def _group(summary: RetrievalSummary) -> str:

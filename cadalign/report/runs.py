@@ -174,9 +174,9 @@ def _read(path: Path, name: str) -> Run:
         timings = [folder.timings] if folder.timings.is_file() else []
         return Run(folder, name, config, read_table(folder.results), _joined(timings), total, total)
     parts = _parts(folder, folder.part)
-    if not parts or config["experiment"] == RETRIEVAL:  # ranks are summed up at its end only
+    if not parts:
         raise DataError(
-            "the run is not finished yet" if parts else "nothing of the run is finished yet",
+            "nothing of the run is finished yet",
             where=str(path),
             fix="wait, or start the command that made it again: it goes on",
         )

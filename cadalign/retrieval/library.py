@@ -203,8 +203,9 @@ class Library:
 
         The likelihood that models are compared by, also such with different sets of keypoints, is
         described in `cadalign.retrieval.options`. Only models whose best possible likelihood (a
-        bound) can reach the list are searched for their pose; the list is the same as if all were.
-        Ties are broken by category and id.
+        bound) leaves them a chance are searched for their pose: every match with a score above 1e-8
+        is where it would be if all were searched, and up to 768 more are searched to fill the rest
+        of the list. Ties are broken by category and id.
 
         Parameters
         ----------

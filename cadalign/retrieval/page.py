@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.camera import Camera
 from cadalign.errors import CadalignError
-from cadalign.files import write_json, write_text
+from cadalign.files import write_json, write_text, writing
 from cadalign.picture import write_image
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
 from cadalign.render.color import ByteImage
@@ -97,8 +97,7 @@ def write_retrieval(
     photo = image
     if photo is None:
         photo = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    for old in folder.glob("overlay_*.png"):
-        old.unlink()
+    _remove_overlays(folder)
     for place, match in enumerate(matches, start=1):
         write_image(folder / overlay_name(place), draw_match(photo, camera, match))
     write_json(folder / "matches.json", [match.to_dict() for match in matches])
@@ -123,6 +122,15 @@ def write_retrieval(
 def overlay_name(place: int) -> str:
     """The file name of a match's overlay, the first being 1."""
     return f"overlay_{place:02d}.png"
+
+
+def _remove_overlays(folder: Path) -> None:
+    """Remove what an earlier retrieval drew, and nothing else of that name's kind."""
+    with writing(folder):
+        for path in folder.glob("overlay_*.png"):
+            place = path.stem.removeprefix("overlay_")
+            if place.isdecimal() and path.name == overlay_name(int(place)):
+                path.unlink()
 
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:

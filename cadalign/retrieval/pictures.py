@@ -8,6 +8,7 @@ import numpy as np
 
 from cadalign.camera import Camera
 from cadalign.errors import InputError
+from cadalign.photo import open_photo
 from cadalign.picture import read_image
 from cadalign.render.color import ByteImage
 from cadalign.validation import BoolArray
@@ -25,7 +26,7 @@ def read_mask(path: Path, camera: Camera) -> BoolArray:
 
 
 def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
-    """Read a photo with its opacity if it has one, (h, w, 3 or 4) uint8.
+    """Read a photo with its opacity if it has one, (h, w, 3 or 4) uint8, upright by EXIF.
 
     Raises
     ------
@@ -41,10 +42,11 @@ def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
             fix="give its image, or the object's pixels with --mask",
         )
     colors = read_image(path, camera)
-    from PIL import Image
+    from PIL import ImageOps
 
-    with Image.open(path) as image:
-        if "A" not in image.getbands():
+    with open_photo(path) as image:
+        if not image.has_transparency_data:
             return colors
-        opacity = np.asarray(image.getchannel("A"))
-    return np.dstack([colors, opacity])
+        # A transparent colour, as of a palette, is no channel of its own in the file.
+        opacity = ImageOps.exif_transpose(image).convert("RGBA").getchannel("A")
+        return np.dstack([colors, np.asarray(opacity)])

@@ -92,6 +92,15 @@ export class Comparison {
     return chosen ?? report.fitted.find((method) => runsOf(method) > 1) ?? report.fitted[0];
   }
 
+  failed(instance) {
+    return this.report.failed(instance, this.method().key);
+  }
+
+  /** Whether nothing failed, but there are no two values to compare, as of a box without volume. */
+  isUnknown({ a, b, before, after }) {
+    return (before === null || after === null) && !this.failed(a) && !this.failed(b);
+  }
+
   update() {
     const { report, state } = this;
     this.a = state.number("a") ?? 0;
@@ -101,9 +110,11 @@ export class Comparison {
     this.pairs = pairs(report, { a: this.a, b: this.b, method, metric: this.metric });
     const worse = this.pairs.filter(({ change }) => change > 0).length;
     const better = this.pairs.filter(({ change }) => change < 0).length;
+    const unknown = this.pairs.filter((pair) => this.isUnknown(pair)).length;
     this.status.textContent = this.pairs.length
       ? `${plural(this.pairs.length, "instance")} in both: ${better} better, ${worse} worse, ` +
-        `${this.pairs.length - better - worse} the same.`
+        `${this.pairs.length - better - worse - unknown} the same` +
+        (unknown ? `, ${unknown} without a value in both.` : ".")
       : "No instance is in both.";
     this.shown = PAGE;
     this.list.replaceChildren();
@@ -120,20 +131,13 @@ export class Comparison {
 
   card(pair) {
     const { change, a, b } = pair;
-    const words = Number.isFinite(change)
-      ? change === 0
-        ? "the same"
-        : `${change < 0 ? "better" : "worse"} by ${quantity(Math.abs(change), this.metric)}`
-      : change > 0
-        ? "now fails"
-        : "no longer fails";
     const side = (instance, value) =>
       h(
         "span",
         { class: "side" },
         this.thumb(instance),
         h("span", { class: "soft" }, this.report.runs[instance.run].name),
-        h("strong", {}, value === null ? "failed" : quantity(value, this.metric)),
+        h("strong", {}, this.failed(instance) ? "failed" : quantity(value, this.metric)),
       );
     return h(
       "li",
@@ -146,10 +150,21 @@ export class Comparison {
         h(
           "span",
           { class: change > 0 ? "worse" : change < 0 ? "better" : "soft" },
-          `${arrow(change)} ${words}`,
+          this.words(pair),
         ),
       ),
     );
+  }
+
+  /** What became of an instance. */
+  words(pair) {
+    const { change } = pair;
+    if (this.isUnknown(pair)) return "nothing to compare";
+    if (change === 0) return "= the same";
+    const arrow = change > 0 ? "\u25b2" : "\u25bc";
+    if (!Number.isFinite(change)) return `${arrow} ${change > 0 ? "now fails" : "no longer fails"}`;
+    const by = quantity(Math.abs(change), this.metric);
+    return `${arrow} ${change < 0 ? "better" : "worse"} by ${by}`;
   }
 
   thumb(instance) {
@@ -170,11 +185,11 @@ export class Comparison {
   chart() {
     const both = this.pairs.filter(({ before, after }) => before !== null && after !== null);
     const dots = both.slice(0, DOTS);
-    const failed = this.pairs.length - both.length;
+    const missing = this.pairs.length - both.length;
     this.note.textContent =
       "Below the line the second run is " +
       `${this.metric.better === "high" ? "worse" : "better"}. A click opens the instance.` +
-      (failed ? ` Not drawn: ${plural(failed, "pair")} with a failure.` : "") +
+      (missing ? ` Not drawn: ${plural(missing, "pair")} without two values.` : "") +
       (both.length > DOTS ? ` Drawn: the ${DOTS} that changed most.` : "");
     // On a logarithmic axis nothing is at zero.
     const positive = dots
@@ -231,5 +246,3 @@ export class Comparison {
     };
   }
 }
-
-const arrow = (change) => (change > 0 ? "\u25b2" : change < 0 ? "\u25bc" : "=");

@@ -16,13 +16,16 @@ export function criteria(report, state) {
   return { metric, shown, methods: chosen ? [chosen] : shown, chosen };
 }
 
-/** The larger the worse; failures are worst, and what was not tried is not a number. */
+/** The larger the worse; failures are worst, and what has no value is not a number. */
 function badness(report, instance, { metric, methods }) {
   let worst = NaN;
   for (const { key } of methods) {
     if (!instance.rows.has(key)) continue;
     const value = metric ? report.error(instance, key, metric.key) : null;
-    const bad = value === null ? Infinity : metric.better === "high" ? -value : value;
+    const failed = report.failed(instance, key);
+    // A good fit may have no value, as the box IoU of a model without volume.
+    if (value === null && !failed) continue;
+    const bad = failed ? Infinity : metric.better === "high" ? -value : value;
     if (!(worst >= bad)) worst = bad;
   }
   return worst;

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.files import write_json as write_json
 from cadalign.validation import as_floats
 
 _LARGEST_INDEX = 2**63 - 1

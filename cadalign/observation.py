@@ -35,6 +35,7 @@ import numpy.typing as npt
 
 from cadalign.camera import Camera
 from cadalign.errors import DataError
+from cadalign.files import write_json
 from cadalign.json_file import (
     as_index,
     as_number,
@@ -43,7 +44,6 @@ from cadalign.json_file import (
     in_file,
     read_json,
     refuse_unknown,
-    write_json,
     written_path,
 )
 from cadalign.validation import FloatArray, IntArray, as_floats, as_points

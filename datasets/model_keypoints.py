@@ -35,6 +35,7 @@ import numpy as np
 from cadalign.datasets.keypointnet import AnnotatedModel
 from cadalign.datasets.meshes import load_mesh
 from cadalign.errors import CadalignError, DataError
+from cadalign.files import write_json
 from cadalign.json_file import (
     as_index,
     as_numbers,
@@ -44,7 +45,6 @@ from cadalign.json_file import (
     in_file,
     read_json,
     refuse_unknown,
-    write_json,
     written_path,
 )
 from cadalign.mesh import Mesh

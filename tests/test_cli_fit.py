@@ -106,7 +106,7 @@ def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
     blue = np.full((480, 640, 3), (200, 90, 40), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), blue)
     (tmp_path / "model.obj").write_text(TETRAHEDRON)
-    path = write_observation(tmp_path / "chair.json", image=Path("photo.png"))
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
     edit(path, lambda data: data.update(model="model.obj"))
     assert main(["fit", str(path)]) == 0
     picture = tmp_path / "chair_fit" / "overlay.png"
@@ -204,13 +204,13 @@ def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_missing_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json", image=Path("photo.png"))
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
     assert refusal(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
 
 
 def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((10, 20, 3), dtype=np.uint8))
-    path = write_observation(tmp_path / "chair.json", image=Path("photo.png"))
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
     assert refusal(capsys, "fit", str(path)) == (
         f"{tmp_path / 'photo.png'}: the image is 20 x 10, the camera 640 x 480; "
         "give the camera of this image"
@@ -219,7 +219,7 @@ def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 def test_photo_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photo.png").write_text("not a picture")
-    path = write_observation(tmp_path / "chair.json", image=Path("photo.png"))
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
     assert refusal(capsys, "fit", str(path)).startswith(
         f"{tmp_path / 'photo.png'}: not an image that can be read ("
     )
@@ -241,7 +241,7 @@ def test_model_that_cannot_be_used(
     model = tmp_path / "model.obj"
     if content is not None:
         model.write_text(content)
-    path = write_observation(tmp_path / "chair.json", model=Path("model.obj"))
+    path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
     line = refusal(capsys, "fit", str(path))
     assert line.startswith(str(model))
     if text is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,17 @@ class Case:
         """Semantic ids and pixels of the visible keypoints."""
         ids = self.instance.semantic_ids.tolist()
         return list(zip(ids, self.instance.points_2d.tolist(), strict=True))
+
+    def copied_to(self, folder: Path) -> Case:
+        """The same with a photo's folder of its own, which can be written to."""
+        shutil.copytree(self.folder, folder)
+        return replace(
+            self,
+            folder=folder,
+            photo=folder / self.photo.name,
+            camera=folder / self.camera.name,
+            keypoints=folder / self.keypoints.name,
+        )
 
     def open(self, **options: Any) -> Session:
         """A session with the calibrated camera and the model's keypoints."""

@@ -1,7 +1,8 @@
-"""What tests of fits share: random problems, steps of the unknowns, comparisons."""
+"""What tests share: random problems, steps of the unknowns, comparisons, edited files."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from typing import Any
 
@@ -53,3 +54,17 @@ def assert_drawn_stretches_are_recovered(images: Iterable[Correspondences]) -> N
         found = fit(image.points_3d / scale, image.points_2d, image.camera, method="aepnp")
         np.testing.assert_allclose(found.alignment.scale, scale, rtol=0.01)
         assert rotation_error(est=found.alignment, gt=image.cam_from_world) < 0.5
+
+
+def replaced(data: Any, path: str, value: Any) -> Any:
+    """The data with the entry at a dotted path replaced; removed where the value is `...`."""
+    data = copy.deepcopy(data)
+    *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    place: Any = data
+    for part in parents:
+        place = place[part]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    return data

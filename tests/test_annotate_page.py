@@ -45,16 +45,7 @@ def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Cas
 
 @pytest.fixture
 def case(original: Case, tmp_path: Path) -> Case:
-    folder = tmp_path / "photos"
-    shutil.copytree(original.folder, folder)
-    return Case(
-        folder,
-        folder / original.photo.name,
-        folder / original.camera.name,
-        original.model,
-        folder / original.keypoints.name,
-        original.instance,
-    )
+    return original.copied_to(tmp_path / "photos")
 
 
 class Driver:

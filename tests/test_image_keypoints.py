@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support import replaced
 
 from cadalign import Camera
 from cadalign.datasets import (
@@ -64,16 +64,7 @@ def read(tmp_path: Path, data: Any, name: str = "keypoints.json") -> list[ImageK
 
 def changed(path: str, value: Any) -> dict[str, Any]:
     """The annotations with the entry at a dotted path replaced; removed where it is `...`."""
-    data = copy.deepcopy(ANNOTATIONS)
-    *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-    place: Any = data
-    for part in parents:
-        place = place[part]
-    if value is ...:
-        del place[last]
-    else:
-        place[last] = value
-    return data
+    return replaced(ANNOTATIONS, path, value)
 
 
 # --- COCO and its relatives -------------------------------------------------------------------

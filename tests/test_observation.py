@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support import replaced
 
 from cadalign import Camera
 from cadalign.errors import DataError, InputError
@@ -31,16 +31,7 @@ DATA: dict[str, Any] = {
 
 def changed(path: str, value: Any) -> dict[str, Any]:
     """The data with the entry at a dotted path replaced; removed where the value is `...`."""
-    data = copy.deepcopy(DATA)
-    *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-    place: Any = data
-    for part in parents:
-        place = place[part]
-    if value is ...:
-        del place[last]
-    else:
-        place[last] = value
-    return data
+    return replaced(DATA, path, value)
 
 
 def write(path: Path, data: Any) -> Path:

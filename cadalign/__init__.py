@@ -3,21 +3,22 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cadalign.alignment import Alignment
-from cadalign.box import Box
-from cadalign.camera import Camera
 from cadalign.errors import CadalignError
-from cadalign.focal import FocalPrior
-from cadalign.mesh import Material, Mesh
-from cadalign.result import FitResult
+from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Material, Mesh
 
 if TYPE_CHECKING:
-    from cadalign.batch import BatchResult
+    from cadalign import datasets, errors, metrics, render, retrieval, solvers
     from cadalign.evaluation.api import evaluate, simulate
-    from cadalign.fitting import fit, fit_batch
+    from cadalign.fitting.batch import BatchResult
+    from cadalign.fitting.fit import fit, fit_batch
+    from cadalign.fitting.robust import RansacOptions
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
-    from cadalign.robust import RansacOptions
 
 __version__ = "0.1.0"
 
@@ -34,28 +35,41 @@ __all__ = [
     "Material",
     "Mesh",
     "RansacOptions",
+    "datasets",
+    "errors",
     "evaluate",
     "fit",
     "fit_batch",
+    "metrics",
+    "render",
+    "retrieval",
     "simulate",
+    "solvers",
 ]
 
-# What needs the compiler is imported when it is first asked for: `import cadalign` stays quick.
-_LAZY = {
-    "RansacOptions": "cadalign.robust",
-    "BatchResult": "cadalign.batch",
+# Imported when first asked for, so that `import cadalign` stays quick.
+_NAMES = {
+    "RansacOptions": "cadalign.fitting.robust",
+    "BatchResult": "cadalign.fitting.batch",
     "Library": "cadalign.retrieval.library",
     "Match": "cadalign.retrieval.match",
     "evaluate": "cadalign.evaluation.api",
-    "fit": "cadalign.fitting",
-    "fit_batch": "cadalign.fitting",
+    "fit": "cadalign.fitting.fit",
+    "fit_batch": "cadalign.fitting.fit",
     "simulate": "cadalign.evaluation.api",
 }
+_MODULES = ("datasets", "metrics", "render", "retrieval", "solvers")
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        value = getattr(import_module(_LAZY[name]), name)
+    if name in _MODULES:
+        return import_module(f"cadalign.{name}")
+    if name in _NAMES:
+        value = getattr(import_module(_NAMES[name]), name)
         globals()[name] = value
         return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import cadalign
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 from cadalign.render.remedy import remedy
 from cadalign.render.select import best_renderer
@@ -64,7 +63,7 @@ def examine() -> Health:
 def compiled_cache() -> str:
     """Say whether Numba keeps compiled solvers on disk, and how many are there."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(chosen) if chosen else Path(cadalign.__file__).parent / "solvers" / "__pycache__"
+    folder = Path(chosen) if chosen else Path(__file__).parent
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
     existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
     if count:

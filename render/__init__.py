@@ -1,9 +1,8 @@
 """Drawing: scenes, renderers, visibility, views, overlays and pictures."""
 
-from cadalign.render.frame import Frame, Geometry, Renderer
-from cadalign.render.movie import contact_sheet, write_movie
-from cadalign.render.overlay import draw_overlay
-from cadalign.render.pictures import (
+from cadalign.render.drawing.movie import contact_sheet, write_movie
+from cadalign.render.drawing.overlay import draw_overlay
+from cadalign.render.drawing.pictures import (
     depth_picture,
     face_picture,
     feature_lines,
@@ -11,15 +10,16 @@ from cadalign.render.pictures import (
     line_picture,
     normal_picture,
 )
+from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
+from cadalign.render.frame import Frame, Geometry, Renderer
 from cadalign.render.probe import Probe, probe_renderer
-from cadalign.render.raycast import RaycastRenderer, cast_geometry
+from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
+from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 from cadalign.render.select import make_renderer
-from cadalign.render.shading import Studio
-from cadalign.render.silhouette import silhouette_iou
-from cadalign.render.stills import Angles, draw_still, pose_in_view, turntable
-from cadalign.render.views import View, frame_object, look_at, sample_view
-from cadalign.render.visibility import visible_keypoints
+from cadalign.render.views.silhouette import silhouette_iou
+from cadalign.render.views.views import View, frame_object, look_at, sample_view
+from cadalign.render.views.visibility import visible_keypoints
 
 __all__ = [
     "Angles",

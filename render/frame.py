@@ -8,12 +8,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.alignment import Alignment
-from cadalign.camera import Camera
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, RenderError
-from cadalign.render.color import ByteImage, bytes_from_linear, linear_from_bytes
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import ByteImage, bytes_from_linear, linear_from_bytes
 from cadalign.render.scene import Scene
-from cadalign.validation import FloatArray
 
 LIGHT_GREY = (228, 230, 233)
 MAX_SIDE = 16384

@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.alignment import Alignment
-from cadalign.camera import Camera
 from cadalign.errors import CadalignError, InputError
-from cadalign.mesh import Mesh
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.render.frame import Renderer
+from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
-from cadalign.render.shading import Studio
 
 RENDERERS: dict[str, str] = {
-    "pyrender": "cadalign.render.pyrender_renderer:PyrenderRenderer",
-    "open3d": "cadalign.render.open3d_renderer:Open3DRenderer",
-    "raycast": "cadalign.render.raycast:RaycastRenderer",
+    "pyrender": "cadalign.render.opengl.renderer:PyrenderRenderer",
+    "open3d": "cadalign.render.open3d.renderer:Open3DRenderer",
+    "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
 }
 """Where each renderer's class is."""
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.mesh import Mesh
-from cadalign.render.caster import RayCaster
-from cadalign.render.coincident import coincident_faces
-from cadalign.render.normals import corner_normals
-from cadalign.render.surface import Surface
-from cadalign.validation import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.mesh import Mesh
+from cadalign.render.raycast.caster import RayCaster
+from cadalign.render.raycast.coincident import coincident_faces
+from cadalign.render.raycast.normals import corner_normals
+from cadalign.render.raycast.surface import Surface
 
 
 class Scene:
@@ -65,14 +65,14 @@ class Scene:
     @cached_property
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
-        from cadalign.render.open3d_engine import Open3DEngine
+        from cadalign.render.open3d.engine import Open3DEngine
 
         return RayCaster(self.mesh.vertices, self.mesh.faces, engine=Open3DEngine)
 
     @cached_property
     def gl_meshes(self) -> tuple[Any, Any]:
         """The front and back sides for OpenGL, both a `pyrender.Mesh`."""
-        from cadalign.render.gl_mesh import gl_meshes
+        from cadalign.render.opengl.mesh import gl_meshes
 
         return gl_meshes(self)
 

@@ -7,7 +7,7 @@ import logging
 from cadalign.errors import InputError, RenderError
 from cadalign.render.frame import Renderer
 from cadalign.render.probe import RENDERERS, load_renderer, probe_renderer
-from cadalign.render.shading import Studio
+from cadalign.render.raycast.shading import Studio
 
 logger = logging.getLogger("cadalign")
 

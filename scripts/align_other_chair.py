@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign.alignment import Alignment
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.wireframe import Wireframe
-from cadalign.box import Box
-from cadalign.camera import Camera
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
-from cadalign.fitting import fit
-from cadalign.observation import Observation
-from cadalign.picture import write_image
+from cadalign.fitting.fit import fit
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
 from cadalign.render import (
     Angles,
     RaycastRenderer,
@@ -32,8 +32,8 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.color import ByteImage
-from cadalign.render.stills import on_background
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.stills import on_background
 
 CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 VIEW = Angles(azimuth=143.0, elevation=24.0)

@@ -17,8 +17,8 @@ from rich.table import Table
 import cadalign
 from cadalign import Camera, RansacOptions, metrics
 from cadalign.errors import CadalignError
-from cadalign.evaluation.limits import cramer_rao_bound, sample_limit
-from cadalign.simulation import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
 
 UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 ERRORS = (

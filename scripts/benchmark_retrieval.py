@@ -21,7 +21,7 @@ import numpy as np
 from cadalign import Library
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.retrieval_tasks import RetrievalTask, observe_model
+from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.retrieval import LibraryModel
 
 KEYPOINTS = 8

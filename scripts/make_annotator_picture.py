@@ -17,7 +17,7 @@ from pathlib import Path
 import tyro
 from playwright.sync_api import Page, sync_playwright
 
-from cadalign.observation import Observation
+from cadalign.io.observation import Observation
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.mesh

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import tyro
 
-from cadalign.box import Box
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.instance import make_instance
-from cadalign.fitting import fit
-from cadalign.picture import write_image
+from cadalign.evaluation.instances.instance import make_instance
+from cadalign.fitting.fit import fit
+from cadalign.geometry.box import Box
+from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cadalign.errors import CadalignError
-from cadalign.evaluation.paper import PaperPlan, reproduce_paper
-from cadalign.evaluation.run import Progress
+from cadalign.evaluation.paper.reproduction import PaperPlan, reproduce_paper
+from cadalign.evaluation.runs.run import Progress
 
 
 def main() -> int:

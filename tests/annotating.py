@@ -20,8 +20,8 @@ from cadalign.annotate.server import listen, make_app
 from cadalign.annotate.session import Session
 from cadalign.annotate.state import state_of
 from cadalign.datasets import KeypointNet, ModelKeypoints
-from cadalign.evaluation.instance import Instance, make_instance
-from cadalign.picture import write_image
+from cadalign.evaluation.instances.instance import Instance, make_instance
+from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer
 
 

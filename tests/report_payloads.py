@@ -15,8 +15,8 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Mesh
-from cadalign.evaluation.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.sketch import sketch_of
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.preview import sketch_of
 from cadalign.render import look_at
 from cadalign.report.looks import METRICS, method_dict
 from cadalign.report.page import render_page

@@ -31,7 +31,11 @@ MODULES = modules_with_examples()
 def test_examples_are_looked_for_in_every_package() -> None:
     packages = {name.split(".")[1] for name in MODULES if name.count(".") > 1}
     assert {"datasets", "render"} <= packages
-    assert {"cadalign.alignment", "cadalign.camera", "cadalign.fitting"} <= set(MODULES)
+    assert {
+        "cadalign.geometry.alignment",
+        "cadalign.geometry.camera",
+        "cadalign.fitting.fit",
+    } <= set(MODULES)
 
 
 @pytest.mark.parametrize("name", MODULES)

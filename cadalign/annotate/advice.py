@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.alignment import Alignment
 from cadalign.annotate.prediction import predicted_covariances, projection_jacobian
-from cadalign.camera import Camera
-from cadalign.deviation import unknown_axes
-from cadalign.validation import FloatArray
+from cadalign.arrays import FloatArray
+from cadalign.fitting.uncertainty import unknown_axes
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 
 
 @dataclass(frozen=True)

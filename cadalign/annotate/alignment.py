@@ -8,12 +8,12 @@ import numpy as np
 
 from cadalign.annotate.contradictions import Rows, find_contradictions
 from cadalign.annotate.document import FocalChoice
-from cadalign.camera import Camera
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.fitting import fit
-from cadalign.focal import FocalPrior
-from cadalign.result import FitResult
-from cadalign.validation import FloatArray
+from cadalign.fitting.fit import fit
+from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.camera import Camera
 
 LEAST_PAIRS = 4
 _LEAST_SIGMA = 1.0

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.prediction import predicted_covariances, projection_jacobian
-from cadalign.camera import Camera
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError
-from cadalign.result import FitResult
-from cadalign.validation import BoolArray, FloatArray
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.camera import Camera
 
 Rows = npt.NDArray[np.intp]
 FitRows = Callable[[Rows, bool], tuple[FitResult, Camera]]

@@ -8,9 +8,9 @@ import numpy as np
 
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.simplify import simplify
-from cadalign.mesh import Mesh
-from cadalign.render.caster import FaceArray
-from cadalign.render.color import bytes_from_linear
+from cadalign.geometry.mesh import Mesh
+from cadalign.render.drawing.color import bytes_from_linear
+from cadalign.render.raycast.caster import FaceArray
 from cadalign.render.scene import Scene
 
 MOST_FACES = 150_000

@@ -17,12 +17,15 @@ import numpy as np
 
 from cadalign.annotate.document import Document, Pair
 from cadalign.annotate.keypoint_book import KeypointBook
-from cadalign.camera import Camera
-from cadalign.datasets.annotations import parse_entry, read_entries
-from cadalign.datasets.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
+from cadalign.arrays import FloatArray
+from cadalign.datasets.models.annotations import parse_entry, read_entries
+from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError
-from cadalign.files import write_json
-from cadalign.json_file import (
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import write_json
+from cadalign.io.json_file import (
     as_index,
     as_numbers,
     as_object,
@@ -30,10 +33,7 @@ from cadalign.json_file import (
     read_json,
     refuse_unknown,
 )
-from cadalign.mesh import Mesh
-from cadalign.observation import Observation
-from cadalign.result import FitResult
-from cadalign.validation import FloatArray
+from cadalign.io.observation import Observation
 
 _UNFINISHED = "cadalign unfinished pairs"
 SAME_PLACE = 1e-6

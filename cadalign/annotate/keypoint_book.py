@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.arrays import FloatArray
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.validation import FloatArray
 
 _LONGEST_NAME = 80
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from cadalign.annotate.alignment import Lens
 from cadalign.annotate.photos import Photo
-from cadalign.camera import Camera
-from cadalign.camera_files import read_camera_views
 from cadalign.errors import CadalignError, DataError
-from cadalign.focal import FocalPrior
-from cadalign.json_file import read_json
+from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.geometry.camera import Camera
+from cadalign.io.json_file import read_json
+from cadalign.render.views.camera_files import read_camera_views
 
 _LIKELY_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]
 

@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.alignment import Alignment
-from cadalign.camera import Camera
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.arrays import FloatArray, IntArray, as_floats
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.mesh import Mesh
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.render.scene import Scene
-from cadalign.render.visibility import visible_keypoints
-from cadalign.validation import FloatArray, IntArray, as_floats
+from cadalign.render.views.visibility import visible_keypoints
 
 _SAMPLES = 96
 _SAMPLED_FROM = 20_000

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import ImageOps
 
 from cadalign.errors import DataError, InputError
-from cadalign.photo import open_photo
+from cadalign.io.images import open_photo
 
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}

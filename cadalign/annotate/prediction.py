@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.alignment import Alignment
-from cadalign.camera import Camera
-from cadalign.deviation import unknown_axes
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.validation import FloatArray
+from cadalign.fitting.uncertainty import unknown_axes
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 
 _WITHOUT_FOCAL, _WITH_FOCAL = 8, 9
 

@@ -21,11 +21,11 @@ from cadalign.annotate.lenses import lens_of, read_camera
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.photos import Photo, find_photos
 from cadalign.annotate.session import Session, Slide
-from cadalign.camera import Camera
-from cadalign.datasets.meshes import load_mesh
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
-from cadalign.mesh import Mesh
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 
 logger = logging.getLogger("cadalign")
 

@@ -21,8 +21,8 @@ from cadalign.annotate.photos import Photo
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError
-from cadalign.json_file import as_index, as_numbers, as_text
-from cadalign.simulation import simulate_problem
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.json_file import as_index, as_numbers, as_text
 
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length, in image widths
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.clustering import merge_vertices
-from cadalign.mesh import Mesh
-from cadalign.validation import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.clustering import merge_vertices
+from cadalign.geometry.mesh import Mesh
 
 _MOST_CELLS = float(1 << 20)  # along an axis, so that a cell's number fits into 63 bits
 _FACES_PER_CELL = 9.4  # over the number of cells along an axis, squared: a sphere's

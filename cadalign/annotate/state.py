@@ -12,7 +12,7 @@ from cadalign.annotate.session import Outcome, Session, Slide
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.annotate.wireframe import box_lines
 from cadalign.annotate.words import advice_text, facts_of, notes_of
-from cadalign.validation import FloatArray
+from cadalign.arrays import FloatArray
 
 
 def state_of(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:

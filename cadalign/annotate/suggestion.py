@@ -11,7 +11,7 @@ from cadalign.annotate.advice import Advice, best_next
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.keypoint_book import KeypointBook
 from cadalign.annotate.model import CadModel
-from cadalign.datasets.model_keypoints import ModelKeypoint
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 
 _APART = 0.02  # corners nearer to a marked point, in diagonals, are no other points
 

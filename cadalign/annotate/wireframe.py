@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.alignment import Alignment
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.simplify import simplify
-from cadalign.box import BOX_EDGES, Box
-from cadalign.camera import Camera
-from cadalign.mesh import Mesh
-from cadalign.validation import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 
 _MOST_FACES = 30_000
 _MOST_FOLDS = 1500

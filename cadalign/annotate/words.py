@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.annotate.advice import Advice, unknown_name
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.result import FitResult
+from cadalign.fitting.result import FitResult
 
 _ROTATIONS = 3
 _UNCERTAIN = 1.0  # relative deviation beyond which a number says nothing

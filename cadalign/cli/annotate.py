@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.cli.output import make_folder, new_console
-from cadalign.files import writing
+from cadalign.io.files import writing
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from cadalign.cli.output import make_folder, new_console, progress_over
 from cadalign.errors import InputError
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.outcome import Outcome
+    from cadalign.evaluation.accuracy.outcome import Outcome
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,13 @@ class Demo:
         if self.seed < 0:
             raise InputError(f"{self.seed} is negative", where="--seed")
         # Renderers and solvers take a moment to import; `cadalign --help` should not wait for them.
-        from cadalign.demo import choose_models, open_dataset, run_demo, write_results
-        from cadalign.evaluation.outcome import OK
+        from cadalign.evaluation.accuracy.outcome import OK
+        from cadalign.evaluation.demo.demo import (
+            choose_models,
+            open_dataset,
+            run_demo,
+            write_results,
+        )
         from cadalign.report import write_report
 
         console = new_console()
@@ -76,7 +81,7 @@ class Demo:
 def _print_table(outcomes: Sequence[Outcome]) -> None:
     from rich.table import Table
 
-    from cadalign.evaluation.summary import summarize
+    from cadalign.evaluation.accuracy.summary import summarize
 
     table = Table(title="Medians per category")
     table.add_column("category")

@@ -16,8 +16,8 @@ from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.run_folder import RunFolder
-    from cadalign.evaluation.summary import CategorySummary
+    from cadalign.evaluation.accuracy.summary import CategorySummary
+    from cadalign.evaluation.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class EvaluateKeypointNet:
     def run(self) -> int:
         """Run the evaluation; returns the exit code."""
         from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet
-        from cadalign.evaluation.keypointnet_report import write_keypointnet_report
-        from cadalign.evaluation.run_folder import RunFolder
+        from cadalign.evaluation.keypointnet.figures import write_keypointnet_report
+        from cadalign.evaluation.runs.folder import RunFolder
 
         options = KeypointNetOptions(
             categories=self.categories,
@@ -111,8 +111,8 @@ class EvaluateShow:
     def run(self) -> int:
         """Show the run; returns the exit code, that of the run."""
         from cadalign.errors import DataError
-        from cadalign.evaluation.keypointnet_report import write_keypointnet_report
-        from cadalign.evaluation.run_folder import RunFolder
+        from cadalign.evaluation.keypointnet.figures import write_keypointnet_report
+        from cadalign.evaluation.runs.folder import RunFolder
 
         folder = RunFolder(self.run_folder)
         config = folder.read_config()
@@ -128,7 +128,7 @@ class EvaluateShow:
         if experiment == "retrieval":
             return conclude_retrieval(folder, json=self.json)
         if experiment == "correspondences":
-            from cadalign.evaluation.correspondences_report import write_correspondences_report
+            from cadalign.evaluation.correspondences.figures import write_correspondences_report
 
             return conclude(folder, write_correspondences_report(folder), json=self.json)
         return _conclude(folder, write_keypointnet_report(folder), json=self.json)

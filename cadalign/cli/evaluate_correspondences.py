@@ -14,8 +14,8 @@ from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.correspondences_report import CorrespondenceSummary, Quartiles
-    from cadalign.evaluation.run_folder import RunFolder
+    from cadalign.evaluation.correspondences.figures import CorrespondenceSummary, Quartiles
+    from cadalign.evaluation.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,12 @@ class EvaluateCorrespondences:
 
     def run(self) -> int:
         """Run the evaluation; returns the exit code."""
-        from cadalign.evaluation.correspondences import CorrespondenceOptions, run_correspondences
-        from cadalign.evaluation.correspondences_report import write_correspondences_report
-        from cadalign.evaluation.run_folder import RunFolder
+        from cadalign.evaluation.correspondences.experiment import (
+            CorrespondenceOptions,
+            run_correspondences,
+        )
+        from cadalign.evaluation.correspondences.figures import write_correspondences_report
+        from cadalign.evaluation.runs.folder import RunFolder
 
         options = CorrespondenceOptions(
             outliers=self.outliers,

@@ -14,8 +14,8 @@ from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.retrieval_report import RetrievalSummary
-    from cadalign.evaluation.run_folder import RunFolder
+    from cadalign.evaluation.retrieval.figures import RetrievalSummary
+    from cadalign.evaluation.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class EvaluateRetrieval:
 
     def run(self) -> int:
         """Run the evaluation; returns the exit code."""
-        from cadalign.evaluation.retrieval import run_retrieval
-        from cadalign.evaluation.retrieval_tasks import RetrievalEvaluation
-        from cadalign.evaluation.run_folder import RunFolder
+        from cadalign.evaluation.retrieval.experiment import run_retrieval
+        from cadalign.evaluation.retrieval.tasks import RetrievalEvaluation
+        from cadalign.evaluation.runs.folder import RunFolder
 
         options = RetrievalEvaluation(
             categories=self.categories,
@@ -96,9 +96,9 @@ class EvaluateRetrieval:
 
 def conclude_retrieval(folder: RunFolder, *, json: bool) -> int:
     """Write a finished run's summary and say what came out; returns its exit code."""
-    from cadalign.evaluation.outcome import FAILED
-    from cadalign.evaluation.retrieval_report import ALL, write_retrieval_report
-    from cadalign.evaluation.tables import read_table
+    from cadalign.evaluation.accuracy.outcome import FAILED
+    from cadalign.evaluation.retrieval.figures import ALL, write_retrieval_report
+    from cadalign.evaluation.runs.tables import read_table
 
     summaries = write_retrieval_report(folder)
     statuses = read_table(folder.results, columns=["status"])["status"].to_pylist()

@@ -13,8 +13,8 @@ import tyro
 from cadalign.cli.output import make_folder, new_console
 
 if TYPE_CHECKING:
-    from cadalign.observation import Observation
-    from cadalign.whitening import Sigma
+    from cadalign.fitting.noise import Sigma
+    from cadalign.io.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,12 @@ class Fit:
 
     def run(self) -> int:
         """Run the fit; returns the exit code."""
-        from cadalign.fitting import fit
-        from cadalign.focal import FocalPrior
-        from cadalign.observation import Observation
-        from cadalign.picture import draw_observation, write_image
-        from cadalign.robust import RansacOptions
+        from cadalign.fitting.fit import fit
+        from cadalign.fitting.focal.prior import FocalPrior
+        from cadalign.fitting.robust import RansacOptions
+        from cadalign.io.images import write_image
+        from cadalign.io.observation import Observation
+        from cadalign.render.drawing.fit_overlay import draw_observation
 
         observation = Observation.load(self.observation)
         console = new_console()

@@ -11,8 +11,8 @@ import tyro
 from cadalign.cli.output import make_folder, new_console
 
 if TYPE_CHECKING:
-    from cadalign.camera import Camera
     from cadalign.datasets import ImageKeypoints
+    from cadalign.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,10 @@ class Observe:
         DataError
             If the photo, the camera and the file of keypoints don't agree on the image's size.
         """
-        from cadalign.camera import Camera
         from cadalign.errors import DataError
-        from cadalign.json_file import in_file, read_json
-        from cadalign.photo import photo_size
+        from cadalign.geometry.camera import Camera
+        from cadalign.io.images import photo_size
+        from cadalign.io.json_file import in_file, read_json
 
         sizes: dict[str, tuple[int, int]] = {}
         camera = None

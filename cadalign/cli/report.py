@@ -13,7 +13,7 @@ from cadalign.cli.output import new_console
 from cadalign.errors import InputError
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.run_folder import RunFolder
+    from cadalign.evaluation.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Report:
         if self.out is None:
             sys.stdout.write(text)
         else:
-            from cadalign.files import write_text
+            from cadalign.io.files import write_text
 
             write_text(self.out, text)
         return 0

@@ -13,9 +13,9 @@ from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json
 
 if TYPE_CHECKING:
-    from cadalign.observation import Observation
+    from cadalign.fitting.noise import Sigma
+    from cadalign.io.observation import Observation
     from cadalign.retrieval import Match
-    from cadalign.whitening import Sigma
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Retrieve:
 
     def run(self) -> int:
         """Run the retrieval; returns the exit code."""
-        from cadalign.picture import read_image
+        from cadalign.io.images import read_image
         from cadalign.retrieval import Library
         from cadalign.retrieval.page import write_retrieval
         from cadalign.retrieval.pictures import read_mask, read_opacity

@@ -25,7 +25,7 @@ from cadalign.cli.output import new_console
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from cadalign.evaluation.run import Progress as RunProgress
+    from cadalign.evaluation.runs.run import Progress as RunProgress
 
 SUCCESS: Final = 0
 NOTHING_WORKED: Final = 1

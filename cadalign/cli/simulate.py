@@ -14,8 +14,8 @@ from cadalign.cli.report import write_run_report
 from cadalign.cli.runs import exit_code, print_json, run_progress
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.sweep import SweepKind
-    from cadalign.evaluation.sweep_report import SweepSummary
+    from cadalign.evaluation.simulation.experiment import SweepKind
+    from cadalign.evaluation.simulation.figures import SweepSummary
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class _Sweep:
     def run(self) -> int:
         """Run the simulation; returns the exit code."""
         from cadalign.evaluation.api import run_sweep, sweep_of
-        from cadalign.evaluation.run_folder import RunFolder
-        from cadalign.evaluation.sweep_report import write_sweep_report
+        from cadalign.evaluation.runs.folder import RunFolder
+        from cadalign.evaluation.simulation.figures import write_sweep_report
 
         kind = sweep_of(
             self.name,

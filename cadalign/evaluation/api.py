@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError
-from cadalign.evaluation.keypoint_tasks import AUTO, VISIBILITIES, KeypointTasks
-from cadalign.evaluation.keypointnet import KeypointNetExperiment
-from cadalign.evaluation.methods import LIMIT, check_methods
-from cadalign.evaluation.run import Progress, execute, workers_of
-from cadalign.evaluation.run_folder import RunFolder
-from cadalign.evaluation.sweep import (
+from cadalign.evaluation.accuracy.methods import LIMIT, check_methods
+from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.tasks import AUTO, VISIBILITIES, KeypointTasks
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress, execute, workers_of
+from cadalign.evaluation.simulation.experiment import (
     SWEEPS,
     SweepExperiment,
     SweepKind,
@@ -106,7 +106,8 @@ def evaluate(
         Names of `cadalign.fit`'s methods, variants of them, and ``limit``.
     visibility : {"auto", "rays", "hull"}
         Keypoints are seen that rays cast at the mesh reach (``rays``), or by a rule that needs no
-        mesh (``hull``, see `cadalign.evaluation.hull`). ``auto`` takes rays where there is a mesh.
+        mesh (``hull``, see ``evaluation/instances/hull.py``). ``auto`` takes rays where there is
+        a mesh.
     seed : int
     workers : int
         Processes; -1 for one for each core, 0 for none.
@@ -118,7 +119,7 @@ def evaluate(
     Returns
     -------
     pandas.DataFrame
-        A row for every view and method; see `cadalign.evaluation.outcome.Outcome`. Failed ones have
+        A row for every view and method; see ``evaluation/accuracy/outcome.py``. Failed ones have
         the status ``failed`` and a reason.
 
     Raises
@@ -168,7 +169,7 @@ def simulate(
     sweep : {"noise", "points", "outliers", "runtime"}
         What is varied.
     methods, values, runs, points, noise_px : optional
-        In place of the sweep's own; see `cadalign.evaluation.sweep.SWEEPS`.
+        In place of the sweep's own; see `cadalign.evaluation.simulation.experiment.SWEEPS`.
     seed, workers, dask, out
         As for `evaluate`.
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.accuracy.methods import LIMIT
+from cadalign.evaluation.accuracy.outcome import FAILED
 from cadalign.report.looks import HIGH, LOW
 
 _MOST_REASONS = 200

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from cadalign.evaluation.correspondences_report import (
+from cadalign.evaluation.accuracy.summary import ALL, summarize_cells
+from cadalign.evaluation.correspondences.figures import (
     ERRORS,
     CorrespondenceSummary,
     summarize_correspondence_tables,
 )
-from cadalign.evaluation.summary import ALL, summarize_cells
-from cadalign.evaluation.sweep import SWEEP_METRICS, SweepKind
-from cadalign.evaluation.sweep_report import (
+from cadalign.evaluation.simulation.experiment import SWEEP_METRICS, SweepKind
+from cadalign.evaluation.simulation.figures import (
     TIME_METRIC,
     VALUE_LABELS,
     SweepSummary,
@@ -135,7 +135,7 @@ def _stated(runs: Sequence[Run], categories: set[str]) -> tuple[list[HeadlineRow
     """The paper's rows on these categories, and what is to be said of them."""
     if 1.0 not in {run.noise_px for run in runs}:  # all that the paper's table is about
         return [], ""
-    from cadalign.evaluation.paper import PAPER_TABLE, PERCENT_NOTE
+    from cadalign.evaluation.paper.reproduction import PAPER_TABLE, PERCENT_NOTE
 
     rows = [
         headline_row(0, name, "AEPnP, stated in the paper", vars(stated), _INSTANCE_COLUMNS)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.accuracy.outcome import OK
 from cadalign.report.looks import METRICS
 from cadalign.report.runs import Run
 

@@ -6,8 +6,8 @@ import colorsys
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from cadalign.evaluation.methods import LIMIT
-from cadalign.evaluation.style import look_of
+from cadalign.evaluation.accuracy.methods import LIMIT
+from cadalign.evaluation.accuracy.style import look_of
 
 LOW, HIGH = "low", "high"
 """Which values are better."""

@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import quote
 
 from cadalign.errors import DataError
-from cadalign.evaluation.exhibit import exhibit_stem
-from cadalign.files import dense_json, write_text, write_whole, writing
+from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.io.files import dense_json, write_text, write_whole, writing
 from cadalign.report.instances import InstanceName, InstanceTable
 from cadalign.report.runs import Run
 

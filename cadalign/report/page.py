@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cadalign.files import dense_json, write_text, writing
+from cadalign.io.files import dense_json, write_text, writing
 from cadalign.report.headlines import headline_of
 from cadalign.report.instances import instance_table
 from cadalign.report.media import INLINE_LIMIT, Shelf, inline_bytes

@@ -34,9 +34,11 @@ of several runs; ``true_y`` and ``true_z`` are what the model was stretched by. 
 as results have them: shown is the value times the metric's ``factor``. ``limit``, the cells of the
 headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
 
-``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is what `cadalign.evaluation.exhibit`
-describes, with the keys of its ``picture``, which has no boxes drawn in as thumbs have, and of its
-``mesh``, both null where there is none. A mesh is what `cadalign.evaluation.sketch` makes of the
+``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is what
+`cadalign.evaluation.instances.record` describes, with the keys of its ``picture``, which has no
+boxes drawn in as thumbs have, and of its
+``mesh``, both null where there is none. A mesh is what
+`cadalign.evaluation.instances.preview` makes of the
 dataset's model: that, times the exhibit's ``stretch``, is the model that methods were given.
 
 Where pictures are in a folder beside the page, instead of ``exhibits`` and ``meshes`` there are

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from cadalign.evaluation.correspondences_report import ERRORS, TIME, Quartiles
-from cadalign.evaluation.sweep import SWEEP_METRICS
-from cadalign.evaluation.sweep_report import TIME_METRIC, VALUE_LABELS
+from cadalign.evaluation.correspondences.figures import ERRORS, TIME, Quartiles
+from cadalign.evaluation.simulation.experiment import SWEEP_METRICS
+from cadalign.evaluation.simulation.figures import TIME_METRIC, VALUE_LABELS
 from cadalign.report.headlines import correspondence_summaries, sweep_kind, sweep_summaries
 from cadalign.report.instances import compact
 from cadalign.report.retrieval import retrieval_plots

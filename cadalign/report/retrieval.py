@@ -19,7 +19,7 @@ from cadalign.report.looks import HIGH
 from cadalign.report.runs import Run
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.retrieval_report import RetrievalSummary
+    from cadalign.evaluation.retrieval.figures import RetrievalSummary
 
 _COLUMNS = (
     *COUNTS,
@@ -67,7 +67,7 @@ def retrieval_headline(runs: Sequence[Run]) -> Headline:
 
 def retrieval_plots(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Rates against the number of keypoints, over all categories, a plot for each noise."""
-    from cadalign.evaluation.retrieval_report import ALL
+    from cadalign.evaluation.retrieval.figures import ALL
 
     found = [[s for s in _summaries(run) if s.category == ALL and s.queries] for run in runs]
     plots = []
@@ -101,7 +101,7 @@ def retrieval_plots(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def _summaries(run: Run) -> list[RetrievalSummary]:
-    from cadalign.evaluation.retrieval_report import summarize_retrieval_tables
+    from cadalign.evaluation.retrieval.figures import summarize_retrieval_tables
 
     return summarize_retrieval_tables(run.results, run.timings)
 

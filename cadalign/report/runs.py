@@ -13,8 +13,8 @@ from typing import Any
 import pyarrow as pa
 
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.run_folder import RunFolder
-from cadalign.evaluation.tables import read_table
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_table
 
 INSTANCES = "instances"
 """Runs over views of models: what a gallery can show."""

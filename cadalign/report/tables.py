@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.evaluation.style import look_of
+from cadalign.evaluation.accuracy.style import look_of
 from cadalign.report.headline import Column, Headline, HeadlineRow
 from cadalign.report.headlines import headline_of
 from cadalign.report.runs import read_runs

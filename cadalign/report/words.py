@@ -8,7 +8,7 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.accuracy.methods import LIMIT
 from cadalign.report.runs import CORRESPONDENCES, INSTANCES, RETRIEVAL, SIMULATION, Run
 
 _SETTINGS = {

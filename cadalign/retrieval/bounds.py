@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.retrieval.jit import kernel
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import cholesky, eigenvectors_4
-from cadalign.validation import FloatArray, IntArray
 
 _CANCELLATION = 1e-10
 

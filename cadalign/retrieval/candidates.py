@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.camera import Camera
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import DegenerateError, InputError
-from cadalign.options import LOSSES
+from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.options import LOSSES
+from cadalign.geometry.camera import Camera
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.validation import FloatArray, IntArray, as_floats, as_points
-from cadalign.whitening import rays_of, whitening_of
 
 _LINEAR = LOSSES["linear"]
 
@@ -173,7 +173,7 @@ def _chosen_models(
     table: ModelTable, category: str | None, exclude: Collection[ModelKey]
 ) -> IntArray:
     """Rows of the models that are compared, in the table's order."""
-    from cadalign.datasets.categories import require_category
+    from cadalign.datasets.models.categories import require_category
 
     if not len(table):
         raise InputError("the library is empty", where="library")

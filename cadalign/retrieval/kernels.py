@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
-from cadalign.retrieval.jit import kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
 from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts
-from cadalign.validation import FloatArray, IntArray
 
 LEAST_SHARED = 4
 """Fewer keypoints than this determine no alignment."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from cadalign.validation import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
 
 _ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from cadalign.camera import Camera
 from cadalign.errors import DataError, InputError
+from cadalign.fitting.noise import Sigma
+from cadalign.geometry.camera import Camera
 from cadalign.retrieval.candidates import gather_field, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import make_matches, rank
-from cadalign.whitening import Sigma
 
 if TYPE_CHECKING:
     from cadalign.datasets import KeypointNet

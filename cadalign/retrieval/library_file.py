@@ -23,7 +23,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from cadalign.errors import DataError
-from cadalign.files import write_whole
+from cadalign.io.files import write_whole
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
 VERSION = 1

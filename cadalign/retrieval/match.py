@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.alignment import Alignment
-from cadalign.box import Box
-from cadalign.validation import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 
 
 @dataclass(frozen=True, eq=False)

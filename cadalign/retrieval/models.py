@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval.labelings import mirrored_labelings
-from cadalign.validation import FloatArray, IntArray, as_floats, as_points, read_only
 
 if TYPE_CHECKING:
     from cadalign.datasets import AnnotatedModel, Symmetries
-    from cadalign.mesh import Mesh
+    from cadalign.geometry.mesh import Mesh
 
 ModelKey = tuple[str, str]
 """A category's name and a model's id."""

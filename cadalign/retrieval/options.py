@@ -32,8 +32,8 @@ import math
 from dataclasses import dataclass, field
 
 from cadalign.errors import InputError
-from cadalign.options import Options
-from cadalign.whitening import Sigma
+from cadalign.fitting.noise import Sigma
+from cadalign.fitting.options import Options
 
 METHODS = ("optimal", "epnp")
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.camera import Camera
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
-from cadalign.files import write_json, write_text, writing
-from cadalign.picture import write_image
+from cadalign.geometry.camera import Camera
+from cadalign.io.files import write_json, write_text, writing
+from cadalign.io.images import write_image
 from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
-from cadalign.render.color import ByteImage
+from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
 from cadalign.retrieval.match import Match
-from cadalign.validation import FloatArray
 from cadalign.web import asset
 
 _STYLE = """

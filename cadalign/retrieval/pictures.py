@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.camera import Camera
+from cadalign.arrays import BoolArray
 from cadalign.errors import InputError
-from cadalign.photo import open_photo
-from cadalign.picture import read_image
-from cadalign.render.color import ByteImage
-from cadalign.validation import BoolArray
+from cadalign.geometry.camera import Camera
+from cadalign.io.images import open_photo, read_image
+from cadalign.render.drawing.color import ByteImage
 
 
 def read_mask(path: Path, camera: Camera) -> BoolArray:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.json_file import read_json
-from cadalign.observation import Observation
+from cadalign.io.json_file import read_json
+from cadalign.io.observation import Observation
 
 _ORIGIN = [0.0, 0.0, 0.0]
 
@@ -16,8 +16,8 @@ _ORIGIN = [0.0, 0.0, 0.0]
 def read_query(path: Path) -> Observation:
     """Read an observation file for retrieval.
 
-    It is the file that `cadalign.observation` describes, but keypoints may lack ``xyz``, since the
-    model is not known, and must have a ``semantic_id``.
+    It is the file that `cadalign.io.observation` describes, but keypoints may lack ``xyz``, since
+    the model is not known, and must have a ``semantic_id``.
 
     Parameters
     ----------

@@ -20,17 +20,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.alignment import Alignment
-from cadalign.box import Box
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.fitting import fit_batch
+from cadalign.fitting.fit import fit_batch
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.retrieval.candidates import Field, Observed
 from cadalign.retrieval.kernels import search_all
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.solvers.minimal import POSE_SIZE
-from cadalign.validation import FloatArray, IntArray
 
 _FIRST_BATCH = 64
 _LARGEST_BATCH = 4096

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.retrieval.models import LibraryModel
-from cadalign.validation import FloatArray
 
 SAME_SHAPE = 0.01
 """Models closer than this cannot be told apart by their keypoints: they count as the same."""

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.camera import Camera
+from cadalign.arrays import BoolArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, InputError
+from cadalign.geometry.camera import Camera
 from cadalign.render import Scene, cast_geometry, silhouette_iou
 from cadalign.retrieval.match import Match
-from cadalign.validation import BoolArray
 
 logger = logging.getLogger("cadalign")
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.solvers.linear import MIN_POINTS, aepnp_kernel
 from cadalign.solvers.minimal import POSE_SIZE
 from cadalign.solvers.objective import UNKNOWNS, Objective
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_kernel
 from cadalign.solvers.status import DEGENERATE, NOT_FOUND, OK, TOO_FEW
-from cadalign.validation import FloatArray, IntArray
 
 
 @kernel

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.linear import MIN_POINTS, affine_rows, moments
 from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate, jacobian_rows
 from cadalign.solvers.optimal import covariance_of
 from cadalign.solvers.refine import move_pose, refine
 from cadalign.solvers.status import OK
-from cadalign.validation import FloatArray
 
 _ROUNDS = 60
 _POSE_ITERATIONS = 100

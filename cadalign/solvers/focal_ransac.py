@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.solvers.focal import at_focal, refine_focal
-from cadalign.solvers.jit import kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
 from cadalign.solvers.objective import Objective
 from cadalign.solvers.ransac import (
@@ -23,7 +24,6 @@ from cadalign.solvers.ransac import (
     solve_sample,
 )
 from cadalign.solvers.sampling import grow_pool, next_subset, seed_state, shuffle, start_pool
-from cadalign.validation import BoolArray, FloatArray, IntArray
 
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
 _REJECTION = 200.0

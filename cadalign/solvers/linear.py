@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray
+from cadalign.compile import fast_sums, kernel
 from cadalign.errors import DegenerateError
-from cadalign.solvers.jit import fast_sums, kernel
 from cadalign.solvers.linalg import (
     cholesky,
     eigenvectors_4,
@@ -16,7 +17,6 @@ from cadalign.solvers.linalg import (
     solve_cholesky,
 )
 from cadalign.solvers.status import DEGENERATE, OK
-from cadalign.validation import FloatArray
 
 MIN_POINTS = 6
 _CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error

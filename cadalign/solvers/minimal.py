@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import polish_rotation
 from cadalign.solvers.polynomial import multiply_add, real_roots
-from cadalign.validation import FloatArray
 
 MAX_SOLUTIONS = 8
 POSE_SIZE = 15

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.solvers.jit import fast_sums, kernel
-from cadalign.validation import FloatArray
+from cadalign.arrays import FloatArray
+from cadalign.compile import fast_sums, kernel
 
 LINEAR, HUBER, CAUCHY = 0, 1, 2
 UNKNOWNS = 8

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.validation import FloatArray
 
 MIN_POINTS = 4
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import cholesky, polish_rotation, solve_cholesky
 from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
 from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate, evaluate_cost
@@ -15,7 +16,6 @@ from cadalign.solvers.starts import (
     minimal_starts,
     rotation_starts,
 )
-from cadalign.validation import FloatArray
 
 MAX_MINIMA = 12
 _COARSE_POINTS = 48  # that many tell the minima apart; all points then refine them

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.solvers.linear import MIN_POINTS, aepnp_error, describe_plane
-from cadalign.validation import FloatArray
 
 _FIX = "a linear solver needs keypoints that span a volume"
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
-from cadalign.validation import FloatArray
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
 
 
 @kernel

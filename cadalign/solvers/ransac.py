@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE, ap4p_kernel
 from cadalign.solvers.objective import Objective
@@ -25,7 +26,6 @@ from cadalign.solvers.sampling import (
     start_pool,
 )
 from cadalign.solvers.status import OK
-from cadalign.validation import BoolArray, FloatArray, IntArray
 
 AP4P, AEPNP = 0, 1
 SAMPLE_SIZES = (4, 6)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate
-from cadalign.validation import FloatArray
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.solvers.jit import kernel
-from cadalign.validation import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
 
 StateArray = npt.NDArray[np.uint64]
 

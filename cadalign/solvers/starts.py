@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.solvers.jit import kernel
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
 from cadalign.solvers.status import OK
-from cadalign.validation import FloatArray, IntArray
 
 _DRAWS_PER_SUBSET = 4
 

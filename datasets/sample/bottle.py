@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.model import Draft, Place
 from cadalign.datasets.sample.outlines import smooth_curve
 from cadalign.datasets.sample.solids import Color, Solid, lathe
-from cadalign.validation import FloatArray
 
 _AZIMUTHS = np.radians([135.0, 45.0, -45.0, -135.0])
 # KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.car_parts import arch_stations, lamps_and_trim, wheel_set
 from cadalign.datasets.sample.car_style import CarParameters
 from cadalign.datasets.sample.model import Draft, mirrored_places
 from cadalign.datasets.sample.solids import Solid, beam, both_sides, box, loft, stacked
-from cadalign.validation import FloatArray
 
 _GLASS = (30, 38, 48)
 _DARK = (34, 34, 38)

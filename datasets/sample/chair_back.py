@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.chair_style import (
     ChairParameters,
     back_half_width,
@@ -21,7 +22,6 @@ from cadalign.datasets.sample.solids import (
     sheet,
     sweep,
 )
-from cadalign.validation import FloatArray
 
 _SHELL_THICKNESS = 0.014
 

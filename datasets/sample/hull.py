@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.solids import Color, Solid, loft
-from cadalign.validation import FloatArray
 
 
 @dataclass(frozen=True)

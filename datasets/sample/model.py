@@ -9,9 +9,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets.sample.solids import Solid
-from cadalign.mesh import Mesh
-from cadalign.validation import FloatArray, IntArray
+from cadalign.geometry.mesh import Mesh
 
 _CREASE_DEGREES = 35.0
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cadalign.validation import FloatArray
+from cadalign.arrays import FloatArray
 
 
 def ellipse(width: float, height: float, *, count: int = 16, exponent: float = 2.0) -> FloatArray:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets.sample.outlines import ellipse, rounded_rectangle
-from cadalign.validation import FloatArray, IntArray
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.solids import (
     Color,
     Solid,
@@ -16,7 +17,6 @@ from cadalign.datasets.sample.solids import (
 )
 from cadalign.datasets.sample.vessel_parts import BLACK, GLASS, SPAR, STEEL, WHITE, Superstructure
 from cadalign.datasets.sample.vessel_style import VesselParameters
-from cadalign.validation import FloatArray
 
 _CLOTH = (246, 243, 232)
 

@@ -22,7 +22,7 @@ from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, f
 from cadalign.datasets.sample.vessel import build_vessel
 from cadalign.datasets.sample.vessel_style import draw_vessel
 from cadalign.errors import DataError, InputError
-from cadalign.mesh import Mesh
+from cadalign.geometry.mesh import Mesh
 
 _SYNSETS = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
 _CATEGORIES = ("chair", "bottle", "car", "vessel")

@@ -1,0 +1,49 @@
+"""Compile kernels: the one way in which cadalign uses Numba."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_SOLVERS = Path(__file__).parent / "solvers"
+
+
+def kernel(function: F) -> F:
+    """Compile on first use, keep the result on disk, release the interpreter lock while running.
+
+    No floating-point liberties are taken: contraction into fused multiply-adds, for one, is decided
+    differently for code that was just compiled and for code read back from disk, and results are to
+    be the same bit for bit.
+    """
+    return _compiled(function, set())
+
+
+def fast_sums(function: F) -> F:
+    """Like `kernel`, but sums may be reordered, so that they run on vector units."""
+    return _compiled(function, {"reassoc"})
+
+
+def _compiled(function: F, fastmath: set[str]) -> F:
+    dispatcher = numba.njit(
+        cache=True, nogil=True, error_model="numpy", fastmath=fastmath or False, boundscheck=False
+    )(function)
+    # Numba recompiles a function when its own file changes, but not when a function that it calls
+    # in another file does. One stamp for the files of its folder and the solvers mends that.
+    cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if cache_file is not None:
+        folder = Path(function.__code__.co_filename).resolve().parent
+        cache_file._source_stamp = _stamp(folder) + _stamp(_SOLVERS.resolve())
+    return cast(F, dispatcher)
+
+
+@cache
+def _stamp(folder: Path) -> tuple[float, int]:
+    """A value that changes with any source file of a folder: newest time, total size."""
+    stats = [path.stat() for path in folder.glob("*.py")]
+    return max(stat.st_mtime for stat in stats), sum(stat.st_size for stat in stats)

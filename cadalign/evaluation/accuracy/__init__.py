@@ -1,0 +1,1 @@
+"""Errors of methods on instances, their summaries, and the Cramer-Rao bound."""

@@ -1,0 +1,115 @@
+"""The methods that can be evaluated, by name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy.typing as npt
+
+from cadalign.errors import InputError
+from cadalign.fitting.batch import BatchResult
+from cadalign.fitting.fit import fit, fit_batch
+from cadalign.fitting.options import METHODS
+from cadalign.fitting.result import FitResult
+from cadalign.fitting.robust import RansacOptions
+from cadalign.geometry.camera import Camera
+
+LIMIT = "limit"
+"""The pseudo-method of the Cramer-Rao bound; see `cramer_rao.limit_estimate`."""
+
+# Names for a method together with options of `cadalign.fit`.
+_VARIANTS: dict[str, dict[str, Any]] = {
+    "optimal-huber": {"method": "optimal", "loss": "huber"},
+    "optimal-cauchy": {"method": "optimal", "loss": "cauchy"},
+}
+# Robust ones, named after what they return: the optimum over all inliers, or the best hypothesis of
+# a minimal solver as it is. With the linear solver, on 6 points, these are the AEPnP paper's two
+# steps: RANSAC-AEPnP, and the same with non-linear refinement.
+_RANSAC: dict[str, dict[str, Any]] = {
+    "ransac-optimal": {"minimal": "ap4p", "refine": True},
+    "ransac-ap4p": {"minimal": "ap4p", "refine": False},
+    "ransac-aepnp": {"minimal": "aepnp", "refine": False},
+    "ransac-aepnp-refined": {"minimal": "aepnp", "refine": True},
+}
+# 99.8 % of Gaussian errors in the plane are shorter than this, in standard deviations.
+_INLIER_BOUND = 3.5
+
+
+def method_names() -> tuple[str, ...]:
+    """All names: the methods of `cadalign.fit`, variants of them, and the limit."""
+    return (*METHODS, *_VARIANTS, *_RANSAC, LIMIT)
+
+
+def is_robust(name: str) -> bool:
+    """Whether a method searches for inliers."""
+    return name in _RANSAC
+
+
+def has_statistics(name: str) -> bool:
+    """Whether a method predicts standard deviations and knows of alternatives."""
+    return name == "optimal" or name in _VARIANTS or name in _RANSAC
+
+
+def check_methods(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names, each once, if all are known.
+
+    Raises
+    ------
+    InputError
+        If there are none, or one is unknown; the message names the known ones.
+    """
+    unique = tuple(dict.fromkeys(names))
+    known = method_names()
+    for name in unique:
+        if name not in known:
+            nearest = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {nearest[0]!r}?" if nearest else ""
+            raise InputError(
+                f"unknown method {name!r}{hint}",
+                where="methods",
+                fix=f"known are {', '.join(known)}",
+            )
+    if not unique:
+        raise InputError("none is given", where="methods", fix=f"known are {', '.join(known)}")
+    return unique
+
+
+def fit_with(
+    name: str,
+    points_3d: npt.ArrayLike,
+    points_2d: npt.ArrayLike,
+    camera: Camera,
+    *,
+    sigma: float = 1.0,
+    ransac: RansacOptions | None = None,
+) -> FitResult:
+    """Fit one problem with a method by its name in `method_names`; see `cadalign.fit`.
+
+    ``sigma`` is the standard deviation of the keypoints' noise [px]; robust methods take what lies
+    within 3.5 of it for an inlier. ``ransac`` gives them another threshold, other bounds and
+    another seed; the minimal solver and the refinement are the method's own. Methods that are not
+    robust ignore it.
+    """
+    return fit(points_3d, points_2d, camera, sigma=sigma, **_options(name, sigma, ransac))
+
+
+def fit_batch_with(
+    name: str,
+    points_3d: Sequence[npt.ArrayLike],
+    points_2d: Sequence[npt.ArrayLike],
+    camera: Camera | Sequence[Camera],
+    *,
+    sigma: float = 1.0,
+) -> BatchResult:
+    """Fit many problems with a method by its name; see `fit_with` and `cadalign.fit_batch`."""
+    return fit_batch(points_3d, points_2d, camera, sigma=sigma, **_options(name, sigma))
+
+
+def _options(name: str, sigma: float, ransac: RansacOptions | None = None) -> dict[str, Any]:
+    if name in _RANSAC:
+        common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)
+        return {"ransac": replace(common, **_RANSAC[name])}
+    return _VARIANTS.get(name, {"method": name})

@@ -1,0 +1,140 @@
+"""How figures look: one colour and marker for each method, the same in every figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cadalign.evaluation.accuracy.methods import LIMIT, method_names
+from cadalign.io.files import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
+# dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).
+_COLORS = (
+    "#0072B2",
+    "#E69F00",
+    "#D55E00",
+    "#CC79A7",
+    "#009E73",
+    "#56B4E9",
+    "#332288",
+    "#999933",
+    "#882255",
+    "#44AA99",
+    "#AA4499",
+    "#117733",
+)
+_MARKERS = "os^DvP<X>phd"
+_LABELS = {
+    "optimal": "optimal (ours)",
+    "aepnp": "AEPnP, 4 x 4 (ours)",
+    "aepnp-paper": "AEPnP, as published",
+    "epnp": "EPnP (no stretch)",
+    "optimal-huber": "optimal, Huber loss",
+    "optimal-cauchy": "optimal, Cauchy loss",
+    "ransac-optimal": "LO-RANSAC + optimal (ours)",
+    "ransac-ap4p": "RANSAC, 4 points",
+    "ransac-aepnp": "RANSAC, 6 points (AEPnP)",
+    "ransac-aepnp-refined": "RANSAC, 6 points + refinement",
+    LIMIT: "Cramer-Rao limit",
+}
+METRIC_LABELS = {
+    "rotation_error_deg": "rotation error [deg]",
+    "translation_error": "translation error [model units]",
+    "scale_y_error": "relative error of $s_y$ [%]",
+    "scale_z_error": "relative error of $s_z$ [%]",
+    "box_iou": "box IoU",
+    "microseconds": "time of one call [µs]",
+}
+PERCENT_METRICS = ("scale_y_error", "scale_z_error")
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a method is drawn.
+
+    Parameters
+    ----------
+    label, color, marker, dash : str
+        The marker and the kind of line are matplotlib's.
+    """
+
+    label: str
+    color: str
+    marker: str
+    dash: str
+
+
+def look_of(method: str) -> Look:
+    """How a method is drawn; the limit as a dashed line without markers."""
+    label = _LABELS.get(method, method)
+    if method == LIMIT:
+        return Look(label, "black", "", "--")
+    names = [name for name in method_names() if name != LIMIT]
+    place = names.index(method) if method in names else len(names)
+    return Look(label, _COLORS[place % len(_COLORS)], _MARKERS[place % len(_MARKERS)], "-")
+
+
+@contextmanager
+def new_figure(**options: Any) -> Iterator[Figure]:
+    """A figure in the project's style, drawn without a display."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    settings: Any = {
+        "font.size": 10,
+        "axes.grid": True,
+        "axes.grid.which": "both",
+        "grid.color": "0.9",
+        "grid.linewidth": 0.6,
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+        "legend.fontsize": 9,
+        "lines.linewidth": 1.8,
+        "lines.markersize": 5,
+        "pdf.fonttype": 42,
+        "figure.dpi": 160,
+    }
+    with rc_context(settings):
+        yield Figure(layout="constrained", **options)
+
+
+def label_log_axis(axes: Axes) -> None:
+    """Write plain numbers, also between the powers of ten, on a logarithmic vertical axis."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    low, high = axes.get_ylim()
+    decades = np.log10(high / low)
+    subs = (1.0, 2.0, 5.0) if decades < 3.5 else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs, numticks=30))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(LogLocator(subs=[float(k) for k in range(2, 10)], numticks=99))
+    axes.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: ""))
+
+
+def save_figure(figure: Figure, path: Path) -> list[Path]:
+    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+    """
+    files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
+    for file in files:
+        # Without its date a PDF is the same in every run.
+        metadata: Any = {"CreationDate": None} if file.suffix == ".pdf" else {"Software": None}
+        write_whole(file, partial(figure.savefig, metadata=metadata))
+    return files

@@ -1,0 +1,1 @@
+"""The experiment on real images with wrong correspondences."""

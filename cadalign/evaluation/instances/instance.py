@@ -1,0 +1,219 @@
+"""Test instances made from an annotated model: a view, a stretch, noisy visible keypoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.seeding import instance_rng
+
+if TYPE_CHECKING:
+    # Workers that look at annotations only are not to carry the renderer's libraries.
+    from cadalign.datasets import AnnotatedModel
+    from cadalign.render import Scene
+
+KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
+"""The camera of the sparse-keypoint experiment."""
+STRETCH_RANGE = (0.5, 2.0)
+RAYS = "rays"
+"""Visibility found by casting rays at the mesh."""
+HULL = "hull"
+"""Visibility by the rule of `cadalign.evaluation.instances.hull`, without a mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One view of a model, and what a method is given to align.
+
+    The image shows the model as it is. The method gets the same model stretched along y and z by
+    factors it does not know, so the true scale is one over them.
+
+    Parameters
+    ----------
+    camera : Camera
+    cam_from_model : Alignment
+        The pose of the model as the image shows it.
+    points_3d : (n, 3) float
+        The visible keypoints of the stretched model.
+    points_2d : (n, 2) float
+        Their noisy observations [px].
+    semantic_ids : (n,) int
+    bounds : (2, 3) float
+        Lowest and highest coordinates of the stretched model; of its keypoints without a mesh.
+    gt : Alignment
+        The truth: pose, and the scale that undoes the stretch.
+    visibility : {"rays", "hull"}
+        How it was found out which keypoints are seen.
+    scene : Scene, optional
+        The model as the image shows it; None without a mesh.
+    """
+
+    camera: Camera
+    cam_from_model: Alignment
+    points_3d: FloatArray
+    points_2d: FloatArray
+    semantic_ids: IntArray
+    bounds: FloatArray
+    gt: Alignment
+    visibility: str
+    scene: Scene | None = None
+
+    @cached_property
+    def gt_box(self) -> Box:
+        """The true box."""
+        return Box.from_model(self.bounds, self.gt)
+
+
+def load_scene(model: AnnotatedModel) -> Scene:
+    """Read a model's mesh for `make_instance`.
+
+    Raises
+    ------
+    DataError
+        If the mesh is missing, damaged or flat.
+    """
+    from cadalign.datasets import check_solid
+    from cadalign.render import Scene
+
+    mesh = model.load_mesh()
+    check_solid(mesh)
+    return Scene(mesh)
+
+
+def make_instance(
+    model: AnnotatedModel,
+    *,
+    camera: Camera = KEYPOINT_CAMERA,
+    noise_px: float = 1.0,
+    min_visible: int = 6,
+    seed: int = 0,
+    view_index: int = 0,
+    scene: Scene | None = None,
+) -> Instance:
+    """Draw a view, a stretch and keypoint noise for an annotated model with a mesh.
+
+    Everything random follows from (seed, category, model id, view index).
+
+    Parameters
+    ----------
+    model : AnnotatedModel
+    camera : Camera
+    noise_px : float
+        Standard deviation of the Gaussian noise on each image coordinate [px].
+    min_visible : int
+        How many keypoints a view must show.
+    seed, view_index : int
+    scene : Scene, optional
+        What `load_scene` gave for this model, where it has been loaded.
+
+    Returns
+    -------
+    Instance
+
+    Raises
+    ------
+    DataError
+        If the mesh is missing, damaged or flat.
+    RenderError
+        If no view shows enough keypoints.
+    """
+    from cadalign.render import sample_view
+
+    rng = instance_rng(seed, model.category, model.model_id, str(view_index))
+    scene = scene or load_scene(model)
+    view = sample_view(scene, model.keypoints.xyz, camera, rng=rng, min_visible=min_visible)
+    return _stretched(
+        model.keypoints.xyz,
+        model.keypoints.semantic_ids,
+        view.visible,
+        camera=camera,
+        cam_from_model=view.cam_from_model,
+        bounds=scene.bounds,
+        noise_px=noise_px,
+        rng=rng,
+        visibility=RAYS,
+        scene=scene,
+    )
+
+
+def make_hull_instance(
+    hull: KeypointHull,
+    semantic_ids: IntArray,
+    *,
+    names: tuple[str, str],
+    noise_px: float = 1.0,
+    min_visible: int = 6,
+    seed: int = 0,
+    view_index: int = 0,
+) -> Instance:
+    """Draw a view, a stretch and keypoint noise for an annotated model without a mesh.
+
+    Which keypoints are seen, and the model's box, follow from the keypoints alone; see
+    `cadalign.evaluation.instances.hull`.
+
+    Parameters
+    ----------
+    hull : KeypointHull
+        The model's keypoints.
+    semantic_ids : (k,) int
+    names : tuple of 2 str
+        Category and model id.
+    noise_px, min_visible, seed, view_index
+        As for `make_instance`.
+
+    Raises
+    ------
+    DegenerateError
+        If no view shows enough keypoints.
+    """
+    rng = instance_rng(seed, *names, str(view_index))
+    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
+    return _stretched(
+        hull.xyz,
+        semantic_ids,
+        visible,
+        camera=KEYPOINT_CAMERA,
+        cam_from_model=pose,
+        bounds=hull.bounds,
+        noise_px=noise_px,
+        rng=rng,
+        visibility=HULL,
+    )
+
+
+def _stretched(
+    xyz: FloatArray,
+    semantic_ids: IntArray,
+    visible: npt.NDArray[np.bool_],
+    *,
+    camera: Camera,
+    cam_from_model: Alignment,
+    bounds: FloatArray,
+    noise_px: float,
+    rng: np.random.Generator,
+    visibility: str,
+    scene: Scene | None = None,
+) -> Instance:
+    stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
+    seen = xyz[visible]
+    projected = camera.project(cam_from_model.apply(seen))
+    return Instance(
+        camera=camera,
+        cam_from_model=cam_from_model,
+        points_3d=seen * stretch,
+        points_2d=projected + noise_px * rng.standard_normal(projected.shape),
+        semantic_ids=semantic_ids[visible],
+        bounds=bounds * stretch,
+        gt=Alignment.from_solver(cam_from_model.rotation, cam_from_model.translation, 1 / stretch),
+        visibility=visibility,
+        scene=scene,
+    )

@@ -1,0 +1,1 @@
+"""The sparse-keypoint experiment on KeypointNet."""

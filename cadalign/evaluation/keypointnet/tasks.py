@@ -1,0 +1,149 @@
+"""The tasks of the KeypointNet experiment: one for each view of each model."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import CadalignError, DataError
+from cadalign.evaluation.instances.instance import HULL, RAYS
+from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+
+if TYPE_CHECKING:
+    from cadalign.datasets import AnnotatedModel, KeypointNet
+
+AUTO = "auto"
+"""Rays where there is a mesh, the hull's rule elsewhere."""
+VISIBILITIES = (AUTO, RAYS, HULL)
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTask:
+    """One view of one model.
+
+    Parameters
+    ----------
+    category, model_id : str
+    view : int
+    xyz : (k, 3) float
+        Keypoints.
+    semantic_ids : (k,) int
+    symmetry : SymmetryGroup
+    model : AnnotatedModel, optional
+        The model with its mesh; None where it is evaluated on its keypoints alone.
+    problem : str
+        Why the model cannot be evaluated; empty otherwise.
+    """
+
+    category: str
+    model_id: str
+    view: int
+    xyz: FloatArray
+    semantic_ids: IntArray
+    symmetry: SymmetryGroup
+    model: AnnotatedModel | None = None
+    problem: str = ""
+
+    @classmethod
+    def of_model(
+        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str = AUTO
+    ) -> KeypointTask:
+        """The first view of a dataset's model; a malformed one gives a task with a problem."""
+        blank = cls(
+            category=category,
+            model_id=model_id,
+            view=0,
+            xyz=np.empty((0, 3)),
+            semantic_ids=np.empty(0, dtype=np.int64),
+            symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+        )
+        try:
+            model = dataset[category, model_id]
+        except CadalignError as error:
+            return replace(blank, problem=str(error))
+        return replace(
+            blank,
+            xyz=model.keypoints.xyz,
+            semantic_ids=model.keypoints.semantic_ids,
+            symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
+            model=_with_mesh(model, visibility),
+        )
+
+
+class KeypointTasks(Sequence[KeypointTask]):
+    """All views of all models of a dataset in the order of their names, made when asked for.
+
+    Parameters
+    ----------
+    dataset : KeypointNet
+    views : int
+        How many of each model.
+    visibility : {"auto", "rays", "hull"}
+    max_models : int, optional
+        How many models of each category at most.
+
+    Raises
+    ------
+    DataError
+        If there are no models.
+    """
+
+    def __init__(
+        self,
+        dataset: KeypointNet,
+        *,
+        views: int,
+        visibility: str = AUTO,
+        max_models: int | None = None,
+    ) -> None:
+        self._dataset = dataset
+        self._views = views
+        self._visibility = visibility
+        self._keys = [
+            key
+            for category in dataset.categories
+            for key in sorted(dataset.ids(category))[:max_models]
+        ]
+        if not self._keys:
+            raise DataError("there are no models to evaluate", where=str(dataset.root))
+        self._describe = lru_cache(maxsize=4)(self._describe_model)
+
+    def __len__(self) -> int:
+        return len(self._keys) * self._views
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        place, view = divmod(range(len(self))[index], self._views)
+        return replace(self._describe(place), view=view)
+
+    def fingerprint(self) -> str:
+        """A hash of what is known of the models: a run must not go on with other annotations."""
+        digest = hashlib.sha256()
+        for category, model_id in self._keys:
+            digest.update(f"{category}\0{model_id}\0".encode())
+            try:
+                model = self._dataset[category, model_id]
+            except CadalignError as error:
+                digest.update(str(error).encode())
+                continue
+            digest.update(model.keypoints.xyz.tobytes())
+            rotations = [rotation.keypoints for rotation in model.symmetries.rotations]
+            digest.update(repr((model.symmetries.reflections, rotations)).encode())
+            digest.update(b"mesh" if _with_mesh(model, self._visibility) else b"")
+        return digest.hexdigest()[:16]
+
+    def _describe_model(self, place: int) -> KeypointTask:
+        return KeypointTask.of_model(self._dataset, *self._keys[place], visibility=self._visibility)
+
+
+def _with_mesh(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
+    """The model if its mesh is to be used; `load_scene` says what is wrong where there is none."""
+    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
+    return model if use_mesh else None

@@ -1,0 +1,1 @@
+"""The AEPnP paper's tables and figures."""

@@ -1,0 +1,1 @@
+"""The engine of experiments: tasks, workers, and folders that resume."""

@@ -1,0 +1,84 @@
+"""Workers of a Dask cluster that exists already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from cadalign.errors import CadalignError, DataError
+from cadalign.evaluation.runs.parallel import Chunk, evaluate_on
+from cadalign.evaluation.runs.work import Experiment, Result
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DaskWorkers:
+    """The workers of a Dask cluster.
+
+    They need the same version of cadalign, and for meshes and overlays the same folders under the
+    same names. Dask itself hands a chunk whose worker dies to others, until the cluster's
+    ``distributed.scheduler.allowed-failures`` is exceeded.
+
+    Parameters
+    ----------
+    address : str
+        The scheduler's, such as ``tcp://10.0.0.1:8786``.
+    timeout : float
+        How long to wait for the scheduler, and for its first worker [s].
+    """
+
+    address: str
+    timeout: float = 30.0
+
+    def evaluate(
+        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
+    ) -> Iterator[tuple[Chunk[T], Result]]:
+        """See `cadalign.evaluation.runs.parallel.Workers`."""
+        try:
+            from distributed import Client, KilledWorker
+        except ImportError:
+            raise CadalignError(
+                "Dask is not installed", where="--dask", fix="pip install 'cadalign[dask]'"
+            ) from None
+        try:
+            # `distributed` is not typed throughout.
+            client: Any = Client(  # type: ignore[no-untyped-call]
+                self.address, timeout=self.timeout, set_as_default=False
+            )
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"no Dask scheduler answers ({error})",
+                where=self.address,
+                fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
+            ) from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=self.timeout)
+            except TimeoutError:
+                raise DataError(
+                    "the Dask cluster has no workers",
+                    where=self.address,
+                    fix="start some with `dask worker ADDRESS`",
+                ) from None
+            threads = sum(client.nthreads().values())
+            executor = client.get_executor()
+            try:
+                yield from evaluate_on(
+                    lambda: executor,
+                    experiment,
+                    chunks,
+                    # Clusters grow, and a round trip may cost more than a chunk.
+                    window=2 * threads + 2,
+                    deadly=(KilledWorker,),
+                )
+            except CancelledError:
+                raise CadalignError(
+                    "the Dask cluster has gone away",
+                    where=self.address,
+                    fix="start the same command again with a cluster: the run goes on",
+                ) from None
+            finally:
+                executor.shutdown(wait=False)

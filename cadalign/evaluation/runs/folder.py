@@ -1,0 +1,237 @@
+"""The folder of a run: what is where, who may write there, and which run it holds.
+
+A run's folder::
+
+    run.json          configuration and versions; the same command makes the same file
+    results.parquet   one row per task and method; the same bytes however the run went
+    exhibits.parquet  what a report shows of a task besides its errors; the same bytes, too
+    timings.parquet   seconds of each row: differs from run to run
+    progress.json     how far it is, since when, on which host: differs, too
+    parts/            tables of finished chunks while the run is not finished
+    summary.csv, figures/             whatever the experiment makes of its results
+    overlays/, thumbs/                instances with their boxes, large and small
+    pictures/, sketches/              instances without boxes, and their models in few triangles
+    report.html                       all of it as one page
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from cadalign import __version__
+from cadalign.errors import DataError
+from cadalign.io.files import write_json, writing
+
+_FORMAT = 2
+_FIX = "give another folder (--out), or remove this one"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        """``run.json``"""
+        return self.path / "run.json"
+
+    @property
+    def results(self) -> Path:
+        """``results.parquet``; there once the run is finished."""
+        return self.path / "results.parquet"
+
+    @property
+    def timings(self) -> Path:
+        """``timings.parquet``"""
+        return self.path / "timings.parquet"
+
+    @property
+    def exhibits(self) -> Path:
+        """``exhibits.parquet``; not all experiments have one."""
+        return self.path / "exhibits.parquet"
+
+    @property
+    def progress(self) -> Path:
+        """``progress.json``"""
+        return self.path / "progress.json"
+
+    @property
+    def summary(self) -> Path:
+        """``summary.csv``"""
+        return self.path / "summary.csv"
+
+    @property
+    def figures(self) -> Path:
+        """``figures``"""
+        return self.path / "figures"
+
+    @property
+    def overlays(self) -> Path:
+        """``overlays``"""
+        return self.path / "overlays"
+
+    @property
+    def pictures(self) -> Path:
+        """``pictures``"""
+        return self.path / "pictures"
+
+    @property
+    def thumbs(self) -> Path:
+        """``thumbs``"""
+        return self.path / "thumbs"
+
+    @property
+    def sketches(self) -> Path:
+        """``sketches``"""
+        return self.path / "sketches"
+
+    @property
+    def report(self) -> Path:
+        """``report.html``"""
+        return self.path / "report.html"
+
+    @property
+    def parts(self) -> Path:
+        """``parts``"""
+        return self.path / "parts"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all results are there."""
+        return self.results.is_file()
+
+    def part(self, index: int) -> Path:
+        """The results of a chunk."""
+        return self.parts / f"{index:07d}.parquet"
+
+    def part_timings(self, index: int) -> Path:
+        """The timings of a chunk."""
+        return self.parts / f"{index:07d}.timings.parquet"
+
+    def part_exhibits(self, index: int) -> Path:
+        """The exhibits of a chunk."""
+        return self.parts / f"{index:07d}.exhibits.parquet"
+
+    def make(self) -> None:
+        """Make the folder.
+
+        Raises
+        ------
+        DataError
+            If that is not possible.
+        """
+        with writing(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+
+    def make_for_pictures(self) -> None:
+        """Make the folder and those in it that pictures go to; see `make`."""
+        self.make()
+        for path in (self.overlays, self.thumbs, self.pictures, self.sketches):
+            with writing(path):
+                path.mkdir(exist_ok=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes out; a killed process holds no lock.
+
+        Raises
+        ------
+        DataError
+            If one is at work here.
+        """
+        with writing(self.path), (self.path / ".lock").open("a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise DataError(
+                    "another process is working on this run",
+                    where=str(self.path),
+                    fix="wait for it, or give another folder (--out)",
+                ) from None
+            yield
+
+    def read_config(self) -> dict[str, Any] | None:
+        """What ``run.json`` holds; None where there is none.
+
+        Raises
+        ------
+        DataError
+            If it cannot be read.
+        """
+        try:
+            found = json.loads(self.config_file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"cannot be read ({error})", where=str(self.config_file), fix=_FIX
+            ) from None
+        if not isinstance(found, dict):
+            raise DataError("not the file of a run", where=str(self.config_file), fix=_FIX)
+        return found
+
+    def claim(self, config: dict[str, Any]) -> None:
+        """Write ``run.json``, or see that the one that is there says the same.
+
+        Raises
+        ------
+        DataError
+            If it says something else, or the folder holds something else.
+        """
+        wanted = json.loads(json.dumps({**config, **_versions()}))
+        found = self.read_config()
+        if found is None:
+            if self.parts.exists() or self.results.exists():
+                raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
+            write_json(self.config_file, wanted)
+            return
+        differences = _differences(found, wanted)
+        if differences:
+            raise DataError(
+                "the folder holds a run with another configuration: " + "; ".join(differences),
+                where=str(self.path),
+                fix=_FIX,
+            )
+
+
+def _versions() -> dict[str, Any]:
+    """What results depend on besides the configuration, to their last bits."""
+    return {
+        "format": _FORMAT,
+        "versions": {
+            "cadalign": __version__,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            **{name: version(name) for name in ("numpy", "scipy", "numba", "pyarrow")},
+        },
+    }
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
+    """Where two configurations differ, in words."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        return [
+            difference
+            for key in sorted({*found, *wanted})
+            for difference in _differences(
+                found.get(key), wanted.get(key), f"{name}.{key}" if name else key
+            )
+        ]
+    if found == wanted:
+        return []
+    return [f"{name} is {json.dumps(found)} there and {json.dumps(wanted)} now"]

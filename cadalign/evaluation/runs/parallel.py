@@ -1,0 +1,243 @@
+"""Handing chunks of tasks to worker processes, here or on a cluster, and surviving their deaths.
+
+The processes are joblib's (loky) or a Dask cluster's; both are used through the standard library's
+executor interface, so one loop serves both. A process that dies, by a segmentation fault, the
+system's out-of-memory killer or a signal, takes the chunks with it that were under way. These are
+then handed out again, one at a time, in halves and halves of halves where one dies again, until it
+is known which single task it is. A task that has killed its worker twice, all alone, becomes failed
+rows.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, cast
+
+from cadalign.errors import CadalignError
+from cadalign.evaluation.runs.work import Experiment, Result, evaluate_chunk, reason_of
+
+T = TypeVar("T")
+
+_STRIKES = 2
+_IDLE_SECONDS = 30
+_LOOK_AFTER_PARENT = 1.0  # seconds
+# Sums that several threads share are rounded in another order than those of one.
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+KILLED_REASON = f"it killed its worker process {_STRIKES} times (a crash, or out of memory)"
+
+
+@dataclass(frozen=True)
+class Chunk(Generic[T]):
+    """Successive tasks of a run.
+
+    Parameters
+    ----------
+    index : int
+        Which chunk of the run.
+    tasks : sequence
+    """
+
+    index: int
+    tasks: Sequence[T]
+
+
+class Workers(Protocol):
+    """Where chunks are evaluated."""
+
+    def evaluate(
+        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
+    ) -> Iterator[tuple[Chunk[T], Result]]:
+        """Evaluate chunks; yields each with its result, in any order."""
+
+
+class InProcess:
+    """No workers: everything happens in this process, and a crash ends it."""
+
+    def evaluate(
+        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
+    ) -> Iterator[tuple[Chunk[T], Result]]:
+        """See `Workers.evaluate`."""
+        for chunk in chunks:
+            yield chunk, evaluate_chunk(experiment, chunk.tasks)
+
+
+@dataclass(frozen=True)
+class LocalProcesses:
+    """Worker processes on this machine, joblib's.
+
+    Parameters
+    ----------
+    count : int
+        How many; -1 for as many as there are cores.
+    """
+
+    count: int = -1
+
+    def evaluate(
+        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
+    ) -> Iterator[tuple[Chunk[T], Result]]:
+        """See `Workers.evaluate`."""
+        from joblib import cpu_count
+        from joblib.externals.loky import get_reusable_executor
+
+        count = cpu_count() if self.count < 0 else self.count
+
+        used: list[Executor] = []
+
+        def executor() -> Executor:
+            # A broken one is replaced; workers wait a while for more, then end by themselves.
+            pool = get_reusable_executor(
+                max_workers=count,
+                timeout=_IDLE_SECONDS,
+                env=_ENVIRONMENT,
+                initializer=_end_with,
+                initargs=(os.getpid(),),
+            )
+            used[:] = [pool]
+            return cast(Executor, pool)
+
+        try:
+            yield from evaluate_on(
+                executor, experiment, chunks, window=count + 1, deadly=(BrokenProcessPool,)
+            )
+        finally:
+            for pool in used:
+                pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
+
+
+def _end_with(parent: int) -> None:
+    """End this worker once its parent is gone: a killed one has no chance to tell."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK_AFTER_PARENT)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def evaluate_on(
+    executor: Callable[[], Executor],
+    experiment: Experiment[T],
+    chunks: Iterable[Chunk[T]],
+    *,
+    window: int,
+    deadly: tuple[type[BaseException], ...],
+) -> Iterator[tuple[Chunk[T], Result]]:
+    """Evaluate chunks on an executor.
+
+    Parameters
+    ----------
+    executor : callable
+        Gives an executor that works; asked again after every death.
+    experiment : Experiment
+    chunks : iterable of Chunk
+        Asked for only as fast as they are evaluated.
+    window : int
+        How many chunks are under way at a time.
+    deadly : tuple of exception types
+        What a future raises whose worker has died.
+
+    Yields
+    ------
+    chunk : Chunk
+    result : Result
+
+    Raises
+    ------
+    CadalignError
+        If workers cannot start at all, or the run cannot go on.
+    """
+    _check_life(executor, experiment, deadly)
+    source = iter(chunks)
+    running: dict[Future[Result], Chunk[T]] = {}
+    suspects: list[Chunk[T]] = []
+    exhausted = False
+    try:
+        while True:
+            while not exhausted and not suspects and len(running) < window:
+                chunk = next(source, None)
+                if chunk is None:
+                    exhausted = True
+                    break
+                try:
+                    future = executor().submit(evaluate_chunk, experiment, chunk.tasks)
+                except deadly:
+                    suspects.append(chunk)
+                    break
+                running[future] = chunk
+            if not running and not suspects:
+                return
+            done = wait(running, return_when=FIRST_COMPLETED).done if running else ()
+            for future in done:
+                chunk = running.pop(future)
+                try:
+                    yield chunk, future.result()
+                except deadly:
+                    suspects.append(chunk)
+                except CadalignError:
+                    raise
+                except Exception as error:
+                    raise CadalignError(
+                        f"a worker cannot work: {reason_of(error)}",
+                        where="workers",
+                        fix="cadalign must be installed there, in the same version as here",
+                    ) from error
+            if suspects and not running:
+                for chunk in suspects:
+                    yield chunk, _alone(executor, experiment, chunk.tasks, deadly)
+                suspects = []
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _alone(
+    executor: Callable[[], Executor],
+    experiment: Experiment[T],
+    tasks: Sequence[T],
+    deadly: tuple[type[BaseException], ...],
+) -> Result:
+    """Evaluate tasks with nothing else under way, to find out which of them kills its worker."""
+    for _ in range(_STRIKES if len(tasks) == 1 else 1):
+        try:
+            return executor().submit(evaluate_chunk, experiment, tasks).result()
+        except deadly:
+            _check_life(executor, experiment, deadly)
+    if len(tasks) == 1:
+        return experiment.failure(tasks[0], KILLED_REASON)
+    middle = len(tasks) // 2
+    halves = [tasks[:middle], tasks[middle:]]
+    return Result.joined([_alone(executor, experiment, half, deadly) for half in halves])
+
+
+def _check_life(
+    executor: Callable[[], Executor],
+    experiment: Experiment[T],
+    deadly: tuple[type[BaseException], ...],
+) -> None:
+    """Let one worker compile what all will need, and see that it lives."""
+    for attempt in range(3):
+        try:
+            executor().submit(experiment.warm_up).result()
+        except deadly as error:  # someone may have killed it; not three times, though
+            if attempt == 2:
+                raise CadalignError(
+                    f"worker processes die before they are given any task: {reason_of(error)}",  # type: ignore[arg-type]
+                    where="workers",
+                    fix="is there enough memory? Try fewer workers, or none (0) to see the error",
+                ) from None
+        except ImportError as error:
+            raise CadalignError(
+                f"a worker cannot work: {error}",
+                where="workers",
+                fix="cadalign must be installed there, in the same version as here",
+            ) from error
+        else:
+            return

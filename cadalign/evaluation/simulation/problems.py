@@ -1,0 +1,105 @@
+"""Random problems with a known answer: the AEPnP paper's simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, cy=239.5)
+"""The paper's virtual camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Keypoints on a model and in an image, and the alignment that joins them.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Model points.
+    points_2d : (n, 2) float
+        Their noisy observations [px].
+    camera : Camera
+    alignment : Alignment
+        The truth.
+    outliers : (n,) bool, optional
+        Which observations have nothing to do with their points; None where there are none.
+    """
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    camera: Camera
+    alignment: Alignment
+    outliers: BoolArray | None = None
+
+
+def simulate_problem(
+    rng: np.random.Generator,
+    *,
+    points: int,
+    noise_px: float,
+    outlier_share: float = 0.0,
+    camera: Camera = SIMULATION_CAMERA,
+    depth: tuple[float, float] = (4.0, 8.0),
+    stretch: tuple[float, float] = (0.5, 2.0),
+) -> Problem:
+    """Draw one problem of the paper's simulation.
+
+    The object's points are uniform in the cube [-1, 1)^3 and the rotation is uniform. The model is
+    the object with y and z divided by stretches drawn from ``stretch``, so the true scale is
+    (1, s_y, s_z). The object's centre lies at a depth drawn from ``depth``, up to one unit off
+    the optical axis.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        The only source of randomness.
+    points : int
+        How many points.
+    noise_px : float
+        Standard deviation of the Gaussian noise on each image coordinate [px].
+    outlier_share : float
+        Share of the observations, rounded to a whole number of them, that are moved to anywhere in
+        the image instead.
+
+    Returns
+    -------
+    Problem
+
+    Examples
+    --------
+    >>> problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=0.0)
+    >>> reprojected = problem.camera.project(problem.alignment.apply(problem.points_3d))
+    >>> bool(np.allclose(reprojected, problem.points_2d))
+    True
+    """
+    scale = np.array([1.0, *rng.uniform(*stretch, 2)])
+    translation = np.array([*rng.uniform(-1, 1, 2), rng.uniform(*depth)])
+    alignment = Alignment(random_rotation(rng), translation, scale)
+    points_3d = rng.uniform(-1, 1, (points, 3)) / scale
+    points_2d = camera.project(alignment.apply(points_3d))
+    points_2d = points_2d + noise_px * rng.standard_normal(points_2d.shape)
+    count = round(outlier_share * points)
+    if not count:
+        return Problem(points_3d, points_2d, camera, alignment)
+    outliers = np.zeros(points, dtype=bool)
+    outliers[rng.choice(points, size=count, replace=False)] = True
+    points_2d[outliers] = rng.uniform(-0.5, [camera.width - 0.5, camera.height - 0.5], (count, 2))
+    return Problem(points_3d, points_2d, camera, alignment, outliers)
+
+
+def random_rotation(rng: np.random.Generator) -> FloatArray:
+    """A rotation matrix (3, 3), uniform over all rotations."""
+    w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,1 @@
+"""Fit models to keypoints: checked input, estimation, and results with their uncertainty."""

@@ -1,0 +1,171 @@
+"""What a batch of fits returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import CadalignError
+from cadalign.fitting.estimation import Solutions
+from cadalign.fitting.problems import Problems
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.alignment import Alignment
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """Alignments of B independent problems.
+
+    The rows of a problem without solution are NaN, and ``errors`` says why.
+
+    Parameters
+    ----------
+    rotation : (B, 3, 3) float
+    translation : (B, 3) float
+        [model units]
+    scale : (B, 3) float
+    rms : (B,) float
+        Root mean square length of the inliers' residuals [px].
+    covariance : (B, 8, 8) or (B, 9, 9) float or None
+        See `cadalign.FitResult`.
+    focal_length : (B,) float
+        Horizontal focal length of the cameras [px], estimated where it was unknown.
+    residuals : (n, 2) float
+        Of all problems, one after the other [px].
+    inliers : (n,) bool
+        The keypoints that were fitted.
+    offsets : (B + 1,) int
+        Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of residuals and inliers.
+    errors : mapping of int to CadalignError
+        By problem.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+    rms: FloatArray
+    covariance: FloatArray | None
+    focal_length: FloatArray
+    residuals: FloatArray
+    inliers: BoolArray
+    offsets: IntArray
+    errors: Mapping[int, CadalignError]
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    @property
+    def solved(self) -> npt.NDArray[np.bool_]:
+        """Which problems have a solution, (B,) bool."""
+        solved = np.ones(len(self), dtype=bool)
+        solved[list(self.errors)] = False
+        return solved
+
+    def alignment(self, problem: int) -> Alignment:
+        """The alignment of one problem.
+
+        Raises
+        ------
+        CadalignError
+            Why the problem has none.
+        """
+        if problem in self.errors:
+            raise self.errors[problem]
+        return Alignment(self.rotation[problem], self.translation[problem], self.scale[problem])
+
+    @classmethod
+    def of_solutions(cls, problems: Problems, solutions: Solutions) -> BatchResult:
+        """Arrange what a solver found."""
+        errors = dict(solutions.errors)
+        focals = np.broadcast_to(problems.calibrations[:, 0], len(problems)).copy()
+        if solutions.focals is not None:
+            focals = solutions.focals[:, 0].copy()
+        focals[list(errors)] = np.nan
+        covariance = solutions.covariances
+        poses = solutions.poses[:, 0].copy()
+        residuals = solutions.residuals
+        for b in errors:
+            poses[b] = np.nan
+            residuals[problems.rows(b)] = np.nan
+            if covariance is not None:
+                covariance[b] = np.nan
+        counts = np.maximum(np.diff(problems.offsets), 1)
+        squares = np.append((residuals**2).sum(axis=1), 0.0)
+        rms = np.sqrt(np.add.reduceat(squares, problems.offsets[:-1]) / counts)
+        rms[list(errors)] = np.nan
+        return cls(
+            rotation=poses[:, :9].reshape(-1, 3, 3),
+            translation=poses[:, 9:12],
+            scale=poses[:, 12:],
+            rms=rms,
+            covariance=covariance,
+            focal_length=focals,
+            residuals=residuals,
+            inliers=np.repeat(~np.isnan(rms), problems.counts),
+            offsets=problems.offsets,
+            errors=errors,
+        )
+
+    @classmethod
+    def of_fits(
+        cls, problems: Problems, fits: Sequence[FitResult | CadalignError], *, focal: str
+    ) -> BatchResult:
+        """Arrange single results, or the errors in their place."""
+        count, total = len(problems), len(problems.points_3d)
+        unknowns = 9 if focal == "estimate" else 8
+        batch = cls(
+            rotation=np.full((count, 3, 3), np.nan),
+            translation=np.full((count, 3), np.nan),
+            scale=np.full((count, 3), np.nan),
+            rms=np.full(count, np.nan),
+            covariance=np.full((count, unknowns, unknowns), np.nan),
+            focal_length=np.full(count, np.nan),
+            residuals=np.full((total, 2), np.nan),
+            inliers=np.zeros(total, dtype=bool),
+            offsets=problems.offsets,
+            errors={b: fit for b, fit in enumerate(fits) if isinstance(fit, CadalignError)},
+        )
+        for b, fit in enumerate(fits):
+            if isinstance(fit, FitResult):
+                batch.rotation[b] = fit.alignment.rotation
+                batch.translation[b] = fit.alignment.translation
+                batch.scale[b] = fit.alignment.scale
+                batch.rms[b] = fit.rms
+                batch.focal_length[b] = fit.camera.fx
+                batch.residuals[problems.rows(b)] = fit.residuals
+                batch.inliers[problems.rows(b)] = fit.inliers
+                if fit.covariance is not None and batch.covariance is not None:
+                    batch.covariance[b] = fit.covariance
+        return batch
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchResult]) -> BatchResult:
+        """Put the results of successive parts of a batch together."""
+        rows = np.cumsum([0, *(len(part.residuals) for part in parts)]).tolist()
+        first_problem = np.cumsum([0, *(len(part) for part in parts)]).tolist()
+        covariances = [part.covariance for part in parts if part.covariance is not None]
+        return cls(
+            rotation=np.concatenate([part.rotation for part in parts]),
+            translation=np.concatenate([part.translation for part in parts]),
+            scale=np.concatenate([part.scale for part in parts]),
+            rms=np.concatenate([part.rms for part in parts]),
+            covariance=np.concatenate(covariances) if covariances else None,
+            focal_length=np.concatenate([part.focal_length for part in parts]),
+            residuals=np.concatenate([part.residuals for part in parts]),
+            inliers=np.concatenate([part.inliers for part in parts]),
+            offsets=np.concatenate(
+                [
+                    [0],
+                    *(part.offsets[1:] + row for part, row in zip(parts, rows, strict=False)),
+                ]
+            ),
+            errors={
+                first + b: error
+                for part, first in zip(parts, first_problem, strict=False)
+                for b, error in part.errors.items()
+            },
+        )

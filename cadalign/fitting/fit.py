@@ -1,0 +1,278 @@
+"""`fit` and `fit_batch`: from keypoints on models and in images to the models' alignments."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, InputError
+from cadalign.fitting.batch import BatchResult
+from cadalign.fitting.estimation import solve
+from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.noise import Sigma
+from cadalign.fitting.options import Options
+from cadalign.fitting.problems import Problems, pack_many, pack_one
+from cadalign.fitting.result import FitResult
+from cadalign.fitting.robust import RansacOptions
+from cadalign.fitting.single import fit_all, fit_robustly
+from cadalign.geometry.camera import Camera
+
+
+def fit(
+    points_3d: npt.ArrayLike,
+    points_2d: npt.ArrayLike,
+    camera: Camera,
+    *,
+    method: str = "optimal",
+    sigma: Sigma | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
+    ransac: RansacOptions | None = None,
+    confidences: npt.ArrayLike | None = None,
+) -> FitResult:
+    """Find rotation, translation and stretch of a model from its keypoints in one image.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Keypoints on the model, in the model's own coordinates.
+    points_2d : (n, 2) float
+        The same keypoints in the image [px]; integers are pixel centres.
+    camera : Camera
+        The calibrated camera. Lens distortion is honoured. Where the focal length is estimated,
+        that of the camera counts for nothing: `Camera.without_focal` has none.
+    method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
+        - ``optimal``: the maximum-likelihood alignment, searched for globally. From 5 points up;
+          4 points give every alignment that reprojects exactly, that with the least stretch
+          first.
+        - ``aepnp``: the linear solver, see `cadalign.solvers.aepnp`; at least 6 points.
+        - ``aepnp-paper``: the solver of the AEPnP paper, as published; at least 6 points.
+        - ``epnp``: OpenCV's EPnP, which does not stretch the model; at least 4 points.
+    sigma : float, (n,) float, (n, 2, 2) float or None
+        Standard deviation of the keypoints, of each keypoint, or covariance of each [px]. None
+        estimates it from the residuals: the choice for a model that is only similar to the object,
+        where shapes differ by more than the pixels' noise.
+    loss : {"linear", "huber", "cauchy"}
+        How the length of a residual counts: squared, or less once it exceeds ``loss_scale``.
+    loss_scale : float
+        Where a robust loss begins to bend [sigma].
+    stretch : str, optional
+        The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
+        or ``"none"``. The others keep the scale 1.
+    scale_prior_sigma : float, optional
+        Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
+        It keeps keypoints in one plane, or seen end-on, solvable.
+    known_axis : {"x", "y", "z"}
+        The model's axis whose length is right. One image alone does not tell size from distance.
+    focal : {"known", "estimate"}
+        Whether the camera's focal length is right, or is estimated too: a ninth unknown, for which
+        5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
+        pixels are the camera's.
+    focal_prior : FocalPrior, optional
+        What is known of the focal length to be estimated, from EXIF for example:
+        `FocalPrior.from_exif`.
+    ransac : RansacOptions, optional
+        Search for the alignment that the most keypoints support, and fit to these: for keypoints of
+        which some are wrong. ``result.inliers`` tells which were kept.
+    confidences : (n,) float, optional
+        How much each keypoint is trusted, for ``ransac``: samples are drawn from the highest first.
+
+    Returns
+    -------
+    FitResult
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, or an option is invalid.
+    DegenerateError
+        If the points are too few or don't determine the alignment (the message says which part of
+        it), or no solution has them all in front of the camera.
+    NoConsensusError
+        With ``ransac``: if no alignment has more support than chance gives.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> problem = simulate_problem(np.random.default_rng(1), points=10, noise_px=0.0)
+    >>> result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    >>> bool(np.allclose(result.alignment.scale, problem.alignment.scale))
+    True
+
+    The same photo without its focal length, which is 150 px:
+
+    >>> camera = Camera.without_focal(640, 480)
+    >>> result = fit(problem.points_3d, problem.points_2d, camera, focal="estimate")
+    >>> round(result.camera.fx, 3)
+    150.0
+    """
+    start = time.perf_counter()
+    options = Options(
+        method,
+        sigma,
+        loss,
+        loss_scale,
+        stretch,
+        scale_prior_sigma,
+        known_axis,
+        focal,
+        focal_prior,
+    )
+    problems = pack_one(points_3d, points_2d, camera)
+    if ransac is None:
+        _refuse_confidences(confidences)
+        return fit_all(problems, options, start)
+    return fit_robustly(problems, options, ransac, confidences, start)
+
+
+def fit_batch(
+    points_3d: Sequence[npt.ArrayLike] | FloatArray,
+    points_2d: Sequence[npt.ArrayLike] | FloatArray,
+    camera: Camera | Sequence[Camera],
+    *,
+    method: str = "optimal",
+    sigma: Sigma | Sequence[Sigma] | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
+    ransac: RansacOptions | None = None,
+    confidences: Sequence[npt.ArrayLike] | None = None,
+    workers: int = 1,
+) -> BatchResult:
+    """Solve many independent problems in one call; each as `fit` does, bit for bit.
+
+    Parameters
+    ----------
+    points_3d : (B, n, 3) float or sequence of B (n_b, 3) float
+        Model points of every problem.
+    points_2d : (B, n, 2) float or sequence of B (n_b, 2) float
+        Image points of every problem [px].
+    camera : Camera or sequence of B Camera
+        One for all problems, or one each.
+    sigma : float, None, or sequence of B
+        As for `fit`, for all problems; a sequence gives each problem its own.
+    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior, ransac
+        As for `fit`; every problem has a focal length of its own.
+    confidences : sequence of B (n_b,) float, optional
+        As for `fit`, for each problem.
+    workers : int
+        How many threads share the problems; -1 for as many as there are cores.
+
+    Returns
+    -------
+    BatchResult
+        Arrays over the problems; a problem without solution has its error there, and does not stop
+        the others.
+
+    Raises
+    ------
+    InputError
+        If the arguments of any problem, or an option, are invalid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> rng = np.random.default_rng(1)
+    >>> problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (8, 20)]
+    >>> batch = fit_batch(
+    ...     [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
+    ... )
+    >>> batch.scale.shape
+    (2, 3)
+    """
+    per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
+    options = Options(
+        method,
+        1.0 if per_problem else sigma,  # type: ignore[arg-type]
+        loss,
+        loss_scale,
+        stretch,
+        scale_prior_sigma,
+        known_axis,
+        focal,
+        focal_prior,
+    )
+    problems = pack_many(points_3d, points_2d, camera)
+    sigmas: Sequence[Sigma] | None = None
+    if per_problem:
+        sigmas = list(sigma)  # type: ignore[arg-type]
+        if len(sigmas) != len(problems):
+            raise InputError(f"{len(problems)} problems but {len(sigmas)} values", where="sigma")
+    if ransac is None:
+        _refuse_confidences(confidences)
+    elif confidences is not None and len(confidences) != len(problems):
+        raise InputError(
+            f"{len(problems)} problems but {len(confidences)} sets", where="confidences"
+        )
+    if workers == -1:
+        workers = os.cpu_count() or 1
+    if workers < 1:
+        raise InputError(f"{workers} is not a number of threads", where="workers", fix="or -1")
+    bounds = np.linspace(0, len(problems), workers + 1).astype(int).tolist()
+    parts = [(a, b) for a, b in pairwise(bounds) if a < b]
+
+    def run(part: tuple[int, int]) -> BatchResult:
+        some = problems.part(*part)
+        own = None if sigmas is None else sigmas[part[0] : part[1]]
+        if ransac is None and not options.estimates_in_rounds:
+            return BatchResult.of_solutions(some, solve(some, options, own))
+        trusted = None if confidences is None else confidences[part[0] : part[1]]
+        fits = _fits(some, options, ransac, own, trusted)
+        return BatchResult.of_fits(some, fits, focal=options.focal)
+
+    if len(parts) < 2:
+        return run((0, len(problems)))
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return BatchResult.joined(list(pool.map(run, parts)))
+
+
+def _refuse_confidences(confidences: object) -> None:
+    if confidences is not None:
+        raise InputError(
+            "given without ransac",
+            where="confidences",
+            fix="give ransac=RansacOptions(...), or the keypoints' sigma instead",
+        )
+
+
+def _fits(
+    problems: Problems,
+    options: Options,
+    ransac: RansacOptions | None,
+    sigmas: Sequence[Sigma] | None,
+    confidences: Sequence[npt.ArrayLike] | None,
+) -> list[FitResult | CadalignError]:
+    """Fits of all problems, one by one; an error takes the place of a result."""
+    fits: list[FitResult | CadalignError] = []
+    for b in range(len(problems)):
+        own = options if sigmas is None else replace(options, sigma=sigmas[b])
+        trusted = None if confidences is None else confidences[b]
+        start = time.perf_counter()
+        one = problems.part(b, b + 1)
+        try:
+            if ransac is None:
+                fits.append(fit_all(one, own, start))
+            else:
+                fits.append(fit_robustly(one, own, ransac, trusted, start))
+        except CadalignError as error:
+            fits.append(error)
+    return fits

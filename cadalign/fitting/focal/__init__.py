@@ -1,0 +1,1 @@
+"""Fits of unknown focal length: priors, the grid of focal lengths, the search."""

@@ -1,0 +1,94 @@
+"""What keypoints look like at every focal length that a search tries."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+from cadalign.fitting.focal.prior import FocalPrior, focal_bounds, focal_grid
+from cadalign.fitting.noise import Sigma, rays_of, whitening_of
+from cadalign.geometry.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class FocalViews:
+    """Rays and weights at rising focal lengths.
+
+    Parameters
+    ----------
+    focals : (k,) float
+        [px]
+    rays : (k, n, 2) float
+        Normalised image coordinates.
+    whitening : (k, 1 or n, 3) float
+        See `cadalign.fitting.noise.whitening_of`.
+    """
+
+    focals: FloatArray
+    rays: FloatArray
+    whitening: FloatArray
+
+
+def focal_views(
+    points_2d: FloatArray,
+    camera: Camera,
+    prior: FocalPrior | None,
+    *,
+    sigma: Sigma | None = None,
+) -> FocalViews:
+    """The keypoints at the focal lengths of `focal_grid`, as far as the lens can be undone there.
+
+    Raises
+    ------
+    InputError
+        If it can be undone at none.
+    """
+    found = []
+    problem: InputError | None = None
+    for focal in focal_grid(camera, prior).tolist():
+        try:
+            found.append((focal, *focal_view(points_2d, camera, focal, sigma=sigma)))
+        except InputError as error:
+            problem = error
+    if not found and problem is not None:
+        raise problem
+    focals, rays, whitening = zip(*found, strict=True)
+    return FocalViews(np.array(focals), np.array(rays), np.array(whitening))
+
+
+def focal_view(
+    points_2d: FloatArray, camera: Camera, focal: float, *, sigma: Sigma | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Rays (n, 2) and weights (1 or n, 3) at one focal length [px]."""
+    camera = camera.with_focal(focal)
+    rays = rays_of(points_2d, camera)
+    return rays, whitening_of(sigma, rays, camera)
+
+
+def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
+    """How undistorted pixels, over the focal length, change with its logarithm.
+
+    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they don't.
+    """
+    if not camera.distortion:
+        return np.empty((0, 2))
+    distorted = (points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    inverse = np.linalg.inv(camera.distortion_jacobian(rays))
+    return np.asarray(rays - np.einsum("nij,nj->ni", inverse, distorted))
+
+
+def log_limits(camera: Camera, prior: FocalPrior | None) -> tuple[float, float]:
+    """Bounds of the focal length's logarithm, which a prior may widen."""
+    low, high = focal_bounds(camera)
+    if prior is not None:
+        low, high = min(low, prior.focal), max(high, prior.focal)
+    return math.log(low), math.log(high)
+
+
+def log_prior(prior: FocalPrior | None) -> tuple[float, float]:
+    """Mean and inverse variance of the focal length's logarithm; the weight 0 for none."""
+    return (0.0, 0.0) if prior is None else (math.log(prior.focal), prior.relative_sigma**-2)

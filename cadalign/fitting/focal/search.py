@@ -1,0 +1,282 @@
+"""The optimum where the focal length is unknown: 9 unknowns, searched for globally."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import CadalignError, InputError
+from cadalign.fitting.focal.grid import (
+    FocalViews,
+    focal_slopes,
+    focal_view,
+    focal_views,
+    log_limits,
+    log_prior,
+)
+from cadalign.fitting.focal.prior import focal_bounds
+from cadalign.fitting.noise import Sigma
+from cadalign.fitting.options import LOSSES, Options
+from cadalign.fitting.problems import Problems
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.batch import optimal_batch
+from cadalign.solvers.focal import focal_covariance, linear_focal, refine_focal
+from cadalign.solvers.minimal import POSE_SIZE
+from cadalign.solvers.objective import UNKNOWNS, Objective
+from cadalign.solvers.optimal import MAX_MINIMA, has_collapsed, orthonormalize, uncenter
+from cadalign.solvers.status import DEGENERATE, NOT_FOUND, TOO_FEW
+
+_MOST_STARTS = 8
+_SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
+_SAME_CHORD = 1e-3
+_SAME_FOCAL = 0.01
+_LENS_ROUNDS = 12
+_LENS_TOLERANCE = 1e-10
+_ALL_STEPS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Minima:
+    """The minima of every problem, the best first.
+
+    Parameters
+    ----------
+    poses, costs : (B, MAX_MINIMA, 15), (B, MAX_MINIMA) float
+    covariances : (B, 8, 8) or (B, 9, 9) float
+        Of the best: rotation vector, translation, log scales, log focal length.
+    statuses : (B,) int
+    info : (B, 4) int
+        Minima, iterations, hypotheses, undetermined unknown or -1.
+    focals : (B, MAX_MINIMA) float, optional
+        Focal lengths [px], where they were estimated.
+    """
+
+    poses: FloatArray
+    costs: FloatArray
+    covariances: FloatArray
+    statuses: IntArray
+    info: IntArray
+    focals: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """One problem, and what it looks like at a focal length.
+
+    ``noise`` is the standard deviation that priors and loss scales are to be multiplied by.
+    """
+
+    points: FloatArray
+    points_2d: FloatArray
+    camera: Camera
+    sigma: Sigma | None
+    options: Options
+    noise: float
+
+    def objective(self, focal: float) -> Objective:
+        view = focal_view(self.points_2d, self.camera, focal, sigma=self.sigma)
+        return Objective(
+            self.points,
+            *view,
+            LOSSES[self.options.loss],
+            self.options.loss_scale * self.noise,
+            self.options.prior_weight * self.noise**2,
+            self.options.free,
+        )
+
+    @property
+    def prior(self) -> tuple[float, float]:
+        """Mean and inverse variance of the focal length's logarithm; the weight 0 for none."""
+        center, weight = log_prior(self.options.focal_prior)
+        return center, weight * self.noise**2
+
+
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    pose: FloatArray
+    focal: float
+    cost: float
+
+
+def search_focal(
+    problems: Problems,
+    options: Options,
+    points: FloatArray,
+    sigmas: Sequence[Sigma] | None,
+    errors: dict[int, CadalignError],
+    noises: FloatArray,
+) -> Minima:
+    """Find the minima over alignment and focal length for every problem.
+
+    Parameters
+    ----------
+    problems : Problems
+    options : Options
+    points : (n, 3) float
+        Model points, the known axis first.
+    sigmas : sequence of B, optional
+        Take the place of the options' sigma.
+    errors : dict of int to CadalignError
+        Receives why a problem cannot be solved, where its keypoints are the reason.
+    noises : (B,) float
+        Standard deviations that priors and loss scales are to be multiplied by.
+    """
+    count = len(problems)
+    focals = np.full((count, MAX_MINIMA), np.nan)
+    found = Minima(
+        poses=np.zeros((count, MAX_MINIMA, POSE_SIZE)),
+        costs=np.full((count, MAX_MINIMA), np.inf),
+        covariances=np.zeros((count, UNKNOWNS + 1, UNKNOWNS + 1)),
+        statuses=np.zeros(count, dtype=np.int64),
+        info=np.zeros((count, 4), dtype=np.int64),
+        focals=focals,
+    )
+    for b in range(count):
+        rows = problems.rows(b)
+        sigma = options.sigma if sigmas is None else sigmas[b]
+        task = _Task(
+            points[rows], problems.points_2d[rows], problems.camera(b), sigma, options, noises[b]
+        )
+        if len(task.points) < options.min_points:
+            found.statuses[b] = TOO_FEW
+            continue
+        try:
+            minima, found.info[b, 1], found.info[b, 2] = _minima(task)
+        except InputError as error:
+            errors[b] = error
+            continue
+        for k, minimum in enumerate(minima[:MAX_MINIMA]):
+            found.poses[b, k] = minimum.pose
+            found.costs[b, k] = minimum.cost
+            focals[b, k] = minimum.focal
+        found.info[b, 0] = len(minima)
+        found.info[b, 3] = -1
+        if not minima:
+            found.statuses[b] = NOT_FOUND
+            continue
+        found.info[b, 3] = _covariance(task, minima[0], found.covariances[b])
+        if found.info[b, 3] >= 0:
+            found.statuses[b] = DEGENERATE
+    return found
+
+
+def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
+    """All minima that the search finds, the best first; with iterations and hypotheses."""
+    center = task.points.mean(axis=0)
+    unit = float(np.sqrt(((task.points - center) ** 2).sum(axis=1).mean()))
+    if not unit > 0:
+        return [], 0, 0
+    local = replace(task, points=(task.points - center) / unit)
+    starts, iterations, hypotheses = _starts(local)
+    minima: list[_Minimum] = []
+    for start in starts:
+        minimum, used = _descend(local, start)
+        iterations += used
+        if not minimum.cost < np.inf or has_collapsed(minimum.pose):
+            continue
+        if not any(_are_same(minimum, other) for other in minima):
+            minima.append(minimum)
+    for minimum in minima:
+        orthonormalize(minimum.pose)
+        uncenter(minimum.pose, center, unit)
+    return sorted(minima, key=lambda minimum: minimum.cost), iterations, hypotheses
+
+
+def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
+    """Where to start: the optima at fixed focal lengths that no neighbouring one improves on."""
+    views = _with_linear_guess(
+        task, focal_views(task.points_2d, task.camera, task.options.focal_prior, sigma=task.sigma)
+    )
+    focals = views.focals
+    count, n = len(focals), len(task.points)
+    poses, costs, _, _, info = optimal_batch(
+        np.tile(task.points, (count, 1)),
+        views.rays.reshape(-1, 2),
+        np.repeat(views.whitening, n // views.whitening.shape[1], axis=1).reshape(-1, 3),
+        np.arange(count + 1) * n,
+        LOSSES[task.options.loss],
+        np.full(count, task.options.loss_scale * task.noise),
+        np.full(count, task.options.prior_weight * task.noise**2),
+        task.options.free,
+        0,
+    )
+    center, weight = task.prior
+    costs = costs + (weight * (np.log(focals) - center) ** 2)[:, None]
+    starts: list[_Minimum] = []
+    for flat in np.argsort(costs, axis=None, kind="stable").tolist():
+        k, row = divmod(flat, MAX_MINIMA)
+        if not costs[k, row] < np.inf or len(starts) == _MOST_STARTS:
+            break
+        around = [j for j in (k - 1, k + 1) if 0 <= j < count]
+        turned = np.linalg.norm(poses[around, :, :9] - poses[k, row, :9], axis=-1) < _SAME_BRANCH
+        if not (turned & (costs[around] < costs[k, row])).any():
+            starts.append(_Minimum(poses[k, row].copy(), float(focals[k]), float(costs[k, row])))
+    return starts, int(info[:, 1].sum()), int(info[:, 2].sum())
+
+
+def _with_linear_guess(task: _Task, views: FocalViews) -> FocalViews:
+    """The views, and among them that of the linear solver's focal length, where it has one."""
+    middle = len(views.focals) // 2
+    focal = float(views.focals[middle] * linear_focal(task.points, views.rays[middle]))
+    low, high = focal_bounds(task.camera)
+    if not low < focal < high:
+        return views
+    try:
+        rays, whitening = focal_view(task.points_2d, task.camera, focal, sigma=task.sigma)
+    except InputError:  # the lens model cannot be undone there
+        return views
+    place = int(np.searchsorted(views.focals, focal))
+    return FocalViews(
+        np.insert(views.focals, place, focal),
+        np.insert(views.rays, place, rays, axis=0),
+        np.insert(views.whitening, place, whitening, axis=0),
+    )
+
+
+def _descend(task: _Task, start: _Minimum) -> tuple[_Minimum, int]:
+    """The minimum of all 9 unknowns below a start, and the iterations it took."""
+    center, weight = task.prior
+    low, high = log_limits(task.camera, task.options.focal_prior)
+    pose, focal, cost = start.pose.copy(), start.focal, np.inf
+    iterations = 0
+    for _ in range(_LENS_ROUNDS if task.camera.distortion else 1):
+        try:
+            objective = task.objective(focal)
+        except InputError:
+            break
+        slopes = focal_slopes(task.points_2d, task.camera.with_focal(focal), objective.rays)
+        log_focal = np.log(focal)
+        cost, moved, used = refine_focal(
+            objective,
+            slopes,
+            center - log_focal,
+            weight,
+            low - log_focal,
+            high - log_focal,
+            _ALL_STEPS,
+            pose,
+            0.0,
+        )
+        iterations += used
+        focal *= float(np.exp(moved))
+        if abs(moved) < _LENS_TOLERANCE:  # a lens's slopes hold near the focal length they are of
+            break
+    return _Minimum(pose, focal, float(cost)), iterations
+
+
+def _are_same(first: _Minimum, second: _Minimum) -> bool:
+    turned = np.linalg.norm(first.pose[:9] - second.pose[:9])
+    stretched = np.linalg.norm(np.log(first.pose[13:] / second.pose[13:]))
+    zoomed = abs(np.log(first.focal / second.focal))
+    return bool(np.hypot(turned, stretched) < _SAME_CHORD and zoomed < _SAME_FOCAL)
+
+
+def _covariance(task: _Task, minimum: _Minimum, covariance: FloatArray) -> int:
+    """Fill in (9, 9); returns the number of an undetermined unknown, or -1."""
+    objective = task.objective(minimum.focal)
+    camera = task.camera.with_focal(minimum.focal)
+    slopes = focal_slopes(task.points_2d, camera, objective.rays)
+    return int(focal_covariance(objective, slopes, task.prior[1], minimum.pose, covariance))

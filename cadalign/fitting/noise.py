@@ -1,0 +1,89 @@
+"""From pixels and their uncertainties to rays and the weights of their residuals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats
+from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.projection import pinhole_rays
+
+Sigma = float | npt.ArrayLike
+
+
+def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:
+    """Normalised image coordinates (n, 2) of checked pixels (n, 2)."""
+    if camera.distortion:
+        return camera.normalize(points_2d)
+    return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
+    """Weights that turn errors of the rays into errors of unit covariance.
+
+    Parameters
+    ----------
+    sigma : float, (n,) float, (n, 2, 2) float or None
+        Standard deviation of all keypoints, of each, or covariance of each [px]; None for 1 px.
+    rays : (n, 2) float
+        Their normalised image coordinates.
+    camera : Camera
+
+    Returns
+    -------
+    (1 or n, 3) float
+        (a, b, c) such that (a du + b dv, c dv) has unit covariance for the error (du, dv) of a
+        ray: the upper Cholesky factor of its information matrix. Lens distortion enters by its
+        derivative.
+
+    Raises
+    ------
+    InputError
+        If a standard deviation is not positive, a covariance is not positive definite, or the
+        shape is wrong.
+    """
+    if sigma is None:
+        sigma = 1.0
+    if isinstance(sigma, int | float) and not camera.distortion:
+        if not 0 < sigma < np.inf:
+            raise InputError(f"{sigma} is not a standard deviation", where="sigma", fix=_FIX)
+        return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
+    information = _pixel_information(sigma, len(rays))
+    to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
+    of_rays = np.swapaxes(to_pixels, 1, 2) @ information @ to_pixels
+    a = np.sqrt(of_rays[:, 0, 0])
+    b = of_rays[:, 0, 1] / a
+    c = np.sqrt(of_rays[:, 1, 1] - b * b)
+    return np.stack([a, b, c], axis=1)
+
+
+_FIX = "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
+
+
+def _pixel_information(sigma: Any, count: int) -> FloatArray:
+    """Inverse covariances (n, 2, 2) of the pixels."""
+    dimensions = np.ndim(sigma)
+    if dimensions < 2:
+        shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
+        deviations = as_floats(sigma, name="sigma", shape=shape)
+        if not (deviations > 0).all():
+            raise InputError("has values that are not positive", where="sigma", fix=_FIX)
+        weights = np.broadcast_to(1.0 / deviations**2, (count,))
+        return np.asarray(weights[:, None, None] * np.eye(2))
+    covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))
+    definite = (np.linalg.eigvalsh(covariances)[:, 0] > 0) & (
+        np.abs(covariances[:, 0, 1] - covariances[:, 1, 0])
+        <= 1e-9 * np.abs(covariances).max(axis=(1, 2))
+    )
+    if not definite.all():
+        raise InputError(
+            f"the covariance of keypoint {np.flatnonzero(~definite)[0]} is not symmetric and "
+            "positive definite",
+            where="sigma",
+            fix=_FIX,
+        )
+    return np.asarray(np.linalg.inv(covariances))

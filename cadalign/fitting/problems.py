@@ -1,0 +1,190 @@
+"""Checked and packed correspondences: what the solvers get."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray, as_points
+from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.projection import all_finite
+
+
+@dataclass(frozen=True, eq=False)
+class Problems:
+    """The correspondences of one or many problems, one after the other.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Model points of all problems.
+    points_2d : (n, 2) float
+        Image points [px].
+    offsets : (B + 1,) int
+        Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``.
+    cameras : tuple of Camera
+        One for all problems, or one each.
+    """
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    offsets: IntArray
+    cameras: tuple[Camera, ...]
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def camera(self, problem: int) -> Camera:
+        """The camera of a problem."""
+        return self.cameras[problem if len(self.cameras) > 1 else 0]
+
+    def rows(self, problem: int) -> slice:
+        """The rows of a problem."""
+        return slice(int(self.offsets[problem]), int(self.offsets[problem + 1]))
+
+    @property
+    def calibrations(self) -> FloatArray:
+        """Focal lengths and principal points (1 or B, 4): fx, fy, cx, cy."""
+        return np.array([[c.fx, c.fy, c.cx, c.cy] for c in self.cameras])
+
+    @property
+    def counts(self) -> IntArray:
+        """How many points each problem has, (B,) int."""
+        return self.offsets[1:] - self.offsets[:-1]
+
+    def each_camera(self) -> Sequence[Camera]:
+        """The camera of every problem; none at all where no lens has distortion."""
+        if not any(camera.distortion for camera in self.cameras):
+            return ()
+        return self.cameras if len(self.cameras) > 1 else self.cameras * len(self)
+
+    def with_focals(self, focals: FloatArray) -> Problems:
+        """The same problems seen with the focal lengths (B,); NaN leaves a camera as it is."""
+        cameras = tuple(
+            self.camera(b) if math.isnan(focal) else self.camera(b).with_focal(focal)
+            for b, focal in enumerate(focals.tolist())
+        )
+        return replace(self, cameras=cameras)
+
+    def part(self, first: int, last: int) -> Problems:
+        """Problems ``first`` to ``last``, that one left out."""
+        start, end = self.offsets[first], self.offsets[last]
+        return Problems(
+            self.points_3d[start:end],
+            self.points_2d[start:end],
+            self.offsets[first : last + 1] - start,
+            self.cameras[first:last] if len(self.cameras) > 1 else self.cameras,
+        )
+
+
+def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera) -> Problems:
+    """Check one problem's arguments.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value is NaN or infinite, or lengths don't match.
+    """
+    model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
+    _check_camera(camera)
+    return Problems(model, image, np.array([0, len(model)]), (camera,))
+
+
+def pack_many(
+    points_3d: Sequence[npt.ArrayLike] | FloatArray,
+    points_2d: Sequence[npt.ArrayLike] | FloatArray,
+    camera: Camera | Sequence[Camera],
+) -> Problems:
+    """Check the arguments of many problems, of the same or of different sizes.
+
+    Raises
+    ------
+    InputError
+        As `pack_one`, naming the problem.
+    """
+    count = len(points_3d)
+    if len(points_2d) != count:
+        raise InputError(
+            f"{count} problems but {len(points_2d)} sets of image points", where="points_2d"
+        )
+    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+    if not isinstance(camera, Camera) and len(cameras) != count:
+        raise InputError(f"{count} problems but {len(cameras)} cameras", where="camera")
+    for single in cameras:
+        _check_camera(single)
+    if not count:
+        return Problems(np.empty((0, 3)), np.empty((0, 2)), np.zeros(1, dtype=np.int64), cameras)
+    if _is_stack(points_3d, 3) and _is_stack(points_2d, 2):
+        model = np.array(points_3d, dtype=np.float64, order="C").reshape(-1, 3)
+        image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
+        if len(model) == len(image) and all_finite(model, image):
+            offsets = np.arange(count + 1) * (len(model) // count)
+            return Problems(model, image, offsets, cameras)
+    pairs = [
+        _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
+        for b in range(count)
+    ]
+    offsets = np.concatenate([[0], np.cumsum([len(model) for model, _ in pairs])])
+    return Problems(
+        np.concatenate([model for model, _ in pairs]),
+        np.concatenate([image for _, image in pairs]),
+        offsets.astype(np.int64),
+        cameras,
+    )
+
+
+def _is_stack(value: object, last: int) -> bool:
+    return (
+        isinstance(value, np.ndarray)
+        and value.ndim == 3
+        and value.shape[2] == last
+        and value.dtype.kind == "f"
+    )
+
+
+def _check_camera(camera: object) -> None:
+    if not isinstance(camera, Camera):
+        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+
+
+def _as_kernels_want(points: npt.ArrayLike) -> FloatArray:
+    """A contiguous and writable array of floats, the given one where it is that already.
+
+    Kernels are compiled for writable arrays; a frozen one would compile them again.
+    """
+    if type(points) is np.ndarray and points.dtype == np.float64 and points.flags.carray:
+        return points
+    return np.require(points, np.float64, ["C", "W"])
+
+
+def _check_pair(
+    points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, name_3d: str, name_2d: str
+) -> tuple[FloatArray, FloatArray]:
+    """Writable arrays (n, 3) and (n, 2) of finite numbers, or an `InputError`."""
+    try:
+        model = _as_kernels_want(points_3d)
+        image = _as_kernels_want(points_2d)
+        valid = (
+            model.ndim == 2
+            and image.ndim == 2
+            and model.shape[1] == 3
+            and image.shape[1] == 2
+            and all_finite(model, image)
+        )
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:  # take the slow road, which says what is wrong
+        model = as_points(points_3d, name=name_3d, dimension=3)
+        image = as_points(points_2d, name=name_2d, dimension=2)
+    if len(model) != len(image):
+        raise InputError(
+            f"{len(model)} model points but {len(image)} image points",
+            where=name_2d,
+            fix="row i of both must be the same keypoint",
+        )
+    return model, image

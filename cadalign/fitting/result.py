@@ -1,0 +1,272 @@
+"""What a fit returns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.errors import InputError
+from cadalign.fitting.focal.prior import FocalPrior, focal_doubt
+from cadalign.fitting.uncertainty import Deviation, deviation_of, warnings_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another alignment that the keypoints cannot tell from the best one.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    relative_likelihood : float
+        Its likelihood over that of the best alignment, 1 for an equally good one.
+    camera : Camera
+        The camera that goes with it; the best alignment's, unless the focal length was estimated.
+    """
+
+    alignment: Alignment
+    relative_likelihood: float
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class FitStats:
+    """What a fit took.
+
+    Parameters
+    ----------
+    iterations : int
+        Refinement steps over all starts; samples, where inliers were searched for.
+    hypotheses : int
+        Alignments from which a refinement could start.
+    seconds : float
+    inlier_ratio : float, optional
+        Share of the keypoints that were kept, where they were searched for.
+    score : float, optional
+        Of the robust search: sum of squared errors, each at most the threshold's square [px^2].
+    """
+
+    iterations: int
+    hypotheses: int
+    seconds: float
+    inlier_ratio: float | None = None
+    score: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """An alignment, how well it explains the keypoints, and how well they determine it.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        Pose and stretch.
+    points_3d : (n, 3) float
+        The model's keypoints, as given.
+    residuals : (n, 2) float
+        Projected minus observed keypoint [px].
+    inliers : (n,) bool
+        The keypoints that the alignment was fitted to.
+    method : str
+        The method that found it.
+    camera : Camera
+        The camera it was fitted with; with the estimated focal length, where that was unknown.
+    sigma : float, optional
+        Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
+        its own.
+    covariance : (8, 8) or (9, 9) float, optional
+        Of the rotation vector in the camera frame [rad], the translation [model units], the
+        logarithms of the two unknown scales, in the order of the axes, and, where it was
+        estimated, the logarithm of the focal length; zero for what was held fixed. The inverse of
+        the Fisher information at the optimum. None for the methods that are not statistical.
+    known_axis : {"x", "y", "z"}
+        The model's axis whose scale was taken as 1.
+    stretched_axes : str
+        The axes whose scale was estimated.
+    focal : {"known", "estimate"}
+        Whether the focal length was estimated.
+    focal_prior : FocalPrior, optional
+        What was known of it beforehand.
+    alternatives : tuple of Alternative
+        Other alignments that explain the keypoints as well: with 4 points all other exact
+        solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
+    stats : FitStats
+    """
+
+    alignment: Alignment
+    points_3d: FloatArray
+    residuals: FloatArray
+    inliers: npt.NDArray[np.bool_]
+    method: str
+    camera: Camera
+    sigma: float | None = None
+    covariance: FloatArray | None = None
+    known_axis: str = "x"
+    stretched_axes: str = "yz"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stats: FitStats = FitStats(0, 0, 0.0)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the inliers' residuals [px]."""
+        kept = self.residuals[self.inliers]
+        return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
+
+    @property
+    def std(self) -> Deviation | None:
+        """The covariance in readable terms; None for methods that have none."""
+        if self.covariance is None:
+            return None
+        return deviation_of(self.covariance, self.known_axis)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What the keypoints do not determine, in words; empty where all is well."""
+        std = self.std
+        if std is None:
+            return ()
+        kept = self.points_3d[self.inliers]
+        unknowns = 6 + len(self.stretched_axes) + (self.focal == "estimate")
+        return warnings_of(
+            kept,
+            self.alignment,
+            std,
+            redundancy=2 * len(kept) - unknowns,
+            doubt=focal_doubt(self.camera, self.focal_prior) if self.focal == "estimate" else None,
+        )
+
+    def __str__(self) -> str:
+        count = int(self.inliers.sum())
+        of = "" if count == len(self.inliers) else f" of {len(self.inliers)}"
+        lines = [f"{self.method}: {count}{of} keypoints, rms {self.rms:.3g} px"]
+        std = self.std
+        angle = np.degrees(np.arccos(np.clip((np.trace(self.alignment.rotation) - 1) / 2, -1, 1)))
+        translation = ", ".join(f"{value:.4g}" for value in self.alignment.translation)
+        scale = [f"{value:.4g}" for value in self.alignment.scale]
+        if std is None:
+            lines.append(f"  rotation     {angle:.4g} deg from the camera's axes")
+            lines.append(f"  translation  ({translation})")
+        else:
+            shift = ", ".join(f"{value:.2g}" for value in std.translation)
+            lines.append(
+                f"  rotation     {angle:.4g} deg from the camera's axes, "
+                f"+- {std.rotation_deg:.2g} deg"
+            )
+            lines.append(f"  translation  ({translation}) +- ({shift})")
+            scale = [
+                text if deviation == 0 else f"{text} +- {100 * deviation:.2g} %"
+                for text, deviation in zip(scale, std.scale, strict=True)
+            ]
+        lines.append(f"  scale        ({', '.join(scale)})")
+        if self.focal == "estimate":
+            known_to = "" if std is None else f" +- {100 * std.focal:.2g} %"
+            lines.append(f"  focal length {self.camera.fx:.4g} px{known_to}")
+        lines.extend(
+            f"  also likely  ({other.relative_likelihood:.2g} x): scale "
+            f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
+            for other in self.alternatives
+        )
+        lines.extend(f"  warning      {text}" for text in self.warnings)
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the result as plain lists and numbers, for JSON."""
+        std = self.std
+        return {
+            "method": self.method,
+            "camera": self.camera.to_dict(),
+            "alignment": self.alignment.to_dict(),
+            "rms": self.rms,
+            "points_3d": self.points_3d.tolist(),
+            "residuals": self.residuals.tolist(),
+            "inliers": self.inliers.tolist(),
+            "sigma": self.sigma,
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "std": None if std is None else asdict(std),
+            "known_axis": self.known_axis,
+            "stretched_axes": self.stretched_axes,
+            "focal": self.focal,
+            "focal_prior": None if self.focal_prior is None else asdict(self.focal_prior),
+            "alternatives": [
+                {
+                    "alignment": other.alignment.to_dict(),
+                    "relative_likelihood": other.relative_likelihood,
+                    "camera": other.camera.to_dict(),
+                }
+                for other in self.alternatives
+            ],
+            "warnings": list(self.warnings),
+            "stats": asdict(self.stats),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> FitResult:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        try:
+            covariance = data["covariance"]
+            prior = data["focal_prior"]
+            unknowns = 8 if data["focal"] == "known" else 9
+            return cls(
+                alignment=Alignment.from_dict(data["alignment"]),
+                points_3d=as_points(data["points_3d"], name="points_3d", dimension=3),
+                residuals=as_floats(data["residuals"], name="residuals", shape=(None, 2)),
+                inliers=np.array(data["inliers"], dtype=bool),
+                method=data["method"],
+                camera=Camera.from_dict(data["camera"]),
+                sigma=data["sigma"],
+                covariance=None
+                if covariance is None
+                else as_floats(covariance, name="covariance", shape=(unknowns, unknowns)),
+                known_axis=data["known_axis"],
+                stretched_axes=data["stretched_axes"],
+                focal=data["focal"],
+                focal_prior=None if prior is None else FocalPrior(**prior),
+                alternatives=tuple(
+                    Alternative(
+                        Alignment.from_dict(other["alignment"]),
+                        other["relative_likelihood"],
+                        Camera.from_dict(other["camera"]),
+                    )
+                    for other in data["alternatives"]
+                ),
+                stats=FitStats(**data["stats"]),
+            )
+        except KeyError as error:
+            raise InputError(f"missing {error}", where="fit result") from None
+        except TypeError as error:
+            raise InputError(f"malformed ({error})", where="fit result") from None
+
+    def to_json(self) -> str:
+        """The result as JSON text; see `to_dict`."""
+        return json.dumps(self.to_dict())
+
+    @classmethod
+    def from_json(cls, text: str) -> FitResult:
+        """Read what `to_json` wrote.
+
+        Raises
+        ------
+        InputError
+            If it is not JSON, or a field is missing or invalid.
+        """
+        try:
+            data = json.loads(text)
+        except ValueError as error:
+            raise InputError(f"not valid JSON: {error}", where="fit result") from None
+        return cls.from_dict(data)

@@ -1,0 +1,151 @@
+"""How well an alignment is determined: standard deviations, and warnings in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.alignment import Alignment
+
+_WEAK_SCALE = 0.1  # relative standard deviation worth a warning
+_WEAK_FOCAL = 0.02
+_SHALLOW = 0.5  # differences of depth over the distance
+_WEAK_ROTATION_DEG = 10.0
+_WEAK_DISTANCE = 0.1  # standard deviation of the translation over its length
+_THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
+_END_ON_DEG = 15.0
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Predicted standard deviations of an alignment.
+
+    Parameters
+    ----------
+    rotation_deg : float
+        Of the rotation about all axes together [degrees].
+    translation : tuple of 3 float
+        Along the camera's axes [model units].
+    scale : tuple of 3 float
+        Of the scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known.
+    focal : float
+        Of the focal length, relative; 0 where it is known.
+    """
+
+    rotation_deg: float
+    translation: tuple[float, float, float]
+    scale: tuple[float, float, float]
+    focal: float = 0.0
+
+
+def deviation_of(covariance: FloatArray, known_axis: str) -> Deviation:
+    """Standard deviations in readable terms from a covariance (8, 8) or (9, 9)."""
+    variance = np.maximum(covariance.diagonal(), 0.0)
+    scale = [0.0, 0.0, 0.0]
+    for place, axis in enumerate(unknown_axes(known_axis)):
+        scale[axis] = float(np.sqrt(variance[6 + place]))
+    x, y, z = np.sqrt(variance[3:6]).tolist()
+    return Deviation(
+        rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
+        translation=(x, y, z),
+        scale=(scale[0], scale[1], scale[2]),
+        focal=float(np.sqrt(variance[8:].sum())),
+    )
+
+
+def unknown_axes(known_axis: str) -> tuple[int, int]:
+    """The two axes, in order, whose scale is unknown."""
+    first, second = (axis for axis in range(3) if "xyz"[axis] != known_axis)
+    return first, second
+
+
+def warnings_of(
+    points_3d: FloatArray,
+    alignment: Alignment,
+    deviation: Deviation,
+    *,
+    redundancy: int,
+    doubt: str | None = None,
+) -> tuple[str, ...]:
+    """Which stretch or motion the keypoints leave uncertain, and why.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        The keypoints that the alignment was fitted to.
+    alignment : Alignment
+    deviation : Deviation
+        Its predicted standard deviations.
+    redundancy : int
+        Equations minus unknowns.
+    doubt : str, optional
+        Why the estimated focal length is doubtful, however well determined it looks.
+
+    Returns
+    -------
+    tuple of str
+        Empty where everything is well determined.
+    """
+    warnings = []
+    if redundancy <= 0:
+        warnings.append(
+            f"{len(points_3d)} keypoints fit exactly whatever they are: "
+            "the residuals say nothing about the quality of the fit"
+        )
+    if deviation.focal > _WEAK_FOCAL:
+        warnings.append(
+            f"the focal length is known only to +-{_percent(deviation.focal)}: "
+            f"{_why_focal_is_weak(points_3d, alignment)}"
+        )
+    if doubt is not None:
+        warnings.append(doubt)
+    for axis, relative in enumerate(deviation.scale):
+        if relative > _WEAK_SCALE:
+            warnings.append(
+                f"s_{'xyz'[axis]} is known only to +-{_percent(relative)}: "
+                f"{_why_scale_is_weak(points_3d, alignment, axis)}"
+            )
+    if deviation.rotation_deg > _WEAK_ROTATION_DEG:
+        warnings.append(f"the rotation is known only to +-{deviation.rotation_deg:.2g} deg")
+    distance = float(np.linalg.norm(alignment.translation))
+    spread = float(np.linalg.norm(deviation.translation))
+    if spread > _WEAK_DISTANCE * distance:
+        direction = "xyz"[int(np.argmax(deviation.translation))]
+        share = f" ({_percent(spread / distance)} of the distance)" if distance > 0 else ""
+        warnings.append(
+            f"the translation along the camera's {direction} is known only to "
+            f"+-{max(deviation.translation):.2g} model units{share}"
+        )
+    return tuple(warnings)
+
+
+def _why_focal_is_weak(points_3d: FloatArray, alignment: Alignment) -> str:
+    in_camera = alignment.apply(points_3d)
+    thickness = np.linalg.svd(in_camera - in_camera.mean(axis=0), compute_uv=False)
+    if thickness[-1] < _THIN * thickness[0]:
+        return "the keypoints lie nearly in one plane"
+    if np.ptp(in_camera[:, 2]) < _SHALLOW * in_camera[:, 2].mean():
+        return "the keypoints differ little in depth for their distance"
+    return "the keypoints show little perspective for their noise"
+
+
+def _why_scale_is_weak(points_3d: FloatArray, alignment: Alignment, axis: int) -> str:
+    name = "xyz"[axis]
+    spread = points_3d.std(axis=0)
+    center = points_3d.mean(axis=0)
+    if spread[axis] < _THIN * spread.max():
+        return f"the keypoints lie nearly in the plane {name} = {center[axis]:.3g}"
+    ray = alignment.apply(center[None])[0]
+    cosine = abs(ray @ alignment.rotation[:, axis]) / np.linalg.norm(ray)
+    if np.degrees(np.arccos(min(1.0, cosine))) < _END_ON_DEG:
+        return f"the model's {name} axis is seen nearly end-on"
+    thickness = np.linalg.svd(points_3d - center, compute_uv=False)
+    if thickness[2] < _THIN * thickness[0]:
+        return "the keypoints lie nearly in one plane"
+    return "there are few keypoints for their noise"
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.0f} %" if fraction < 100 else "more than 10000 %"

@@ -1,0 +1,1 @@
+"""Cameras, alignments, boxes and meshes, their conventions and their metrics."""

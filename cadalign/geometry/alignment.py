@@ -1,0 +1,181 @@
+"""The alignment of a CAD model: rotation, translation and stretch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points, read_only
+from cadalign.errors import InputError
+
+_ORTHONORMAL_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where a model is and how it is stretched.
+
+    ``x_cam = rotation @ diag(scale) @ x + translation``: the stretch acts along the model's own
+    axes, before the rotation. Estimated alignments have ``scale[0] == 1``: one image alone does not
+    tell a large object far away from a small one nearby, so the model's length along x is taken as
+    known.
+
+    Parameters
+    ----------
+    rotation : (3, 3) float
+        Orthonormal, determinant +1.
+    translation : (3,) float
+        The model's origin in the camera frame [model units].
+    scale : (3,) float
+        Stretch along the model's x, y and z, positive.
+
+    Raises
+    ------
+    InputError
+        If a shape or value is wrong, the rotation is not one, or a scale is not positive.
+
+    Examples
+    --------
+    >>> alignment = Alignment(np.eye(3), [0, 0, 4], [1, 2, 0.5])
+    >>> alignment.apply([[1.0, 1.0, 1.0]]).tolist()
+    [[1.0, 2.0, 4.5]]
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+
+    def __post_init__(self) -> None:
+        rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
+        translation = as_floats(self.translation, name="translation", shape=(3,))
+        scale = as_floats(self.scale, name="scale", shape=(3,))
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise InputError(
+                "not a rotation matrix",
+                where="rotation",
+                fix="its rows must be orthonormal and its determinant +1",
+            )
+        if (scale <= 0).any():
+            raise InputError(f"{scale.tolist()} is not positive", where="scale")
+        for name, value in (("rotation", rotation), ("translation", translation), ("scale", scale)):
+            object.__setattr__(self, name, read_only(value))
+
+    @classmethod
+    def from_solver(
+        cls, rotation: FloatArray, translation: FloatArray, scale: FloatArray
+    ) -> Alignment:
+        """Wrap arrays that a solver guarantees to be valid, without checking or copying them."""
+        alignment = object.__new__(cls)
+        for name, value in (("rotation", rotation), ("translation", translation), ("scale", scale)):
+            value.flags.writeable = False
+            object.__setattr__(alignment, name, value)
+        return alignment
+
+    @classmethod
+    def from_packed(cls, pose: FloatArray) -> Alignment:
+        """Take over a solver's packed pose (15,): rotation row by row, translation, scale."""
+        pose = pose.copy()
+        pose.flags.writeable = False
+        alignment = object.__new__(cls)
+        object.__setattr__(alignment, "rotation", pose[:9].reshape(3, 3))
+        object.__setattr__(alignment, "translation", pose[9:12])
+        object.__setattr__(alignment, "scale", pose[12:])
+        return alignment
+
+    @classmethod
+    def identity(cls) -> Alignment:
+        """The alignment that leaves every point where it is."""
+        return cls(np.eye(3), np.zeros(3), np.ones(3))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Alignment):
+            return NotImplemented
+        return bool(
+            (self.rotation == other.rotation).all()
+            and (self.translation == other.translation).all()
+            and (self.scale == other.scale).all()
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.rotation.tobytes(), self.translation.tobytes(), self.scale.tobytes()))
+
+    @property
+    def linear(self) -> FloatArray:
+        """The linear part ``rotation @ diag(scale)``, (3, 3) float."""
+        return np.asarray(self.rotation * self.scale)
+
+    @property
+    def cam_from_model(self) -> FloatArray:
+        """The homogeneous transform from stretched-model to camera coordinates, (4, 4) float."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.linear
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def apply(self, points: npt.ArrayLike) -> FloatArray:
+        """Take model points (n, 3) into the camera frame; (n, 3) float."""
+        return as_points(points, name="points", dimension=3) @ self.linear.T + self.translation
+
+    def inverse(self, points_cam: npt.ArrayLike) -> FloatArray:
+        """Take camera-frame points (n, 3) back to the model's coordinates; (n, 3) float.
+
+        Examples
+        --------
+        >>> alignment = Alignment(np.eye(3), [0, 0, 4], [1, 2, 0.5])
+        >>> alignment.inverse([[1.0, 2.0, 4.5]]).tolist()
+        [[1.0, 1.0, 1.0]]
+        """
+        points = as_points(points_cam, name="points_cam", dimension=3)
+        return (points - self.translation) @ self.rotation / self.scale
+
+    def __matmul__(self, first: Alignment) -> Alignment:
+        """Compose: ``(second @ first).apply(x) == second.apply(first.apply(x))``.
+
+        Raises
+        ------
+        InputError
+            If ``second`` stretches its axes differently: the result would shear the model, which
+            is not an alignment any more.
+        """
+        if not isinstance(first, Alignment):
+            return NotImplemented
+        if np.ptp(self.scale) > 1e-12 * self.scale.max():
+            raise InputError(
+                f"the outer alignment has the stretch {self.scale.tolist()}",
+                where="second @ first",
+                fix="only an alignment with equal scales can follow another one",
+            )
+        return Alignment(
+            self.rotation @ first.rotation,
+            self.apply(first.translation[None])[0],
+            self.scale * first.scale,
+        )
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """Write the alignment as plain lists, for JSON."""
+        return {
+            "rotation": self.rotation.tolist(),
+            "translation": self.translation.tolist(),
+            "scale": self.scale.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        if not isinstance(data, Mapping):
+            raise InputError(f"expected an object, got {type(data).__name__}", where="alignment")
+        missing = [key for key in ("rotation", "translation", "scale") if key not in data]
+        if missing:
+            raise InputError(f"missing {', '.join(missing)}", where="alignment")
+        return cls(data["rotation"], data["translation"], data["scale"])

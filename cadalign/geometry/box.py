@@ -1,0 +1,87 @@
+"""Oriented boxes: the stretched model's bounding box in the camera frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, read_only
+from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+
+# Corner i lies at the high side of axis k where bit k of i is set.
+_CORNER_SIGNS = np.array([[1 if i >> k & 1 else -1 for k in range(3)] for i in range(8)]) / 2
+BOX_EDGES = tuple((i, i | 1 << k) for k in range(3) for i in range(8) if not i >> k & 1)
+"""The 12 edges as pairs of corner numbers: four along x, four along y, four along z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An oriented box.
+
+    Parameters
+    ----------
+    center : (3,) float
+        The box's centre.
+    rotation : (3, 3) float
+        Its axes are the columns.
+    extents : (3,) float
+        Its full side lengths along these axes, not negative.
+
+    Raises
+    ------
+    InputError
+        If a shape or value is wrong, or an extent is negative.
+    """
+
+    center: FloatArray
+    rotation: FloatArray
+    extents: FloatArray
+
+    def __post_init__(self) -> None:
+        center = as_floats(self.center, name="center", shape=(3,))
+        rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
+        extents = as_floats(self.extents, name="extents", shape=(3,))
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
+            raise InputError("its columns are not orthonormal", where="rotation")
+        if (extents < 0).any():
+            raise InputError(f"{extents.tolist()} is negative", where="extents")
+        for name, value in (("center", center), ("rotation", rotation), ("extents", extents)):
+            object.__setattr__(self, name, read_only(value))
+
+    @classmethod
+    def from_model(cls, bounds: npt.ArrayLike, alignment: Alignment) -> Box:
+        """Make the box, in the camera frame, of a model that is stretched and placed.
+
+        Parameters
+        ----------
+        bounds : (2, 3) float
+            The lowest and highest coordinates of the model in its own frame.
+        alignment : Alignment
+            The model's pose and stretch.
+
+        Examples
+        --------
+        >>> alignment = Alignment(np.eye(3), [0, 0, 4], [1, 2, 0.5])
+        >>> box = Box.from_model([[-1, -1, -1], [1, 1, 1]], alignment)
+        >>> box.center.tolist(), box.extents.tolist()
+        ([0.0, 0.0, 4.0], [2.0, 4.0, 1.0])
+        """
+        low, high = as_floats(bounds, name="bounds", shape=(2, 3))
+        return cls(
+            center=alignment.apply([(low + high) / 2])[0],
+            rotation=alignment.rotation,
+            extents=(high - low) * alignment.scale,
+        )
+
+    @property
+    def corners(self) -> FloatArray:
+        """The 8 corners, (8, 3) float; `BOX_EDGES` says which of them an edge joins."""
+        return self.center + (_CORNER_SIGNS * self.extents) @ self.rotation.T
+
+    @property
+    def volume(self) -> float:
+        """The volume [model units cubed]."""
+        return float(np.prod(self.extents))

@@ -1,0 +1,166 @@
+"""Triangle meshes with their faces in file order, and how their surface is coloured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import DataError, InputError
+
+GREY = (0.7, 0.7, 0.7, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """How a part of a surface looks.
+
+    Parameters
+    ----------
+    name : str
+        The material's name in its file.
+    color : tuple of 4 float
+        Red, green, blue and opacity, 0 to 1; multiplied with the texture where there is one.
+    texture : (h, w, 3 or 4) uint8, optional
+        The image, its first row at the top; texture coordinates start at the bottom left.
+    """
+
+    name: str = ""
+    color: tuple[float, float, float, float] = GREY
+    texture: npt.NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh in model coordinates.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+        Positions [model units].
+    faces : (m, 3) int
+        Vertex numbers of the triangles, in the order of the file.
+    polygon : (m,) int, optional
+        The number, in the file, of the face that a triangle was cut from: a quad gives two
+        triangles with the same number. By default ``0 ... m - 1``.
+    vertex_colors : (n, 4) float, optional
+        Red, green, blue, opacity, 0 to 1.
+    corner_uv : (m, 3, 2) float, optional
+        Texture coordinates of each triangle's corners.
+    materials : tuple of Material
+        The materials that ``face_material`` names.
+    face_material : (m,) int, optional
+        Which material a triangle has; by default the first of all.
+    source : str
+        The file or id the mesh comes from, for messages.
+
+    Raises
+    ------
+    DataError
+        If there are no faces, an index is out of range, a vertex is not finite, or arrays don't
+        match in length.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    polygon: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    vertex_colors: FloatArray | None = None
+    corner_uv: FloatArray | None = None
+    materials: tuple[Material, ...] = (Material(),)
+    face_material: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    source: str = "mesh"
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise DataError(
+                f"vertices {vertices.shape} and faces {faces.shape} are not a triangle mesh",
+                where=self.source,
+            )
+        if not len(faces):
+            raise DataError("the mesh has no faces", where=self.source)
+        if not np.isfinite(vertices).all():
+            raise DataError("the mesh has NaN or infinite vertices", where=self.source)
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise DataError(
+                f"a face names vertex {faces.min() if faces.min() < 0 else faces.max()}, "
+                f"but there are {len(vertices)}",
+                where=self.source,
+                fix="the file is cut short or damaged",
+            )
+        count = len(faces)
+        polygon = self.polygon if len(self.polygon) else np.arange(count)
+        material = self.face_material if len(self.face_material) else np.zeros(count, dtype=int)
+        for name, array, shape in (
+            ("polygon", polygon, (count,)),
+            ("face_material", material, (count,)),
+            ("vertex_colors", self.vertex_colors, (len(vertices), 4)),
+            ("corner_uv", self.corner_uv, (count, 3, 2)),
+        ):
+            if array is not None and array.shape != shape:
+                raise DataError(f"{name} has shape {array.shape}, not {shape}", where=self.source)
+        for name, value in (
+            ("vertices", vertices),
+            ("faces", faces),
+            ("polygon", polygon.astype(np.int64)),
+            ("face_material", material.astype(np.int64)),
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest coordinates of the vertices that faces use, (2, 3) float."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.array([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def triangles(self) -> FloatArray:
+        """The corners of all triangles, (m, 3, 3) float."""
+        return np.asarray(self.vertices[self.faces])
+
+    def stretched(self, scale: npt.ArrayLike) -> Mesh:
+        """The same mesh with its axes multiplied by ``scale`` (3,)."""
+        return replace(self, vertices=self.vertices * np.asarray(scale, dtype=float))
+
+    def surface_points(self, face_index: npt.ArrayLike, barycentric: npt.ArrayLike) -> FloatArray:
+        """Points on the surface from the file's face numbers and barycentric coordinates.
+
+        Parameters
+        ----------
+        face_index : (k,) int
+            Numbers of faces in the file's order; of a polygon its first triangle counts.
+        barycentric : (k, 3) float
+            Weights of the face's corners in file order; normalised to the sum 1.
+
+        Returns
+        -------
+        (k, 3) float
+
+        Raises
+        ------
+        InputError
+            If a face number is not in the mesh.
+        """
+        index = np.atleast_1d(np.asarray(face_index, dtype=np.int64))
+        weights = np.asarray(barycentric, dtype=float).reshape(len(index), 3)
+        triangle = np.searchsorted(self.polygon, index)
+        known = (triangle < len(self.faces)) & (index >= 0)
+        known[known] = self.polygon[triangle[known]] == index[known]
+        if not known.all():
+            raise InputError(
+                f"face {index[~known][0]} is not in {self.source}, which has faces "
+                f"0 to {self.polygon[-1]}",
+                where="face_index",
+            )
+        weights = weights / weights.sum(axis=1, keepdims=True)
+        return np.asarray(np.einsum("kc,kcd->kd", weights, self.triangles[triangle]))
+
+    def to_trimesh(self) -> Any:
+        """The geometry as a `trimesh.Trimesh`, faces in the same order, nothing merged."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)

@@ -1,0 +1,114 @@
+"""Read images upright, as EXIF says they were held, and write them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import DataError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from cadalign.geometry.camera import Camera
+
+ByteImage = npt.NDArray[np.uint8]
+
+_ORIENTATION = 0x0112
+_ON_ITS_SIDE = frozenset((5, 6, 7, 8))
+
+
+@contextmanager
+def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
+    """Open a photo; its pixels are read when they are asked for.
+
+    Raises
+    ------
+    DataError
+        If it is missing or is not an image, now or while its pixels are read.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            yield image
+    except FileNotFoundError:
+        raise DataError("no such file", where=str(path)) from None
+    except (
+        OSError,
+        SyntaxError,  # Pillow's word for a broken PNG
+        UnidentifiedImageError,
+        Image.DecompressionBombError,
+    ) as error:
+        raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
+
+
+def read_photo(path: str | os.PathLike[str]) -> npt.NDArray[np.uint8]:
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
+
+    Raises
+    ------
+    DataError
+        If it is missing or is not an image.
+    """
+    from PIL import ImageOps
+
+    with open_photo(path) as image:
+        return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+
+
+def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height [px] of a photo turned upright; its pixels are not read.
+
+    Raises
+    ------
+    DataError
+        If it is missing or is not an image.
+    """
+    with open_photo(Path(path)) as image:
+        width, height = image.size
+        is_on_its_side = image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
+    return (height, width) if is_on_its_side else (width, height)
+
+
+def read_image(path: Path, camera: Camera) -> ByteImage:
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
+
+    Raises
+    ------
+    DataError
+        If it is missing, is not an image, or has another size than the camera.
+    """
+    pixels = read_photo(path)
+    height, width = pixels.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"the image is {width} x {height}, the camera {camera.width} x {camera.height}",
+            where=str(path),
+            fix="give the camera of this image",
+        )
+    return pixels
+
+
+def write_image(path: Path, image: ByteImage) -> None:
+    """Write an RGB image (h, w, 3) uint8 as PNG.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    try:
+        if not encoded:
+            raise OSError("the picture could not be encoded")
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise DataError(f"cannot be written ({error})", where=str(path)) from None

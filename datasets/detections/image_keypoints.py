@@ -1,0 +1,277 @@
+"""Keypoints in an image, as detectors and annotation tools write them, joined with a model's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.datasets.models.model_keypoints import ModelKeypoints
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.camera import Camera
+from cadalign.io.observation import Observation
+
+OCCLUDED_SCORE = 0.5
+"""How much a keypoint is trusted whose visibility flag says that it is labelled but hidden."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageKeypoints:
+    """The keypoints of one object in one image.
+
+    Parameters
+    ----------
+    points_2d : (k, 2) float
+        Pixels; integers are pixel centres.
+    scores : (k,) float, optional
+        How sure the detector is of each, 0 for a keypoint that was not found. Visibility flags are
+        scores of 0 (not labelled), 0.5 (hidden) and 1 (visible).
+    names : tuple of k str, optional
+        What each keypoint is called.
+    semantic_ids : tuple of k int, optional
+        What each keypoint means.
+    sigma : (k,) float, optional
+        Standard deviation of each [px].
+    image : str, optional
+        Name or id of the image.
+    size : (int, int), optional
+        The image's width and height [px].
+    images : int
+        How many images the file lists, with keypoints or without.
+    score : float, optional
+        How sure the detector is of the whole object.
+    source : str
+        The file and the place in it, for messages.
+    """
+
+    points_2d: FloatArray
+    scores: FloatArray | None = None
+    names: tuple[str, ...] | None = None
+    semantic_ids: tuple[int, ...] | None = None
+    sigma: FloatArray | None = None
+    image: str | None = None
+    size: tuple[int, int] | None = None
+    images: int = 1
+    score: float | None = None
+    source: str = "keypoints"
+
+    def __post_init__(self) -> None:
+        points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)
+        object.__setattr__(self, "points_2d", points)
+        for name in ("scores", "sigma"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            value = as_floats(value, name=f"{self.source}: {name}", shape=(len(points),))
+            object.__setattr__(self, name, value)
+            if (value < 0).any() or (name == "sigma" and not value.all()):
+                row = int(np.argmax(value <= 0) if name == "sigma" else np.argmax(value < 0))
+                what = "not positive" if name == "sigma" else "negative"
+                raise DataError(
+                    f"keypoint {row} has the value {value[row]:g}, which is {what}",
+                    where=f"{self.source}: {name}",
+                )
+        for name in ("names", "semantic_ids"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(points):
+                raise DataError(
+                    f"{len(points)} keypoints but {len(values)} {name.replace('_', ' ')}",
+                    where=self.source,
+                )
+
+    def __len__(self) -> int:
+        return len(self.points_2d)
+
+
+def choose_object(
+    objects: Sequence[ImageKeypoints],
+    *,
+    image: str | None = None,
+    number: int | None = None,
+) -> ImageKeypoints:
+    """Choose one object out of those of a file.
+
+    Parameters
+    ----------
+    objects : sequence of ImageKeypoints
+    image : str, optional
+        The image's file name or id; needed where the file has several images. A file of one image
+        may call it otherwise.
+    number : int, optional
+        Which of the image's objects, from 0; by default that of the highest score, or the only one.
+
+    Raises
+    ------
+    InputError
+        If there is no such image or object, or no telling which is meant.
+    """
+    images = list(dict.fromkeys(found.image for found in objects))
+    wanted = [found for found in objects if image is not None and _is_image(found.image, image)]
+    if not wanted:
+        listed_images = max((found.images for found in objects), default=0)
+        if image is not None and listed_images > 1 and len(images) == 1:
+            raise InputError(
+                f"{listed_images} images, and no keypoints in {image!r}",
+                where="image",
+                fix=f"there are some in {images[0]}",
+            )
+        if len(images) != 1:
+            listed = ", ".join(str(name) for name in images[:5])
+            raise InputError(
+                f"{len(images)} images, none of which is {image!r}"
+                if image is not None
+                else f"{len(images)} images",
+                where="image",
+                fix=f"choose one of {listed}" + (", ..." if len(images) > 5 else ""),
+            )
+        wanted = list(objects)
+    if number is not None:
+        if not 0 <= number < len(wanted):
+            raise InputError(
+                f"object {number} of {len(wanted)}", where="number", fix="count from 0"
+            )
+        return wanted[number]
+    if len(wanted) > 1 and any(found.score is None for found in wanted):
+        raise InputError(
+            f"{len(wanted)} objects in the image, and no scores to choose by",
+            where="number",
+            fix=f"choose one, 0 to {len(wanted) - 1}",
+        )
+    return max(wanted, key=lambda found: found.score or 0.0)
+
+
+def join_keypoints(
+    found: ImageKeypoints,
+    model: ModelKeypoints,
+    camera: Camera,
+    *,
+    image: Path | None = None,
+    min_score: float = 0.0,
+    ignore_unknown: bool = False,
+    sigma_from_scores: float | None = None,
+) -> Observation:
+    """Pair an image's keypoints with the model's.
+
+    By name where the image's have names (capitals, and spaces for ``_`` and ``-``, don't count),
+    otherwise by semantic id, otherwise by their order, if there are as many.
+
+    Parameters
+    ----------
+    found : ImageKeypoints
+    model : ModelKeypoints
+    camera : Camera
+        May be one `Camera.without_focal`.
+    image : Path, optional
+        The photo.
+    min_score : float
+        Keypoints of a lower score are left out; those of score 0 always are.
+    ignore_unknown : bool
+        Leave out keypoints that the model does not have, instead of refusing them.
+    sigma_from_scores : float, optional
+        Take the scores as weights: the standard deviation of a keypoint is this [px] over its
+        score. Without it they become the observation's ``confidences``, which a robust fit draws
+        its samples by.
+
+    Returns
+    -------
+    Observation
+
+    Raises
+    ------
+    DataError
+        If a keypoint is unknown, two are the same, or none is left.
+    InputError
+        If ``sigma_from_scores`` is not positive.
+    """
+    kept = [row for row in range(len(found)) if _is_found(found, row, min_score)]
+    places = _places(found, model)
+    unknown = [row for row in kept if places[row] is None]
+    if unknown and not ignore_unknown:
+        raise DataError(
+            f"the model has no keypoint {_label(found, unknown[0])!r}",
+            where=found.source,
+            fix=f"it has {_some(model.names)}; ignore_unknown leaves out what it has not",
+        )
+    if sigma_from_scores is not None and not 0 < sigma_from_scores < np.inf:
+        raise InputError(f"{sigma_from_scores} is not positive", where="sigma_from_scores")
+    pairs = [(row, place) for row in kept if (place := places[row]) is not None]
+    first: dict[int, int] = {}
+    for row, place in pairs:
+        if first.setdefault(place, row) != row:
+            raise DataError(
+                f"keypoints {first[place]} and {row} are both {model.names[place]!r}",
+                where=found.source,
+                fix="leave one of them out",
+            )
+    if not pairs:
+        raise DataError(
+            f"none of {len(found)} keypoints is found in the image and on the model",
+            where=found.source,
+            fix=f"the model has {_some(model.names)}",
+        )
+    rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
+    ids = [model.semantic_ids[place] for place in columns]
+    scores = None if found.scores is None else found.scores[rows]
+    sigma = None if found.sigma is None else found.sigma[rows]
+    if sigma_from_scores is not None:
+        if scores is None:
+            raise DataError("there are no scores to weigh by", where=found.source)
+        sigma = sigma_from_scores / scores
+    return Observation(
+        points_3d=model.xyz[columns],
+        points_2d=found.points_2d[rows],
+        camera=camera,
+        sigma=sigma,
+        semantic_ids=None if None in ids else np.array(ids, dtype=np.int64),
+        names=tuple(model.names[place] for place in columns),
+        confidences=scores if sigma_from_scores is None else None,
+        image=image,
+        model=model.model,
+    )
+
+
+def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
+    """For each of the image's keypoints the model's row; None where the model has it not."""
+    if found.names is not None:
+        rows = {_plain(name): row for row, name in enumerate(model.names)}
+        return [rows.get(_plain(name)) for name in found.names]
+    if found.semantic_ids is not None:
+        by_id = {number: row for row, number in enumerate(model.semantic_ids)}
+        return [by_id.get(number) for number in found.semantic_ids]
+    if len(found) != len(model):
+        raise DataError(
+            f"{len(found)} keypoints without names, but the model has {len(model)}",
+            where=found.source,
+            fix="give names, or as many keypoints as the model has, in its order",
+        )
+    return list(range(len(found)))
+
+
+def _is_found(found: ImageKeypoints, row: int, min_score: float) -> bool:
+    if found.scores is None:
+        return True
+    return bool(found.scores[row] > 0 and found.scores[row] >= min_score)
+
+
+def _label(found: ImageKeypoints, row: int) -> str | int:
+    if found.names is not None:
+        return found.names[row]
+    return row if found.semantic_ids is None else found.semantic_ids[row]
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _is_image(name: str | None, wanted: str) -> bool:
+    """Whether a file's name or id for an image means the wanted one."""
+    return name is not None and (
+        name == wanted or Path(name).name == Path(wanted).name or name == Path(wanted).stem
+    )

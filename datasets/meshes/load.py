@@ -1,0 +1,137 @@
+"""Mesh files of several formats, and checks of what is in them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets.meshes.obj import read_obj
+from cadalign.datasets.meshes.scenes import read_ply, read_scene
+from cadalign.errors import DataError
+from cadalign.geometry.mesh import Mesh
+
+_READERS = {
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".glb": read_scene,
+    ".gltf": read_scene,
+    ".stl": read_scene,
+    ".off": read_scene,
+}
+# Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
+FLAT_TOLERANCE = 1e-5
+
+
+def load_mesh(path: str | os.PathLike[str]) -> Mesh:
+    """Read a mesh with its faces in file order.
+
+    Of OBJ and PLY files, ``Mesh.polygon`` holds each triangle's face number in the file, which is
+    what keypoint annotations refer to. In GLB and glTF scenes every node is placed by its
+    transform and all become one mesh.
+
+    A material library or texture that is missing or unreadable is warned of (logger "cadalign"),
+    and the surface becomes plain.
+
+    Parameters
+    ----------
+    path : str or path-like
+        An OBJ, PLY, GLB, glTF, STL or OFF file.
+
+    Returns
+    -------
+    Mesh
+        Its ``source`` is the path.
+
+    Raises
+    ------
+    DataError
+        If the file is missing, empty, cut short, of an unknown or another format, or has no faces.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "square.obj")
+    ...     _ = path.write_text("v 0 0 0\\nv 1 0 0\\nv 1 1 0\\nv 0 1 0\\nf 1 2 3 4\\n")
+    ...     mesh = load_mesh(path)
+    >>> mesh.faces.tolist(), mesh.polygon.tolist()
+    ([[0, 1, 2], [0, 2, 3]], [0, 0])
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError(
+            f"{path.suffix or 'no extension'} is not a known mesh format",
+            where=str(path),
+            fix=f"known are {', '.join(_READERS)}",
+        )
+    try:
+        if path.stat().st_size == 0:
+            raise DataError("the mesh file is empty", where=str(path), fix="get it again")
+        return reader(path)
+    except FileNotFoundError:
+        raise DataError("no such mesh file", where=str(path)) from None
+    except OSError as error:
+        raise DataError(
+            f"the mesh file cannot be read ({error.strerror or error})", where=str(path)
+        ) from None
+
+
+def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ...]:
+    """Name the axes along which a mesh has no thickness.
+
+    Such a model has no volume, no stretch along that axis can be told, and boxes around it have no
+    overlap to measure.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The model.
+    tolerance : float
+        The thickness that counts as none, as a share of the bounding box's diagonal.
+
+    Returns
+    -------
+    tuple of str
+        Some of "x", "y", "z"; empty for a solid model.
+
+    Examples
+    --------
+    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> flat_axes(square)
+    ('z',)
+    """
+    extents = _extents(mesh)
+    flat = extents <= tolerance * np.linalg.norm(extents)
+    return tuple(axis for axis, thin in zip("xyz", flat, strict=True) if thin)
+
+
+def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
+    """Refuse a mesh that has no thickness along an axis; see `flat_axes`.
+
+    Raises
+    ------
+    DataError
+        Naming the mesh's source and the axes.
+
+    Examples
+    --------
+    >>> check_solid(Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], source="square.obj"))
+    Traceback (most recent call last):
+    cadalign.errors.DataError: square.obj: the model has zero thickness along z; leave it out
+    """
+    flat = flat_axes(mesh, tolerance=tolerance)
+    if flat:
+        raise DataError(
+            f"the model has zero thickness along {' and '.join(flat)}",
+            where=mesh.source,
+            fix="leave it out",
+        )
+
+
+def _extents(mesh: Mesh) -> FloatArray:
+    low, high = mesh.bounds
+    return np.asarray(high - low)

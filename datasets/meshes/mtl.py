@@ -1,0 +1,177 @@
+"""The materials of OBJ files: MTL libraries and the textures they name."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from trimesh.exchange.obj import parse_mtl
+
+from cadalign.geometry.mesh import GREY, Material
+
+logger = logging.getLogger("cadalign")
+
+WHITE = (1.0, 1.0, 1.0, 1.0)
+# How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
+_MAP_OPTIONS = {
+    "-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-texres": 1, "-imfchan": 1, "-type": 1,
+    "-bm": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3,
+}  # fmt: skip
+
+
+def load_materials(
+    obj_path: Path, libraries: Iterable[str], names: Iterable[str]
+) -> dict[str, Material]:
+    """Read the named materials; what is missing is warned of and becomes grey.
+
+    Parameters
+    ----------
+    obj_path : Path
+        The OBJ file, which library names are relative to.
+    libraries : iterable of str
+        What its ``mtllib`` lines name.
+    names : iterable of str
+        The materials in use; only their textures are read.
+
+    Returns
+    -------
+    dict of str to Material
+        Every one of the names.
+    """
+    entries: dict[str, tuple[Path, dict[str, Any]]] = {}
+    for library in libraries:
+        for path in _library_paths(obj_path, library):
+            entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
+    found: dict[str, Material] = {}
+    for name in names:
+        # The parser joins the words of a name with single blanks.
+        key = " ".join(name.split())
+        if key in entries:
+            found[name] = _material(name, *entries[key])
+        else:
+            logger.warning("%s: material %r is not defined; it becomes grey", obj_path, name)
+            found[name] = Material(name=name)
+    return found
+
+
+def texture_array(image: Any) -> npt.NDArray[np.uint8]:
+    """A PIL image as (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
+    transparent = "A" in image.getbands() or "transparency" in image.info
+    return np.asarray(image.convert("RGBA" if transparent else "RGB"))
+
+
+def _library_paths(obj_path: Path, library: str) -> list[Path]:
+    """The files that an ``mtllib`` line names: one with blanks in its name, or several."""
+    whole = _find(obj_path.parent, library)
+    if whole is not None:
+        return [whole]
+    paths = []
+    for word in library.split():
+        path = _find(obj_path.parent, word)
+        if path is None:
+            logger.warning("%s: no material library %s beside it", obj_path, word)
+        else:
+            paths.append(path)
+    return paths
+
+
+def _find(folder: Path, name: str) -> Path | None:
+    """The file of this name relative to the folder, also if it is written with backslashes."""
+    for spelling in (name, name.replace("\\", "/")):
+        try:
+            if spelling and (folder / spelling).is_file():
+                return folder / spelling
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+class _DeferredTextures:
+    """Gives trimesh's parser no texture: it would drop unreadable ones without a word."""
+
+    def get(self, name: str) -> bytes:
+        raise FileNotFoundError(name)
+
+
+def _parse_library(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        text = path.read_bytes().decode("utf-8", errors="replace")
+        # Renamed, so that the parser keeps the texture's name instead of opening the file.
+        lines = (_rename_map(line) for line in text.splitlines())
+        return dict(parse_mtl("\n".join(lines), resolver=_DeferredTextures()))  # type: ignore[no-untyped-call]
+    except Exception as error:  # the parser promises nothing about damaged files
+        logger.warning("%s: the material library cannot be read (%s)", path, error)
+        return {}
+
+
+def _rename_map(line: str) -> str:
+    words = line.split(None, 1)
+    return f"texture_file {words[1]}" if words and words[0].lower() == "map_kd" else line
+
+
+def _material(name: str, path: Path, entry: dict[str, Any]) -> Material:
+    texture = _load_texture(path, entry.get("texture_file", []))
+    color = _color(entry)
+    if texture is None and "texture_file" in entry:
+        color = (*GREY[:3], color[3])
+    elif texture is not None and not any(color[:3]):
+        # Exporters write a black Kd beside a texture; multiplied, the texture would vanish.
+        color = (1.0, 1.0, 1.0, color[3])
+    return Material(name=name, color=color, texture=texture)
+
+
+def _color(entry: dict[str, Any]) -> tuple[float, float, float, float]:
+    diffuse = entry.get("kd", GREY[:3])
+    values = diffuse if isinstance(diffuse, list | tuple) else [diffuse] * 3
+    if len(values) < 3 or not np.isfinite(values).all():
+        values = GREY[:3]
+    opacity = _number(entry.get("d"))
+    if opacity is None:
+        transparency = _number(entry.get("tr"))
+        opacity = 1.0 if transparency is None else 1.0 - transparency
+    red, green, blue, alpha = (float(v) for v in np.clip([*values[:3], opacity], 0.0, 1.0))
+    return red, green, blue, alpha
+
+
+def _number(words: list[str] | None) -> float | None:
+    """The last of the words (``d -halo 0.5``), None if it is not a number."""
+    try:
+        value = float(words[-1]) if words else np.nan
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _load_texture(path: Path, words: list[str]) -> npt.NDArray[np.uint8] | None:
+    import PIL.Image
+
+    if not words:
+        return None
+    name = " ".join(_without_options(words))
+    found = _find(path.parent, name) or _find(path.parent, PurePosixPath(name).name)
+    if found is None:
+        logger.warning("%s: the texture %s is missing; drawn grey", path, name)
+        return None
+    try:
+        with PIL.Image.open(found) as image:
+            return texture_array(image)
+    except Exception as error:  # PIL's plugins raise what they like on damaged files
+        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", path, name, error)
+        return None
+
+
+def _without_options(words: list[str]) -> list[str]:
+    position = 0
+    while position < len(words) - 1 and words[position].lower() in _MAP_OPTIONS:
+        option = words[position].lower()
+        position += 1
+        for _ in range(_MAP_OPTIONS[option]):
+            # -o, -s and -t may leave their second and third value out.
+            if option in ("-o", "-s", "-t") and _number([words[position]]) is None:
+                break
+            position += 1
+    return words[position:]

@@ -1,0 +1,351 @@
+"""Wavefront OBJ files, read with their faces in file order.
+
+Keypoint annotations name faces by the number of their ``f`` line. Readers that group faces by
+material lose that order, so this one keeps it. The format: Wavefront's "Object Files (.obj)",
+appendix B1 of the Advanced Visualizer manual.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.datasets.meshes.mtl import WHITE, load_materials
+from cadalign.errors import DataError
+from cadalign.geometry.mesh import Material, Mesh
+
+_DIGITS = b"0123456789+-"
+_DAMAGED = "the file is cut short or damaged; get it again"
+# Assimp, which wrote ShapeNetCore.v2, says in a comment how many faces, lines and points follow.
+_ASSIMP_MARK = b"Open Asset Import Library"
+_ASSIMP_COUNT = re.compile(rb"# Mesh '.*' with (\d+) faces")
+
+
+@dataclass
+class _Statements:
+    """The statements of a file, sorted by kind and not yet turned into numbers."""
+
+    vertices: list[bytes] = field(default_factory=list)
+    texture_coordinates: list[bytes] = field(default_factory=list)
+    faces: list[bytes] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
+    # (first face, vertices so far, texture coordinates so far): what negative indices count from.
+    counts_at: list[tuple[int, int, int]] = field(default_factory=list)
+    # (first face, material name)
+    materials_at: list[tuple[int, str]] = field(default_factory=list)
+    other_elements: int = 0
+    declared_elements: int = 0
+
+
+def read_obj(path: Path) -> Mesh:
+    """Read an OBJ file; `cadalign.datasets.load_mesh` is the public way to it.
+
+    Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
+    that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
+    curves and surfaces are not read.
+
+    Raises
+    ------
+    DataError
+        If the file is cut short or damaged, is not an OBJ file, or has no faces.
+    OSError
+        If it cannot be read.
+    """
+    with path.open("rb") as file:
+        statements = _sort_statements(file, path)
+    _require_complete(statements, path)
+    try:
+        vertices, colors = _parse_vertices(statements.vertices)
+        texture_coordinates = _parse_rows(statements.texture_coordinates)
+        corners, sizes = _parse_faces(statements.faces)
+    except ValueError:
+        raise _first_malformed(path) from None
+    line_of_corner = np.repeat(np.arange(len(sizes)), sizes)
+    corners[:, 0] = _absolute_indices(
+        corners[:, 0], len(vertices), line_of_corner, statements, kind=1, path=path
+    )
+    triangles, polygon = fan_triangles(sizes)
+    materials, face_material = _assign_materials(statements, path, polygon, colors is not None)
+    return Mesh(
+        vertices=vertices,
+        faces=corners[:, 0][triangles],
+        polygon=polygon,
+        vertex_colors=colors,
+        corner_uv=_corner_uv(
+            corners[:, 1], texture_coordinates, triangles, line_of_corner, statements, path
+        ),
+        materials=materials,
+        face_material=face_material,
+        source=str(path),
+    )
+
+
+def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
+    """Cut polygons, whose corners are listed one after the other, into fans of triangles.
+
+    Parameters
+    ----------
+    sizes : (p,) int
+        The number of corners of each polygon, at least 3.
+
+    Returns
+    -------
+    triangles : (m, 3) int
+        Positions in the list of all corners.
+    polygon : (m,) int
+        Which polygon a triangle was cut from, ascending.
+
+    Examples
+    --------
+    >>> triangles, polygon = fan_triangles(np.array([3, 4]))
+    >>> triangles.tolist(), polygon.tolist()
+    ([[0, 1, 2], [3, 4, 5], [3, 5, 6]], [0, 1, 1])
+    """
+    first_corner = np.cumsum(sizes) - sizes
+    counts = sizes - 2
+    polygon = np.repeat(np.arange(len(sizes)), counts)
+    step = np.arange(len(polygon)) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = first_corner[polygon]
+    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
+
+
+def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
+    found = _Statements()
+    by_assimp = False
+    counted = (-1, -1)
+    for number, line in _logical_lines(file):
+        key, _, body = line.partition(b" ")
+        if key == b"f":
+            counts = (len(found.vertices), len(found.texture_coordinates))
+            if counts != counted:
+                found.counts_at.append((len(found.faces), *counts))
+                counted = counts
+            found.faces.append(body)
+        elif key == b"v":
+            found.vertices.append(body)
+        elif key == b"vt":
+            found.texture_coordinates.append(body)
+        elif key in (b"l", b"p"):
+            found.other_elements += 1
+        elif key == b"usemtl":
+            found.materials_at.append((len(found.faces), _text(body)))
+        elif key == b"mtllib":
+            found.libraries.append(_text(body))
+        elif key.startswith(b"#"):
+            by_assimp = by_assimp or _ASSIMP_MARK in line
+            count = _ASSIMP_COUNT.match(line) if by_assimp else None
+            found.declared_elements += int(count[1]) if count else 0
+        elif b"\0" in line:
+            raise DataError(
+                "holds binary data, not the text of an OBJ file",
+                where=f"{path}, line {number}",
+                fix=_DAMAGED,
+            )
+    return found
+
+
+def _logical_lines(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
+    pending = b""
+    for number, raw in enumerate(file, start=1):
+        line = raw.strip()
+        if line.endswith(b"\\"):
+            pending += line[:-1] + b" "
+            continue
+        if pending:
+            line, pending = pending + line, b""
+        # A tab may separate the keyword too.
+        yield number, line.replace(b"\t", b" ")
+    if pending:
+        yield number, pending.replace(b"\t", b" ")
+
+
+def _require_complete(statements: _Statements, path: Path) -> None:
+    if not statements.faces:
+        raise DataError(
+            f"no faces; {len(statements.vertices)} vertices and {statements.other_elements} lines "
+            "and points were found",
+            where=str(path),
+            fix="is it an OBJ file, and whole?",
+        )
+    if not statements.vertices:
+        raise DataError(
+            f"{len(statements.faces)} faces, but no vertices", where=str(path), fix=_DAMAGED
+        )
+    found = len(statements.faces) + statements.other_elements
+    if found < statements.declared_elements:
+        raise DataError(
+            f"its comments announce {statements.declared_elements} faces and lines, but only "
+            f"{found} are there",
+            where=str(path),
+            fix=_DAMAGED,
+        )
+
+
+def _parse_rows(bodies: list[bytes]) -> FloatArray:
+    """The numbers of statements that may differ in length, padded with zeros; (n, width) float."""
+    values = np.fromstring(b" ".join(bodies), sep=" ", dtype=np.float64)
+    lengths = np.array([len(body.split()) for body in bodies], dtype=np.int64)
+    if lengths.sum() != len(values) or (lengths < 1).any():
+        raise ValueError("not all of it is numbers")
+    width = int(lengths.max(initial=0))
+    if (lengths == width).all():
+        return np.asarray(values.reshape(len(bodies), width))
+    rows = np.zeros((len(bodies), width))
+    rows[np.arange(width) < lengths[:, None]] = values
+    return rows
+
+
+def _parse_vertices(bodies: list[bytes]) -> tuple[FloatArray, FloatArray | None]:
+    """Positions (n, 3), and colours (n, 4) if there are any: ``x y z [w] [r g b]``."""
+    rows = _parse_rows(bodies)
+    width = rows.shape[1]
+    if width < 3 or min(len(body.split()) for body in bodies) < 3:
+        raise ValueError("a vertex has fewer than 3 coordinates")
+    if width < 6:
+        return np.ascontiguousarray(rows[:, :3]), None
+    colors = np.ones((len(rows), 4))
+    colors[:, :3] = rows[:, 3:6] if width == 6 else rows[:, 4:7]
+    if colors.max() > 1:
+        colors[:, :3] /= 255
+    return np.ascontiguousarray(rows[:, :3]), np.clip(colors, 0, 1)
+
+
+def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
+    """Corners (c, 2) as (vertex, texture coordinate or 0), as in the file, and faces' sizes."""
+    sizes = np.array([len(body.split()) for body in bodies], dtype=np.int64)
+    if sizes.min() < 3:
+        raise ValueError("a face has fewer than 3 corners")
+    text = b" ".join(bodies)
+    total = int(sizes.sum())
+    # What stays when digits and signs go is the form of each corner: "", "/" or "//".
+    forms = set(text.translate(None, _DIGITS).split())
+    doubled = text.count(b"//")
+    corners = np.zeros((total, 2), dtype=np.int64)
+    if not forms:
+        corners[:, 0] = _integers(text, total)
+    elif forms == {b"/"} and text.count(b"/") == total:
+        corners[:] = _integers(text.replace(b"/", b" "), 2 * total).reshape(total, 2)
+    elif forms == {b"//"} and doubled == total:
+        corners[:, 0] = _integers(text.replace(b"//", b" "), 2 * total)[::2]
+    elif forms == {b"//"} and not doubled and text.count(b"/") == 2 * total:
+        corners[:] = _integers(text.replace(b"/", b" "), 3 * total).reshape(total, 3)[:, :2]
+    else:
+        for row, corner in enumerate(text.split()):
+            corners[row] = _parse_corner(corner)
+    return corners, sizes
+
+
+def _integers(text: bytes, count: int) -> IntArray:
+    values = np.fromstring(text, sep=" ", dtype=np.int64)
+    if len(values) != count:
+        raise ValueError("not all of it is whole numbers")
+    return np.asarray(values)
+
+
+def _parse_corner(corner: bytes) -> tuple[int, int]:
+    """One corner of a face in any of the four forms, slowly."""
+    parts = corner.split(b"/")
+    if len(parts) > 3:
+        raise ValueError(f"{corner!r} is not a corner")
+    if len(parts) == 3 and parts[2]:
+        int(parts[2])
+    return int(parts[0]), int(parts[1]) if len(parts) > 1 and parts[1] else 0
+
+
+def _absolute_indices(
+    indices: IntArray,
+    count: int,
+    line_of_corner: IntArray,
+    statements: _Statements,
+    *,
+    kind: int,
+    path: Path,
+) -> IntArray:
+    """Indices from 0; negative ones count back from the face. ``kind``: 1 vertices, 2 texture."""
+    starts = np.array(statements.counts_at, dtype=np.int64)
+    block = np.searchsorted(starts[:, 0], line_of_corner, side="right") - 1
+    absolute = np.where(indices < 0, starts[block, kind] + indices, indices - 1)
+    wrong = np.flatnonzero((absolute < 0) | (absolute >= count))
+    if len(wrong):
+        what = "vertex" if kind == 1 else "texture coordinate"
+        raise DataError(
+            f"face {line_of_corner[wrong[0]]} (counted from 0) names {what} {indices[wrong[0]]}, "
+            f"but there are {count}",
+            where=str(path),
+            fix=_DAMAGED,
+        )
+    return np.asarray(absolute)
+
+
+def _corner_uv(
+    indices: IntArray,
+    texture_coordinates: FloatArray,
+    triangles: IntArray,
+    line_of_corner: IntArray,
+    statements: _Statements,
+    path: Path,
+) -> FloatArray | None:
+    """Texture coordinates of the triangles' corners, (0, 0) where a corner names none."""
+    named = indices != 0
+    if not named.any():
+        return None
+    uv = np.zeros((len(indices), 2))
+    rows = _absolute_indices(
+        indices[named],
+        len(texture_coordinates),
+        line_of_corner[named],
+        statements,
+        kind=2,
+        path=path,
+    )
+    width = min(texture_coordinates.shape[1], 2)
+    uv[named, :width] = texture_coordinates[rows, :width]
+    return np.asarray(uv[triangles])
+
+
+def _assign_materials(
+    statements: _Statements, path: Path, polygon: IntArray, colored: bool
+) -> tuple[tuple[Material, ...], npt.NDArray[np.int64]]:
+    """The materials in order of first use, and the number of each triangle's."""
+    blocks = [(0, ""), *statements.materials_at]
+    starts = np.array([start for start, _ in blocks])
+    # Of blocks that start at the same face only the last one colours it: the others are empty.
+    block_of_triangle = np.searchsorted(starts, polygon, side="right") - 1
+    used, index = np.unique(block_of_triangle, return_inverse=True)
+    names = list(dict.fromkeys(blocks[block][1] for block in used))
+    number = np.array([names.index(blocks[block][1]) for block in used])
+    known = load_materials(path, statements.libraries, [name for name in names if name])
+    plain = Material(color=WHITE) if colored else Material()
+    return tuple(known.get(name, plain) for name in names), number[index]
+
+
+def _first_malformed(path: Path) -> DataError:
+    """Read the file again, slowly, to say which line of it is wrong."""
+    with path.open("rb") as file:
+        for number, line in _logical_lines(file):
+            key, _, body = line.partition(b" ")
+            try:
+                if key == b"v":
+                    _parse_vertices([body])
+                elif key == b"vt":
+                    _parse_rows([body])
+                elif key == b"f":
+                    _parse_faces([body])
+            except ValueError:
+                shown = line[:60].decode("ascii", errors="replace")
+                return DataError(
+                    f"cannot read {shown!r}", where=f"{path}, line {number}", fix=_DAMAGED
+                )
+    return DataError("cannot be read as an OBJ file", where=str(path), fix=_DAMAGED)
+
+
+def _text(body: bytes) -> str:
+    return body.decode("utf-8", errors="replace").strip()

@@ -1,0 +1,1 @@
+"""Annotated CAD models: KeypointNet, ShapeNet, and keypoint files."""

@@ -1,0 +1,399 @@
+"""KeypointNet: CAD models of ShapeNetCore with semantic keypoints on their surfaces.
+
+You et al., "KeypointNet: A Large-scale 3D Keypoint Dataset Aggregated from Numerous Human
+Annotations", CVPR 2020.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.annotations import entry_id, parse_entry, read_entries
+from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
+from cadalign.datasets.models.keypoints import Keypoints, Symmetries
+from cadalign.datasets.models.locate import MeshLocator
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.mesh import Mesh
+
+logger = logging.getLogger("cadalign")
+
+ModelKey = tuple[str, str]
+"""A category's name and a model's id."""
+
+# KeypointNet's file of all categories, beside those of each.
+_ALL = "all"
+# Real annotations match their meshes to 1e-6 of a model with the diagonal 1.
+_MATCH_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotatedModel:
+    """One model of KeypointNet.
+
+    Parameters
+    ----------
+    category : str
+        The category's name, such as "chair".
+    class_id : str
+        Its synset id, such as "03001627".
+    model_id : str
+        The model's id.
+    keypoints : Keypoints
+        The annotated points.
+    symmetries : Symmetries
+        Which of them trade places under reflections and rotations.
+    mesh_path : Path or None
+        The mesh file, None where there is none.
+    """
+
+    category: str
+    class_id: str
+    model_id: str
+    keypoints: Keypoints
+    symmetries: Symmetries
+    mesh_path: Path | None
+
+    @property
+    def key(self) -> ModelKey:
+        """(category, model id)"""
+        return self.category, self.model_id
+
+    def load_mesh(self, *, check: bool = True) -> Mesh:
+        """Read the mesh.
+
+        Parameters
+        ----------
+        check : bool
+            Whether the keypoints must lie on it where the annotation says, to 1e-3 of its
+            diagonal. Meshes of another version of ShapeNet fail this.
+
+        Raises
+        ------
+        DataError
+            If there is no mesh, it cannot be read, or the keypoints do not lie on it.
+        """
+        where = f"{self.category}, model {self.model_id}"
+        if self.mesh_path is None:
+            raise DataError(
+                "there is no mesh of this model",
+                where=where,
+                fix="get KeypointNet's ShapeNetCore.v2.ply, or give shapenet_root",
+            )
+        mesh = load_mesh(self.mesh_path)
+        if check:
+            self._check_match(mesh, where)
+        return mesh
+
+    def _check_match(self, mesh: Mesh, where: str) -> None:
+        fix = "is the mesh ShapeNetCore.v2's? check=False loads it all the same"
+        try:
+            rebuilt = self.keypoints.on_mesh(mesh)
+        except InputError as error:
+            raise DataError(error.what, where=where, fix=fix) from None
+        gaps = np.linalg.norm(rebuilt - self.keypoints.xyz, axis=1)
+        worst = int(np.argmax(gaps))
+        low, high = mesh.bounds
+        # Not <=, so that NaN, which a face index on a damaged mesh can give, does not pass.
+        if not gaps[worst] <= _MATCH_TOLERANCE * np.linalg.norm(high - low):
+            raise DataError(
+                f"keypoints[{worst}] lies {gaps[worst]:.3g} off the place that its face and "
+                f"barycentric coordinates name in {mesh.source}",
+                where=where,
+                fix=fix,
+            )
+
+
+@dataclass(frozen=True)
+class _Category:
+    """One category's models: annotated ones, and why the others could not be read."""
+
+    models: dict[str, AnnotatedModel]
+    problems: dict[str, DataError]
+    # All model ids in file order.
+    order: tuple[str, ...]
+
+
+class KeypointNet:
+    """The annotated models below a folder in KeypointNet's layout.
+
+    ::
+
+        annotations/<category>.json     or one file for all: annotations/all.json, keypointnet.json
+        splits/<name>.txt               lines <synset>-<model id>
+        ShapeNetCore.v2.ply/<synset>/<model id>.ply                          meshes, either here
+        models/<synset>/<model id>/models/model_normalized.obj               or here
+
+    A category is read when it is first asked for, a mesh when `AnnotatedModel.load_mesh` is
+    called. Categories come sorted, models in file order.
+
+    A model whose annotation is malformed does not stop the others. Iterating, ``len`` and
+    ``dataset["chair"]`` give the readable models only, with a warning for each of the others
+    (logger "cadalign"); `problems` holds the reasons. `ids` names all models, and asking for a
+    malformed one by its id raises the reason.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder.
+    shapenet_root : str or path-like, optional
+        ShapeNetCore, for the meshes; comes before the meshes below ``root``. KeypointNet was
+        annotated on version 2, whose faces and coordinates are not version 1's.
+
+    Raises
+    ------
+    DataError
+        If there is no such folder, or no annotations in it.
+
+    Examples
+    --------
+    >>> dataset = KeypointNet("keypointnet")  # doctest: +SKIP
+    >>> for model in dataset.subset(categories=["chair"], split="test", with_mesh=True):
+    ...     print(model.model_id, len(model.keypoints))  # doctest: +SKIP
+    >>> dataset["chair", "88382b877be91b2a572f8e1c1caad99e"].load_mesh()  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        *,
+        shapenet_root: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
+        self._source = _Source(self.root, MeshLocator(self.root, shapenet_root))
+        self._categories = self._source.categories
+        self._allowed: frozenset[ModelKey] | None = None
+        self._with_mesh = False
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories' names, sorted."""
+        return self._categories
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """The names of the splits there are, sorted."""
+        return tuple(sorted(path.stem for path in (self.root / "splits").glob("*.txt")))
+
+    def split(self, name: str) -> frozenset[ModelKey]:
+        """The (category, model id) that a split names, annotated or not.
+
+        Raises
+        ------
+        InputError
+            If there is no such split.
+        DataError
+            If a line of its file is not ``<synset>-<model id>``.
+        """
+        if name not in self.splits:
+            known = ", ".join(self.splits)
+            raise InputError(
+                f"unknown split {name!r}",
+                where=str(self.root / "splits"),
+                fix=f"known are {known}" if known else "there are none here",
+            )
+        return _read_split(self.root / "splits" / f"{name}.txt")
+
+    def subset(
+        self,
+        *,
+        categories: Iterable[str] | None = None,
+        split: str | None = None,
+        with_mesh: bool = False,
+    ) -> KeypointNet:
+        """A dataset of some of the models, which shares what has been read.
+
+        Parameters
+        ----------
+        categories : iterable of str, optional
+            Names or synset ids; by default all.
+        split : str, optional
+            A split's name; by default all models.
+        with_mesh : bool
+            Whether to leave out models without a mesh file.
+
+        Raises
+        ------
+        InputError
+            If a category or the split is unknown.
+        """
+        chosen = object.__new__(KeypointNet)
+        chosen.__dict__.update(self.__dict__)
+        if categories is not None:
+            names = [categories] if isinstance(categories, str) else categories
+            chosen._categories = tuple(sorted({self._require(name) for name in names}))
+        if split is not None:
+            members = self.split(split)
+            chosen._allowed = members if self._allowed is None else self._allowed & members
+        chosen._with_mesh = self._with_mesh or with_mesh
+        return chosen
+
+    def ids(self, category: str | None = None) -> tuple[ModelKey, ...]:
+        """(category, model id) of all models, also of malformed ones; of one category or all.
+
+        An entry without a model id goes by its position: ``("chair", "#17")``.
+        """
+        names = self._categories if category is None else (self._require(category),)
+        return tuple(
+            (name, model_id)
+            for name in names
+            for model_id in self._source.load(name).order
+            if self._has(name, model_id)
+        )
+
+    @property
+    def problems(self) -> dict[ModelKey, DataError]:
+        """Why models could not be read, by (category, model id)."""
+        return {
+            (name, model_id): error
+            for name in self._categories
+            for model_id, error in self._source.load(name).problems.items()
+            if self._has(name, model_id)
+        }
+
+    def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
+        """All mesh files there are of a model, the one that `AnnotatedModel` names first."""
+        return self._source.mesh_paths(self._require(category), model_id)
+
+    @overload
+    def __getitem__(self, key: str) -> tuple[AnnotatedModel, ...]: ...
+    @overload
+    def __getitem__(self, key: ModelKey) -> AnnotatedModel: ...
+    def __getitem__(self, key: str | ModelKey) -> AnnotatedModel | tuple[AnnotatedModel, ...]:
+        """``dataset["chair"]``: a category's models; ``dataset["chair", model_id]``: one.
+
+        Raises
+        ------
+        InputError
+            If there is no such category or model.
+        DataError
+            If the category's file, or that model's annotation, is malformed.
+        """
+        if isinstance(key, tuple):
+            name, model_id = self._require(key[0]), key[1]
+            loaded = self._source.load(name)
+            if model_id in loaded.problems:
+                # A copy: the raised one keeps the frames that it passes through alive.
+                raise copy.copy(loaded.problems[model_id])
+            if model_id not in loaded.models or not self._has(name, model_id):
+                raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
+            return loaded.models[model_id]
+        name = self._require(key)
+        models = self._source.load(name).models.items()
+        return tuple(model for model_id, model in models if self._has(name, model_id))
+
+    def __iter__(self) -> Iterator[AnnotatedModel]:
+        for category in self._categories:
+            yield from self[category]
+
+    def __len__(self) -> int:
+        return sum(len(self[category]) for category in self._categories)
+
+    def __repr__(self) -> str:
+        return f"KeypointNet({str(self.root)!r}, categories={list(self._categories)})"
+
+    def _require(self, category: str) -> str:
+        return require_category(category, self._categories, where=str(self.root))
+
+    def _has(self, category: str, model_id: str) -> bool:
+        if self._allowed is not None and (category, model_id) not in self._allowed:
+            return False
+        return not self._with_mesh or bool(self._source.mesh_paths(category, model_id))
+
+
+class _Source:
+    """Reads the annotation files, each once."""
+
+    def __init__(self, root: Path, locator: MeshLocator) -> None:
+        self._locator = locator
+        self._loaded: dict[str, _Category] = {}
+        folder = root / "annotations"
+        files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
+        self._files = files
+        if not files:
+            single = [folder / f"{_ALL}.json", root / f"{_ALL}.json", root / "keypointnet.json"]
+            found = [path for path in single if path.is_file()]
+            if not found:
+                raise DataError(
+                    "no annotations/*.json below it",
+                    where=str(root),
+                    fix="give the folder that holds KeypointNet's annotations/ and splits/",
+                )
+            self._read_single(found[0])
+        self.categories = tuple(sorted({*files, *self._loaded}))
+
+    def load(self, category: str) -> _Category:
+        """The models of a category."""
+        if category not in self._loaded:
+            path = self._files[category]
+            entries = list(enumerate(read_entries(path)))
+            self._loaded[category] = self._build(category, path, entries)
+        return self._loaded[category]
+
+    def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
+        """All mesh files of a model, also of a malformed one."""
+        model = self.load(category).models.get(model_id)
+        synset = synset_of_name(category) if model is None else model.class_id
+        return self._locator.paths(synset, model_id)
+
+    def _read_single(self, path: Path) -> None:
+        """Read the file of all categories; entries are told apart by their class id."""
+        grouped: dict[str, list[tuple[int, object]]] = {}
+        for position, entry in enumerate(read_entries(path)):
+            class_id = entry.get("class_id") if isinstance(entry, dict) else None
+            name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
+            grouped.setdefault(name, []).append((position, entry))
+        for name, entries in grouped.items():
+            self._loaded[name] = self._build(name, path, entries)
+
+    def _build(self, category: str, path: Path, entries: list[tuple[int, object]]) -> _Category:
+        models: dict[str, AnnotatedModel] = {}
+        problems: dict[str, DataError] = {}
+        order = []
+        for position, entry in entries:
+            model_id = entry_id(entry, position)
+            where = f"{path.name}, model {model_id}"
+            try:
+                if model_id in models or model_id in problems:
+                    model_id = f"{model_id}#{position}"
+                    raise DataError("the model occurs twice", where=where, fix="remove one entry")
+                annotation = parse_entry(entry, where=where)
+                paths = self._locator.paths(annotation.class_id, annotation.model_id)
+                models[model_id] = AnnotatedModel(
+                    category=category,
+                    class_id=annotation.class_id,
+                    model_id=annotation.model_id,
+                    keypoints=annotation.keypoints,
+                    symmetries=annotation.symmetries,
+                    mesh_path=paths[0] if paths else None,
+                )
+            except DataError as error:
+                logger.warning("left out: %s", error)
+                problems[model_id] = error.with_traceback(None)
+            order.append(model_id)
+        return _Category(models=models, problems=problems, order=tuple(order))
+
+
+def _read_split(path: Path) -> frozenset[ModelKey]:
+    members = set()
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    for number, line in enumerate(lines, start=1):
+        synset, dash, model_id = line.strip().partition("-")
+        if not line.strip():
+            continue
+        if not (synset and dash and model_id):
+            raise DataError(
+                f"{line.strip()[:60]!r} is not <synset>-<model id>", where=f"{path}, line {number}"
+            )
+        members.add((name_of_synset(synset), model_id))
+    return frozenset(members)

@@ -1,0 +1,155 @@
+"""ShapeNetCore as it is distributed: one folder per category, one folder per model."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.mesh import Mesh
+
+# Where a model's mesh lies in its folder: version 2, then version 1.
+_MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
+_SYNSET_DIGITS = 8
+
+
+@dataclass(frozen=True)
+class ShapeNetModel:
+    """One model of ShapeNetCore.
+
+    Parameters
+    ----------
+    category : str
+        The category's name, such as "chair".
+    class_id : str
+        Its synset id, such as "03001627".
+    model_id : str
+        The model's id.
+    mesh_path : Path
+        Its OBJ file.
+    """
+
+    category: str
+    class_id: str
+    model_id: str
+    mesh_path: Path
+
+    def load_mesh(self) -> Mesh:
+        """Read its mesh; see `cadalign.datasets.load_mesh`."""
+        return load_mesh(self.mesh_path)
+
+
+class ShapeNet:
+    """The models of ShapeNetCore, version 1 or 2.
+
+    Version 1 lies in ``<synset>/<model id>/model.obj``, version 2 in
+    ``<synset>/<model id>/models/model_normalized.obj``; which it is, is found out model by model.
+    A category's folder is listed when it is first asked for.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder that holds the synsets' folders.
+
+    Raises
+    ------
+    DataError
+        If there is no such folder.
+
+    Examples
+    --------
+    >>> shapenet = ShapeNet("ShapeNetCore.v2")  # doctest: +SKIP
+    >>> shapenet.categories  # doctest: +SKIP
+    ('airplane', 'bag', ...)
+    >>> mesh = shapenet["chair", "88382b877be91b2a572f8e1c1caad99e"].load_mesh()  # doctest: +SKIP
+    """
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise DataError("no such folder", where=str(self.root), fix="give ShapeNetCore's root")
+        self._categories: tuple[str, ...] | None = None
+        self._models: dict[str, dict[str, ShapeNetModel]] = {}
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories there are folders of, sorted; a synset of unknown name keeps its id."""
+        if self._categories is None:
+            folders = [entry.name for entry in os.scandir(self.root) if entry.is_dir()]
+            synsets = [name for name in folders if name.isdigit() and len(name) == _SYNSET_DIGITS]
+            self._categories = tuple(sorted(map(name_of_synset, synsets)))
+        return self._categories
+
+    def ids(self, category: str | None = None) -> tuple[tuple[str, str], ...]:
+        """All (category, model id) with a mesh, sorted; of one category or of all."""
+        names = self.categories if category is None else (self._require(category),)
+        return tuple((name, model_id) for name in names for model_id in self._list(name))
+
+    def path(self, category: str, model_id: str) -> Path:
+        """The mesh file of a model, found without listing its category.
+
+        Raises
+        ------
+        InputError
+            If there is no such category or model.
+        DataError
+            If the model's folder holds no mesh.
+        """
+        name = self._require(category)
+        folder = self.root / synset_of_name(name) / model_id
+        if not folder.is_dir():
+            raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
+        found = _mesh_file(folder)
+        if found is None:
+            wanted = " nor ".join(file.as_posix() for file in _MESH_FILES)
+            raise DataError(f"neither {wanted} is there", where=str(folder))
+        return found
+
+    @overload
+    def __getitem__(self, key: str) -> tuple[ShapeNetModel, ...]: ...
+    @overload
+    def __getitem__(self, key: tuple[str, str]) -> ShapeNetModel: ...
+    def __getitem__(self, key: str | tuple[str, str]) -> ShapeNetModel | tuple[ShapeNetModel, ...]:
+        """``shapenet["chair"]``: a category's models; ``shapenet["chair", model_id]``: one."""
+        if isinstance(key, tuple):
+            category, model_id = key
+            path = self.path(category, model_id)
+            name = self._require(category)
+            return ShapeNetModel(name, synset_of_name(name), model_id, path)
+        return tuple(self._list(self._require(key)).values())
+
+    def __iter__(self) -> Iterator[ShapeNetModel]:
+        for category in self.categories:
+            yield from self[category]
+
+    def __len__(self) -> int:
+        return sum(len(self._list(category)) for category in self.categories)
+
+    def __repr__(self) -> str:
+        return f"ShapeNet({str(self.root)!r})"
+
+    def _require(self, category: str) -> str:
+        return require_category(category, self.categories, where=str(self.root))
+
+    def _list(self, category: str) -> dict[str, ShapeNetModel]:
+        if category not in self._models:
+            synset = synset_of_name(category)
+            models = {}
+            for model_id in sorted(os.listdir(self.root / synset)):
+                path = _mesh_file(self.root / synset / model_id)
+                if path is not None:
+                    models[model_id] = ShapeNetModel(category, synset, model_id, path)
+            self._models[category] = models
+        return self._models[category]
+
+
+def _mesh_file(folder: Path) -> Path | None:
+    for file in _MESH_FILES:
+        if (folder / file).is_file():
+            return folder / file
+    return None

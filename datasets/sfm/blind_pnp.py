@@ -1,0 +1,274 @@
+"""The NYU-RGBD and MegaDepth correspondences that blind PnP was trained on.
+
+Liu, Campbell, Li, Zhou, Song and Yang, "Learning 2D-3D Correspondences To Solve The Blind
+Perspective-n-Point Problem", 2020 (github.com/Liumouliu/Deep_blind_PnP); Campbell, Liu and Gould,
+"Solving the Blind Perspective-n-Point Problem End-To-End With Robust Differentiable Geometric
+Optimization", ECCV 2020 (github.com/dylan-campbell/bpnpnet).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray, as_floats
+from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+DEFAULT_FOCAL = 800.0
+"""The virtual camera's focal length [px] where the files don't say one."""
+
+# Pairs whose median distance under the true pose [normalised] is larger don't belong together.
+_PAIRED = 0.05
+
+
+class BlindPnP(CorrespondenceSet):
+    """Samples of one split, such as ``nyu_train`` or ``megaDepth_valid``; ids are "0", "1", ...
+
+    Two layouts are understood. Each is a folder of pickles, each pickle a list with an entry per
+    sample, those in brackets optional::
+
+        matches.pkl  R.pkl  t.pkl  [inlier_matches.pkl  focal.pkl]
+        preprocessed/  p2d.pkl  p3d.pkl  R_gt.pkl  t_gt.pkl
+                       [W_gt.pkl  num_points_2d.pkl  num_points_3d.pkl  focal.pkl]
+
+    - ``matches`` (n, 5) has an image point and a scene point in each row. Where there is
+      ``inlier_matches`` (m, 2), its rows say which belong together: (row of the scene point, row
+      of the image point).
+    - ``p2d`` (n, 2) and ``p3d`` (m, 3) are shuffled, and padded with repetitions from
+      ``num_points_2d`` and ``num_points_3d`` on. Scene point j belongs to image point ``W_gt[j]``,
+      or to none where there is no such row. One of the sets is said to store it the other way
+      round; the true pose tells. Without ``W_gt`` the rows belong together as they are.
+
+    Image points are stored with the calibration taken out. They are given in the pixels of a
+    virtual camera of the sample's focal length, whose image is just large enough for them.
+
+    The true pose's file is read at once, the others when the first sample is asked for. None can
+    run code; see `cadalign.datasets.sfm.unpickling`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The split's folder.
+    focal : float, optional
+        Focal length [px] of the virtual camera; by default that of ``focal.pkl``, or 800.
+
+    Raises
+    ------
+    DataError
+        If files are missing, no pickles, ask for code, or differ in their number of samples.
+        Asking for a sample raises it if its arrays are malformed, or if its points don't belong
+        together under the true pose.
+    InputError
+        If ``focal`` is not positive.
+
+    Examples
+    --------
+    >>> samples = BlindPnP("nyu_train")  # doctest: +SKIP
+    >>> samples[0].cam_from_world.translation  # doctest: +SKIP
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, focal: float | None = None) -> None:
+        if focal is not None and not (np.isfinite(focal) and focal > 0):
+            raise InputError(f"{focal!r} is not a focal length", where="focal")
+        self._focal = focal
+        folder, self._layout = _find_layout(Path(path))
+        self._files = {
+            name: folder / f"{name}.pkl"
+            for name in (*self._layout.required, *self._layout.optional)
+            if name in self._layout.required or (folder / f"{name}.pkl").is_file()
+        }
+        # The smallest file is enough to count the samples.
+        translations = _load_samples(self._files[self._layout.translation])
+        self._data: dict[str, Any] = {self._layout.translation: translations}
+        super().__init__(folder, [str(position) for position in range(len(translations))])
+
+    def _prepare(self) -> None:
+        for name, file in self._files.items():
+            if name not in self._data:
+                samples = _load_samples(file)
+                if len(samples) != len(self):
+                    raise DataError(
+                        f"holds {len(samples)} samples, {self._layout.translation}.pkl {len(self)}",
+                        where=str(file),
+                        fix="the files must be of one split; get them again",
+                    )
+                self._data[name] = samples
+
+    def _read(self, position: int) -> Correspondences:
+        pose = rigid_pose(
+            self._array(self._layout.rotation, position, shape=(3, 3)),
+            self._flat(self._layout.translation, position),
+        )
+        if self._layout == _MATCHES:
+            rays, points_3d = self._matched(position)
+        else:
+            rays, points_3d = self._paired(position, pose)
+        if not len(rays):
+            raise InputError("there are no correspondences", where=self._layout.points[0])
+        distance = _distance(rays, points_3d, pose)
+        if not distance <= _PAIRED:
+            raise InputError(
+                f"under the true pose the {len(rays)} pairs of points are {distance:.2g} apart, "
+                "in normalised coordinates and the median",
+                where="true pose",
+                fix="is W_gt.pkl or inlier_matches.pkl, which says what belongs together, missing?",
+            )
+        camera = _virtual_camera(self._focal_lengths(position), rays)
+        return Correspondences(
+            id=self.ids[position],
+            points_3d=points_3d,
+            points_2d=camera.pixels_from_normalized(rays),
+            camera=camera,
+            cam_from_world=pose,
+        )
+
+    def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
+        """Image points (n, 2) and scene points (n, 3) out of ``matches``."""
+        rows = self._array("matches", position, shape=(None, 5))
+        rays, points_3d = rows[:, :2], rows[:, 2:]
+        if "inlier_matches" not in self._data:
+            return rays, points_3d
+        pairs = self._array("inlier_matches", position, shape=(None, 2)).astype(np.int64)
+        bad = pairs[(pairs < 0) | (pairs >= len(rows))]
+        if len(bad):
+            raise InputError(
+                f"names row {bad[0]} of {len(rows)} in matches", where="inlier_matches"
+            )
+        return rays[pairs[:, 1]], points_3d[pairs[:, 0]]
+
+    def _paired(self, position: int, pose: Alignment) -> tuple[FloatArray, FloatArray]:
+        """Image points (n, 2) and scene points (n, 3) of the preprocessed layout."""
+        rays = self._array("p2d", position, shape=(None, 2))[: self._count("2d", position)]
+        points_3d = self._array("p3d", position, shape=(None, 3))[: self._count("3d", position)]
+        if "W_gt" not in self._data:
+            if len(rays) != len(points_3d):
+                raise InputError(
+                    f"{len(rays)} image points but {len(points_3d)} scene points",
+                    where="p2d",
+                    fix="W_gt.pkl, which says which belong together, is missing",
+                )
+            return rays, points_3d
+        partners = self._flat("W_gt", position).astype(np.int64)
+        scene_rows, image_rows = _pairs(partners, len(points_3d), len(rays))
+        usual = rays[image_rows], points_3d[scene_rows]
+        image_rows, scene_rows = _pairs(partners, len(rays), len(points_3d))
+        inverted = rays[image_rows], points_3d[scene_rows]
+        return min(usual, inverted, key=lambda pair: _distance(pair[0], pair[1], pose))
+
+    def _count(self, kind: str, position: int) -> int | None:
+        """How many points come before the padding; None where the files don't say."""
+        name = f"num_points_{kind}"
+        return int(self._flat(name, position)[0]) if name in self._data else None
+
+    def _focal_lengths(self, position: int) -> FloatArray:
+        """One focal length [px], or those along x and y."""
+        if self._focal is not None:
+            return np.array([self._focal])
+        if "focal" not in self._data:
+            return np.array([DEFAULT_FOCAL])
+        focal = self._flat("focal", position)
+        if len(focal) > 2 or (focal <= 0).any():
+            raise InputError(f"{focal.tolist()} are no focal lengths", where="focal")
+        return focal
+
+    def _array(self, name: str, position: int, *, shape: tuple[int | None, ...]) -> FloatArray:
+        return as_floats(self._entry(name, position), name=name, shape=shape)
+
+    def _flat(self, name: str, position: int) -> FloatArray:
+        """A sample's few numbers, whatever shape they were stored in; (k,) float, k >= 1."""
+        try:
+            values = np.reshape(self._entry(name, position), -1)
+        except ValueError:
+            raise InputError("not an array of numbers", where=name) from None
+        if not len(values):
+            raise InputError("is empty", where=name)
+        return as_floats(values, name=name, shape=(None,))
+
+    def _entry(self, name: str, position: int) -> Any:
+        try:
+            return self._data[name][position]
+        except KeyError:
+            raise InputError("there is no such sample", where=name) from None
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The names of the pickles."""
+
+    points: tuple[str, ...]
+    rotation: str
+    translation: str
+    optional: tuple[str, ...]
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        return (*self.points, self.rotation, self.translation)
+
+
+_MATCHES = _Layout(("matches",), "R", "t", ("inlier_matches", "focal"))
+_PREPROCESSED = _Layout(
+    ("p2d", "p3d"), "R_gt", "t_gt", ("W_gt", "num_points_2d", "num_points_3d", "focal")
+)
+
+
+def _find_layout(root: Path) -> tuple[Path, _Layout]:
+    if not root.is_dir():
+        raise DataError("no such folder", where=str(root), fix="give a split's folder")
+    closest: tuple[int, str] = (0, "there are no correspondences")
+    for folder in (root, root / "preprocessed"):
+        for layout in (_MATCHES, _PREPROCESSED):
+            missing = [n for n in layout.required if not (folder / f"{n}.pkl").is_file()]
+            if not missing:
+                return folder, layout
+            found = len(layout.required) - len(missing)
+            text = ", ".join(f"{name}.pkl" for name in missing)
+            closest = max(closest, (found, f"{text} missing in {folder}"))
+    raise DataError(
+        closest[1],
+        where=str(root),
+        fix="give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/",
+    )
+
+
+def _load_samples(file: Path) -> Any:
+    value = load_pickle(file)
+    is_list = isinstance(value, list | tuple | dict) or (
+        isinstance(value, np.ndarray) and value.ndim > 0
+    )
+    if not is_list:
+        raise DataError(f"holds {type(value).__name__}, not a list of samples", where=str(file))
+    return value
+
+
+def _pairs(partners: IntArray, from_count: int, to_count: int) -> tuple[IntArray, IntArray]:
+    """The rows i with a partner, and their partners, where ``partners[i]`` is that of row i."""
+    rows = np.arange(min(from_count, len(partners)))
+    chosen = partners[rows]
+    known = (chosen >= 0) & (chosen < to_count)
+    return rows[known], chosen[known]
+
+
+def _distance(rays: FloatArray, points_3d: FloatArray, pose: Alignment) -> float:
+    """The median distance of pairs under a pose, in normalised coordinates; inf if none."""
+    points_cam = pose.apply(points_3d)
+    in_front = points_cam[:, 2] > 0
+    gaps = np.full(len(rays), np.inf)
+    projected = points_cam[in_front, :2] / points_cam[in_front, 2:]
+    gaps[in_front] = np.linalg.norm(projected - rays[in_front], axis=1)
+    return float(np.median(gaps)) if len(gaps) else np.inf
+
+
+def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
+    """A camera that looks along its principal point and just has all rays in its image."""
+    fx, fy = float(focal_lengths[0]), float(focal_lengths[-1])
+    reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))
+    width, height = (2 * int(length) + 1 for length in reach)
+    return Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)

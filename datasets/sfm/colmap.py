@@ -1,0 +1,186 @@
+"""COLMAP's sparse models: photos with known poses and the points that they see.
+
+Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016. The format is described at
+https://colmap.github.io/format.html.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.datasets.sfm.colmap_binary import (
+    read_cameras_binary,
+    read_images_binary,
+    read_points_binary,
+)
+from cadalign.datasets.sfm.colmap_model import INVALID_POINT, ColmapPoints
+from cadalign.datasets.sfm.colmap_text import read_cameras_text, read_images_text, read_points_text
+from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.camera import Camera
+
+_STEMS = ("cameras", "images", "points3D")
+# COLMAP itself prefers the binary files where both are there.
+_SUFFIXES = (".bin", ".txt")
+_SUBFOLDERS = (".", "sparse/0", "sparse", "0")
+# COLMAP puts the centre of the top-left pixel at (0.5, 0.5), cadalign at (0, 0).
+_PIXEL_CENTRE = 0.5
+
+
+class Colmap(CorrespondenceSet):
+    """The photos of a COLMAP model, sorted by name; text or binary.
+
+    Observations that belong to no point are left out. Poses and observations are checked image by
+    image, when they are asked for; see `CorrespondenceSet`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The folder with ``cameras``, ``images`` and ``points3D`` (``.bin`` or ``.txt``), or one
+        that holds them in ``sparse/0``, ``sparse`` or ``0``.
+
+    Raises
+    ------
+    DataError
+        If files are missing, cut short or malformed, or a name or number occurs twice. Asking for
+        an image raises it if the image observes points that don't exist, or its camera's model is
+        none of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
+
+    Examples
+    --------
+    >>> images = Colmap("reconstruction")  # doctest: +SKIP
+    >>> images.ids  # doctest: +SKIP
+    ('00.jpg', '01.jpg')
+    >>> seen = images["00.jpg"]  # doctest: +SKIP
+    >>> float(np.median(np.linalg.norm(seen.residuals(), axis=1)))  # doctest: +SKIP
+    0.25
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        folder, suffix = _find_model(Path(path))
+        binary = suffix == ".bin"
+        files = {stem: folder / f"{stem}{suffix}" for stem in _STEMS}
+        self._camera_file, self._point_file = files["cameras"], files["points3D"]
+        try:
+            read_cameras = read_cameras_binary if binary else read_cameras_text
+            self._cameras = read_cameras(self._camera_file)
+            points = (read_points_binary if binary else read_points_text)(self._point_file)
+            images = (read_images_binary if binary else read_images_text)(files["images"])
+        except OSError as error:
+            raise DataError(
+                f"cannot be read ({error.strerror or error})", where=str(error.filename or folder)
+            ) from None
+        self._point_ids, self._points = _sorted_points(points, self._point_file)
+        self._images = sorted(images, key=lambda image: image.name)
+        super().__init__(files["images"], [image.name for image in self._images])
+
+    def _read(self, position: int) -> Correspondences:
+        image = self._images[position]
+        view = image.read()
+        rows = view.point_ids != INVALID_POINT
+        point_ids = view.point_ids[rows]
+        return Correspondences(
+            id=image.name,
+            points_3d=self._points[self._point_rows(point_ids, image.name)],
+            points_2d=view.points_2d[rows] - _PIXEL_CENTRE,
+            camera=self._camera(view.camera_id, image.name),
+            cam_from_world=rigid_pose(rotation_from_quat_wxyz(view.quat_wxyz), view.translation),
+            point_ids=point_ids,
+        )
+
+    def _point_rows(self, point_ids: IntArray, name: str) -> IntArray:
+        rows = np.searchsorted(self._point_ids, point_ids)
+        known = np.zeros(len(point_ids), dtype=bool)
+        within = rows < len(self._point_ids)
+        known[within] = self._point_ids[rows[within]] == point_ids[within]
+        missing = np.unique(point_ids[~known])
+        if len(missing):
+            raise DataError(
+                f"{len(missing)} of the points that it observes do not exist, the first is point "
+                f"{missing[0]}",
+                where=f"{self.source}, image {name}",
+                fix=f"does {self._point_file.name} belong to the same model?",
+            )
+        return rows
+
+    def _camera(self, camera_id: int, name: str) -> Camera:
+        if camera_id not in self._cameras:
+            raise DataError(
+                f"there is no camera {camera_id}",
+                where=f"{self.source}, image {name}",
+                fix=f"does {self._camera_file.name} belong to the same model?",
+            )
+        try:
+            return Camera.from_dict(self._cameras[camera_id])
+        except InputError as error:
+            raise DataError(
+                error.what, where=f"{self._camera_file}, camera {camera_id}", fix=error.fix
+            ) from None
+
+
+def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
+    """The rotation matrix of a quaternion.
+
+    Parameters
+    ----------
+    quat_wxyz : (4,) float
+        Scalar first, of any length but 0.
+
+    Returns
+    -------
+    (3, 3) float
+
+    Raises
+    ------
+    InputError
+        If it is zero or not finite.
+
+    Examples
+    --------
+    >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    length = np.linalg.norm(quat_wxyz)
+    if not (np.isfinite(length) and length > 0):
+        raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
+    w, x, y, z = quat_wxyz / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _find_model(root: Path) -> tuple[Path, str]:
+    """The folder and the suffix of a model's files."""
+    if not root.is_dir():
+        raise DataError("no such folder", where=str(root), fix="give the folder of a COLMAP model")
+    incomplete = ""
+    for folder in (root / name for name in _SUBFOLDERS):
+        for suffix in _SUFFIXES:
+            missing = [stem for stem in _STEMS if not (folder / f"{stem}{suffix}").is_file()]
+            if not missing:
+                return folder, suffix
+            if len(missing) < len(_STEMS) and not incomplete:
+                incomplete = f"{folder / missing[0]}{suffix} is missing"
+    raise DataError(
+        incomplete or "there is no COLMAP model",
+        where=str(root),
+        fix="cameras, images and points3D are needed, all three as .bin or as .txt",
+    )
+
+
+def _sorted_points(points: ColmapPoints, file: Path) -> tuple[IntArray, FloatArray]:
+    """The points by increasing number."""
+    order = np.argsort(points.ids, kind="stable")
+    ids = points.ids[order]
+    twice = ids[1:][ids[1:] == ids[:-1]]
+    if len(twice):
+        raise DataError(f"point {twice[0]} occurs twice", where=str(file))
+    return ids, points.xyz[order]

@@ -1,0 +1,269 @@
+"""Points of a scene, seen in an image with a known pose: what all correspondence loaders yield."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+logger = logging.getLogger("cadalign")
+
+# Files hold rotations with 6 digits or more.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Points of a scene and where one image shows them.
+
+    Parameters
+    ----------
+    id : str
+        The image's name, or the sample's number.
+    points_3d : (n, 3) float
+        Points [units of the scene].
+    points_2d : (n, 2) float
+        Where the image shows them [px]; integers are pixel centres.
+    camera : Camera
+        The calibrated camera.
+    cam_from_world : Alignment
+        The true pose; its scale is 1.
+    point_ids : (n,) int, optional
+        The points' numbers in the file that they come from.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, or the pose stretches the scene.
+
+    Examples
+    --------
+    >>> camera = Camera(width=640, height=480, fx=500, fy=500, cx=319.5, cy=239.5)
+    >>> pose = Alignment(np.eye(3), [0, 0, 2], [1, 1, 1])
+    >>> seen = Correspondences("a.jpg", [[0, 0, 0], [1, 0, 0]], [[320.5, 239.5], [569.5, 239.5]],
+    ...                        camera, pose)
+    >>> seen.residuals().tolist()
+    [[-1.0, 0.0], [0.0, 0.0]]
+    >>> len(seen.subset([False, True]))
+    1
+    """
+
+    id: str
+    points_3d: FloatArray
+    points_2d: FloatArray
+    camera: Camera
+    cam_from_world: Alignment
+    point_ids: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
+        points_2d = as_points(self.points_2d, name="points_2d", dimension=2)
+        lengths = {"points_2d": len(points_2d)}
+        if self.point_ids is not None:
+            point_ids = np.asarray(self.point_ids, dtype=np.int64)
+            lengths["point_ids"] = len(point_ids)
+            object.__setattr__(self, "point_ids", read_only(point_ids))
+        for name, length in lengths.items():
+            if length != len(points_3d):
+                raise InputError(f"{length} rows, but points_3d has {len(points_3d)}", where=name)
+        if (self.cam_from_world.scale != 1).any():
+            raise InputError(
+                f"the scale is {self.cam_from_world.scale.tolist()}",
+                where="cam_from_world",
+                fix="a true pose does not stretch the scene: give the scale (1, 1, 1)",
+            )
+        object.__setattr__(self, "points_3d", read_only(points_3d))
+        object.__setattr__(self, "points_2d", read_only(points_2d))
+
+    def __len__(self) -> int:
+        return len(self.points_3d)
+
+    def residuals(self) -> FloatArray:
+        """Projected minus observed points [px] under the true pose, (n, 2) float.
+
+        Raises
+        ------
+        InputError
+            If the true pose has points behind the camera.
+        """
+        projected = self.camera.project(self.cam_from_world.apply(self.points_3d))
+        return np.asarray(projected - self.points_2d)
+
+    def subset(self, rows: npt.ArrayLike) -> Correspondences:
+        """Keep some of the points.
+
+        Parameters
+        ----------
+        rows : (n,) bool or (k,) int
+            A mask, or the rows to keep.
+        """
+        chosen = np.asarray(rows)
+        if chosen.dtype.kind not in "biu" or (
+            chosen.dtype.kind == "b" and chosen.shape != (len(self),)
+        ):
+            if chosen.size:
+                raise InputError(
+                    f"neither a mask of {len(self)} values nor row numbers", where="rows"
+                )
+            chosen = chosen.astype(np.int64)
+        return Correspondences(
+            id=self.id,
+            points_3d=self.points_3d[chosen],
+            points_2d=self.points_2d[chosen],
+            camera=self.camera,
+            cam_from_world=self.cam_from_world,
+            point_ids=None if self.point_ids is None else self.point_ids[chosen],
+        )
+
+
+class CorrespondenceSet(ABC):
+    """The images of a file, each with its correspondences, read one by one.
+
+    ``images["00.jpg"]`` and ``images[0]`` give one image's `Correspondences`, ``images[:3]`` a
+    tuple, ``len(images)`` counts all images, and ``images.ids`` names them in order.
+
+    An image that the file describes wrongly does not stop the others: asking for it raises a
+    `DataError`, iterating leaves it out with a warning (logger "cadalign"), and `problems` holds
+    the reasons.
+
+    Parameters
+    ----------
+    source : Path
+        The file that describes the images, for messages.
+    ids : sequence of str
+        The images' names, each once.
+    """
+
+    def __init__(self, source: Path, ids: Sequence[str]) -> None:
+        self.source = source
+        self.ids = tuple(ids)
+        self._positions = {name: position for position, name in enumerate(self.ids)}
+        self._warned: set[str] = set()
+        if len(self._positions) < len(self.ids):
+            twice = next(name for i, name in enumerate(self.ids) if self._positions[name] != i)
+            raise DataError(
+                f"the image {twice!r} occurs twice", where=str(source), fix="remove one of them"
+            )
+
+    @abstractmethod
+    def _read(self, position: int) -> Correspondences:
+        """Read one image; an `InputError` or `DataError` from here concerns that image alone."""
+
+    def _prepare(self) -> None:  # noqa: B027 (most sets have nothing to prepare)
+        """Read what all images share; an error from here concerns the whole file."""
+
+    @property
+    def problems(self) -> dict[str, DataError]:
+        """Why images could not be read, by id; reads them all."""
+        self._prepare()
+        problems = {}
+        for position, name in enumerate(self.ids):
+            try:
+                self._read_checked(position)
+            except DataError as error:
+                problems[name] = error.with_traceback(None)
+        return problems
+
+    @overload
+    def __getitem__(self, key: int | str) -> Correspondences: ...
+    @overload
+    def __getitem__(self, key: slice) -> tuple[Correspondences, ...]: ...
+    def __getitem__(self, key: int | str | slice) -> Correspondences | tuple[Correspondences, ...]:
+        """One image by position or id, or a slice of them.
+
+        Raises
+        ------
+        InputError
+            If there is no such image.
+        DataError
+            If the file describes it wrongly.
+        """
+        if isinstance(key, slice):
+            return tuple(self[position] for position in range(*key.indices(len(self))))
+        position = self._position(key)
+        self._prepare()
+        return self._read_checked(position)
+
+    def __iter__(self) -> Iterator[Correspondences]:
+        self._prepare()
+        for position, name in enumerate(self.ids):
+            try:
+                image = self._read_checked(position)
+            except DataError as error:
+                if name not in self._warned:
+                    self._warned.add(name)
+                    logger.warning("left out: %s", error)
+                continue
+            yield image
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.source)!r}, {len(self)} images)"
+
+    def _position(self, key: int | str) -> int:
+        if isinstance(key, str):
+            position = self._positions.get(key)
+            if position is None:
+                raise InputError(
+                    f"no image {key!r}", where=str(self.source), fix=f"known are {_some(self.ids)}"
+                )
+            return position
+        if not isinstance(key, int | np.integer) or not -len(self) <= key < len(self):
+            raise InputError(
+                f"no image {key!r} among {len(self)}",
+                where=str(self.source),
+                fix="give a position from 0, or an id",
+            )
+        return int(key) % len(self)
+
+    def _read_checked(self, position: int) -> Correspondences:
+        try:
+            return self._read(position)
+        except InputError as error:
+            where = f"{self.source}, image {self.ids[position]}"
+            if error.where is not None:
+                where = f"{where}, {error.where}"
+            raise DataError(error.what, where=where, fix=error.fix) from None
+
+
+def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:
+    """Make a true pose out of a rotation written with few digits.
+
+    Parameters
+    ----------
+    rotation : (3, 3) float
+        Orthonormal to 1e-3, determinant +1; the nearest rotation is taken.
+    translation : (3,) float
+        Any shape of 3 values.
+
+    Raises
+    ------
+    InputError
+        If it is not a rotation, or a value is NaN or infinite.
+    """
+    matrix = as_floats(rotation, name="rotation", shape=(3, 3))
+    shift = as_floats(np.reshape(translation, -1), name="translation", shape=(3,))
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE:
+        raise InputError(
+            f"not a rotation matrix: {np.array2string(matrix, precision=4)}", where="rotation"
+        )
+    left, _, right = np.linalg.svd(matrix)
+    return Alignment(left @ right, shift, np.ones(3))
+
+
+def _some(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")

@@ -1,0 +1,177 @@
+"""Correspondences of any format: which one a folder holds, and its loader."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cadalign.datasets.sfm.blind_pnp import BlindPnP
+from cadalign.datasets.sfm.bundler import Bundler
+from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.datasets.sfm.correspondences import CorrespondenceSet
+from cadalign.errors import DataError, InputError
+
+AUTO = "auto"
+"""Recognise the format by the names of the files."""
+_BUNDLER_HEADER = b"# Bundle file"
+
+
+@dataclass(frozen=True)
+class _Format:
+    """A format, and the files that it is recognised by.
+
+    Parameters
+    ----------
+    name : str
+    load : callable
+    sought : str
+        What a folder of this format holds, in words.
+    layouts : tuple of tuple of str
+        Patterns of files below the folder; it is of this format if all of one layout are there.
+    header : bytes
+        What its files begin with.
+    """
+
+    name: str
+    load: Callable[[Path], CorrespondenceSet]
+    sought: str
+    layouts: tuple[tuple[str, ...], ...]
+    header: bytes = b""
+
+    def fits(self, folder: Path) -> bool:
+        """Whether a folder holds all files of one layout."""
+        return any(
+            all(
+                any(_begins_with(file, self.header) for file in _files(folder, name))
+                for name in layout
+            )
+            for layout in self.layouts
+        )
+
+    def fits_in_part(self, folder: Path) -> bool:
+        """Whether a folder holds files with such names, any of them."""
+        return any(_files(folder, name) for layout in self.layouts for name in layout)
+
+
+_FORMATS = (
+    _Format(
+        "colmap",
+        Colmap,
+        "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
+        tuple(
+            tuple(f"{folder}{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
+            for folder in ("", "sparse/0/", "sparse/", "0/")
+            for suffix in (".bin", ".txt")
+        ),
+    ),
+    _Format(
+        "bundler",
+        Bundler,
+        "bundle.out (also in bundle, or one *.out)",
+        (("bundle.out",), ("bundle/bundle.out",), ("*.out",)),
+        # Many a program calls its log something.out.
+        header=_BUNDLER_HEADER,
+    ),
+    _Format(
+        "blind-pnp",
+        BlindPnP,
+        "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
+        "(also in preprocessed)",
+        tuple(
+            tuple(f"{folder}{stem}.pkl" for stem in stems)
+            for folder in ("", "preprocessed/")
+            for stems in (("matches", "R", "t"), ("p2d", "p3d", "R_gt", "t_gt"))
+        ),
+    ),
+)
+CORRESPONDENCE_FORMATS = (AUTO, *(known.name for known in _FORMATS))
+"""The names that `open_correspondences` knows."""
+
+
+def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) -> CorrespondenceSet:
+    """Open correspondences of any format.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A folder, as `Colmap`, `Bundler` or `BlindPnP` takes it, or Bundler's file.
+    format : {"auto", "colmap", "bundler", "blind-pnp"}
+        ``auto`` goes by the names of the files.
+
+    Returns
+    -------
+    CorrespondenceSet
+
+    Raises
+    ------
+    InputError
+        If the format is unknown.
+    DataError
+        If no format or several are recognised, or the loader refuses the files.
+
+    Examples
+    --------
+    >>> open_correspondences("reconstruction")  # doctest: +SKIP
+    Colmap('reconstruction/images.txt', 4 images)
+    """
+    if format not in CORRESPONDENCE_FORMATS:
+        raise InputError(
+            f"unknown format {format!r}",
+            where="format",
+            fix=f"known are {', '.join(CORRESPONDENCE_FORMATS)}",
+        )
+    root = Path(path)
+    if format == AUTO:
+        return _recognize(root).load(root)
+    return next(known for known in _FORMATS if known.name == format).load(root)
+
+
+def _recognize(root: Path) -> _Format:
+    if root.is_file():
+        return _recognize_file(root)
+    if not root.is_dir():
+        raise DataError(
+            "no such folder", where=str(root), fix="give the folder of the correspondences"
+        )
+    # A layout with files missing is better named by its loader, which says which ones.
+    found = [known for known in _FORMATS if known.fits(root)] or [
+        known for known in _FORMATS if known.fits_in_part(root)
+    ]
+    if not found:
+        sought = "; ".join(f"{known.name}: {known.sought}" for known in _FORMATS)
+        raise DataError(
+            f"there are no correspondences of a known format. Looked for {sought}",
+            where=str(root),
+            fix="give the folder that holds such files",
+        )
+    if len(found) > 1:
+        names = " and ".join(known.name for known in found)
+        raise DataError(
+            f"the folder holds files of {names}", where=str(root), fix="say which format to read"
+        )
+    return found[0]
+
+
+def _recognize_file(file: Path) -> _Format:
+    """The format that is one file: Bundler's."""
+    if not _begins_with(file, _BUNDLER_HEADER):
+        raise DataError(
+            f"not a Bundler file: it does not begin with {_BUNDLER_HEADER.decode()!r}",
+            where=str(file),
+            fix="for other formats, give the folder",
+        )
+    return next(known for known in _FORMATS if known.name == "bundler")
+
+
+def _files(folder: Path, pattern: str) -> list[Path]:
+    return [file for file in folder.glob(pattern) if file.is_file()]
+
+
+def _begins_with(file: Path, header: bytes) -> bool:
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(header)) == header
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror or error})", where=str(file)) from None

@@ -1,0 +1,244 @@
+"""Lines, markers and text on an image: antialiased, with a dark casing that sets them off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from cadalign.arrays import FloatArray
+from cadalign.render.drawing.color import ByteImage
+
+Color = tuple[int, int, int]
+
+CASING: Color = (18, 20, 24)
+# OpenCV takes whole numbers; this many bits of them are the fraction of a pixel.
+_SHIFT = 4
+# Farther off than this [px] OpenCV's whole numbers would overflow.
+_FARTHEST = 1e6
+_PLATE_OPACITY = 0.62
+_SMALL_SIDE = 1000
+
+
+@dataclass(frozen=True)
+class LegendEntry:
+    """A line of the legend.
+
+    Parameters
+    ----------
+    text : str
+    color : tuple of 3 int
+    marker : str
+        "line", "ring" or "cross".
+    """
+
+    text: str
+    color: Color
+    marker: str = "line"
+
+
+class Canvas:
+    """An image that is drawn on, a small one at twice its size, for finer lines.
+
+    All methods take pixels of the canvas, which `place` makes of the image's.
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8
+        Copied, not changed.
+
+    Attributes
+    ----------
+    image : (h, w, 3) uint8
+        The canvas.
+    unit : float
+        The width of a thin line [canvas px], which grows with the image.
+    """
+
+    def __init__(self, image: ByteImage) -> None:
+        rows, columns = image.shape[:2]
+        self._zoom = 2 if min(rows, columns) < _SMALL_SIDE else 1
+        self.image: ByteImage = np.repeat(np.repeat(image, self._zoom, 0), self._zoom, 1)
+        self.unit = float(self._zoom * max(0.5, min(rows, columns) / 480))
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Take pixels (n, 2) of the image to those of the canvas."""
+        return np.asarray((points + 0.5) * self._zoom - 0.5)
+
+    def finished(self) -> ByteImage:
+        """The drawn image at its own size; where nothing was drawn it is what it was."""
+        if self._zoom == 1:
+            return self.image
+        rows, columns = self.image.shape[:2]
+        size = (columns // self._zoom, rows // self._zoom)
+        return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+    @property
+    def _casing(self) -> int:
+        """Width of the dark border of lines [canvas px]."""
+        return max(1, round(0.6 * float(self.unit)))
+
+    @property
+    def _marker_casing(self) -> int:
+        """The same for markers, which are small and need more to stand out."""
+        return max(1, round(0.75 * self.unit))
+
+    def blend_from(self, before: ByteImage, *, opacity: float) -> None:
+        """Let what was drawn since ``before`` was copied show through to it."""
+        self.image = np.asarray(
+            cv2.addWeighted(self.image, opacity, before, 1 - opacity, 0), dtype=np.uint8
+        )
+
+    def line(self, points: FloatArray, color: Color, *, width: float, dashed: bool = False) -> None:
+        """Draw a line through (n, 2) pixels; its width is in units."""
+        parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else [points]
+        fixed = [_fixed_point(part) for part in parts]
+        inner = max(1, round(width * self.unit))
+        for shade, thickness in ((CASING, inner + 2 * self._casing), (color, inner)):
+            cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
+
+    def dot(self, point: FloatArray, color: Color, *, radius: float) -> None:
+        """Draw a disc without casing."""
+        x, y = (int(value) for value in _fixed_point(point))
+        fixed = int(radius * self.unit * (1 << _SHIFT))
+        cv2.circle(self.image, (x, y), fixed, color, -1, cv2.LINE_AA, _SHIFT)
+
+    def ring(self, point: FloatArray, color: Color, *, radius: float) -> None:
+        """Draw a circle."""
+        x, y = (int(value) for value in _fixed_point(point))
+        fixed = int(radius * self.unit * (1 << _SHIFT))
+        inner = max(1, round(1.5 * self.unit))
+        for shade, thickness in ((CASING, inner + 2 * self._marker_casing), (color, inner)):
+            cv2.circle(self.image, (x, y), fixed, shade, thickness, cv2.LINE_AA, _SHIFT)
+
+    def cross(self, point: FloatArray, color: Color, *, radius: float) -> None:
+        """Draw an upright cross."""
+        reach = radius * self.unit
+        arms = [point + np.array(arm) * reach for arm in ([[-1, 0], [1, 0]], [[0, -1], [0, 1]])]
+        fixed = [_fixed_point(arm) for arm in arms]
+        inner = max(1, round(1.5 * self.unit))
+        for shade, thickness in ((CASING, inner + 2 * self._marker_casing), (color, inner)):
+            cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
+
+    def arrow(self, start: FloatArray, end: FloatArray, color: Color, *, width: float) -> None:
+        """Draw an arrow between two pixels (2,)."""
+        along = end - start
+        length = float(np.linalg.norm(along))
+        if length < 1e-6:
+            return
+        along = along / length
+        head = min(4.5 * width * self.unit, length)
+        aside = np.array([-along[1], along[0]]) * head * 0.42
+        neck = end - along * head
+        triangle = _fixed_point(np.array([end, neck + aside, neck - aside]))
+        casing = 2 * self._casing
+        self.line(np.array([start, neck]), color, width=width)
+        cv2.polylines(self.image, [triangle], True, CASING, casing, cv2.LINE_AA, _SHIFT)
+        cv2.fillPoly(self.image, [triangle], color, cv2.LINE_AA, _SHIFT)
+        inner = max(1, round(width * self.unit))
+        # The shaft again, over the head's casing.
+        joint = _fixed_point(np.array([neck - along * casing, neck + along * head * 0.3]))
+        cv2.polylines(self.image, [joint], False, color, inner, cv2.LINE_AA, _SHIFT)
+
+    def label(self, text: str, middle: FloatArray, color: Color) -> None:
+        """Write a short text about a point."""
+        height, width = self.image.shape[:2]
+        if not ((middle >= 0) & (middle < (width, height))).all():
+            return
+        font = ImageFont.load_default(size=15 * self.unit)
+        # Only a part of the image goes through Pillow, which copies it twice.
+        reach = 20 * self.unit
+        left, top = np.maximum(np.floor(middle - reach), 0).astype(int)
+        right, bottom = np.ceil(middle + reach).astype(int)
+        part = Image.fromarray(self.image[top:bottom, left:right])
+        ImageDraw.Draw(part).text(
+            (float(middle[0]) - left, float(middle[1]) - top),
+            text,
+            fill=color,
+            font=font,
+            anchor="mm",
+            stroke_width=max(1, round(self.unit)),
+            stroke_fill=CASING,
+        )
+        self.image[top:bottom, left:right] = np.asarray(part)
+
+    def legend(self, entries: list[LegendEntry], *, keep_clear: FloatArray) -> None:
+        """Write a legend into the corner that covers the fewest of some pixels (n, 2)."""
+        size = round(12.5 * self.unit)
+        font = ImageFont.load_default(size=size)
+        pad, swatch, pitch = 0.7 * size, 1.9 * size, 1.45 * size
+        width = round(3 * pad + swatch + max(font.getlength(entry.text) for entry in entries))
+        height = round(2 * pad + pitch * len(entries) - (pitch - size))
+        rows, columns = self.image.shape[:2]
+        if width + size > columns or height + size > rows:
+            return
+        left, top = self._emptiest_corner(width, height, round(0.7 * size), keep_clear)
+        plate = Image.new("L", (width, height), 0)
+        ImageDraw.Draw(plate).rounded_rectangle(
+            (0, 0, width - 1, height - 1), radius=0.4 * size, fill=round(255 * _PLATE_OPACITY)
+        )
+        block = (slice(top, top + height), slice(left, left + width))
+        part = Image.fromarray(self.image[block])
+        part.paste(CASING, (0, 0), plate)
+        pen = ImageDraw.Draw(part)
+        middles = [pad + size / 2 + pitch * number for number in range(len(entries))]
+        for entry, y in zip(entries, middles, strict=True):
+            pen.text((2 * pad + swatch, y), entry.text, fill=(245,) * 3, font=font, anchor="lm")
+        self.image[block] = np.asarray(part)
+        self._draw_swatches(entries, left + pad, swatch, top + np.array(middles))
+
+    def _draw_swatches(
+        self, entries: list[LegendEntry], left: float, width: float, middles: FloatArray
+    ) -> None:
+        """Draw the legend's samples, one under the other."""
+        for entry, y in zip(entries, middles, strict=True):
+            middle = np.array([left + width / 2, y])
+            if entry.marker == "ring":
+                self.ring(middle, entry.color, radius=4.5)
+            elif entry.marker == "cross":
+                self.cross(middle, entry.color, radius=4)
+            else:
+                self.line(np.array([[left, y], [left + width, y]]), entry.color, width=2.5)
+
+    def _emptiest_corner(
+        self, width: int, height: int, gap: int, keep_clear: FloatArray
+    ) -> tuple[int, int]:
+        """Left and top of a plate in the corner where it covers the fewest pixels (n, 2)."""
+        rows, columns = self.image.shape[:2]
+        corners = [
+            (left, top)
+            for top in (gap, rows - height - gap)
+            for left in (gap, columns - width - gap)
+        ]
+        covered = [
+            ((keep_clear >= corner) & (keep_clear <= (corner[0] + width, corner[1] + height)))
+            .all(axis=1)
+            .sum()
+            for corner in corners
+        ]
+        return corners[int(np.argmin(covered))]
+
+
+def _fixed_point(points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
+    """Pixels in OpenCV's whole numbers with a fraction."""
+    held = np.clip(points, -_FARTHEST, _FARTHEST)
+    return np.asarray(np.rint(held * (1 << _SHIFT)), dtype=np.int32)
+
+
+def _dashes(points: FloatArray, dash: float, gap: float) -> list[FloatArray]:
+    """Cut a line (n, 2) into dashes [px], the first and last of which are whole."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    reached = np.concatenate([[0.0], np.cumsum(steps)])
+    total = reached[-1]
+    count = min(max(1, round((total + gap) / (dash + gap))), 1000)
+    pitch = (total + gap) / count
+    begins = np.arange(count) * pitch
+    ends = begins + (pitch - gap)
+    result = []
+    for begin, end in zip(begins, ends, strict=True):
+        between = reached[(reached > begin) & (reached < end)]
+        at = np.concatenate([[begin], between, [max(end, begin)]])
+        result.append(np.column_stack([np.interp(at, reached, points[:, axis]) for axis in (0, 1)]))
+    return result

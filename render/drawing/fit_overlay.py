@@ -1,0 +1,41 @@
+"""Draw a fit over the photo of its observation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets import load_mesh
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.box import Box
+from cadalign.io.images import read_image
+from cadalign.io.observation import Observation
+from cadalign.render import draw_overlay
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.frame import LIGHT_GREY
+
+
+def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
+    """Draw predicted box, axes and keypoints over the photo, or over grey where there is none.
+
+    The box is the model's; without a model it is the box of the keypoints.
+    """
+    camera = result.camera
+    if observation.image is None:
+        image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
+    else:
+        image = read_image(observation.image, camera)
+    return draw_overlay(
+        image,
+        camera,
+        est_box=Box.from_model(_bounds(observation), result.alignment),
+        observed=observation.points_2d,
+        reprojected=camera.project(result.alignment.apply(observation.points_3d)),
+    )
+
+
+def _bounds(observation: Observation) -> FloatArray:
+    if observation.model is not None:
+        return load_mesh(observation.model).bounds
+    points = observation.points_3d
+    return np.array([points.min(axis=0), points.max(axis=0)])

@@ -1,0 +1,292 @@
+"""What `cadalign render` does: from words to pictures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.annotations import parse_entry, read_entries
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.movie import contact_sheet, write_movie
+from cadalign.render.drawing.stills import (
+    VIEWS,
+    Angles,
+    draw_still,
+    on_background,
+    pose_in_view,
+    turntable,
+    with_keypoints,
+)
+from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
+from cadalign.render.scene import Scene
+from cadalign.render.select import make_renderer
+from cadalign.render.views.camera_files import CameraView, read_camera_views
+
+_COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
+_MAX_FRAMES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class RenderJob:
+    """Everything that a picture needs, checked.
+
+    Parameters
+    ----------
+    scene : Scene
+    renderer : Renderer
+    views : tuple of (str, Angles or (Camera, Alignment))
+        Labels, and angles or whole cameras.
+    camera : Camera
+    out : Path
+    style : str
+    background : tuple of 3 int, optional
+        None is transparent.
+    keypoints : (k, 3) float, optional
+    scale : (3,) float
+    samples : int
+    """
+
+    scene: Scene
+    renderer: Renderer
+    views: tuple[tuple[str, Angles | tuple[Camera, Alignment]], ...]
+    camera: Camera
+    out: Path
+    style: str
+    background: tuple[int, int, int] | None
+    keypoints: FloatArray | None
+    scale: FloatArray
+    samples: int
+
+    @classmethod
+    def prepare(
+        cls,
+        *,
+        model: Path,
+        out: Path,
+        views: tuple[str, ...],
+        size: str,
+        style: str,
+        background: str,
+        keypoints: Path | None,
+        scale: tuple[float, float, float],
+        fov: float,
+        samples: int,
+        renderer: str,
+    ) -> RenderJob:
+        """Check the words of the command line and read the files that they name.
+
+        Raises
+        ------
+        InputError, DataError, RenderError
+            If a word, a file or the renderer won't do.
+        """
+        width, height = parse_size(size)
+        camera = Camera.from_fov(width, height, fov_x=fov)
+        check_image_size(camera)
+        if out.suffix.lower() not in (".png", ".mp4"):
+            raise InputError(
+                f"{out.name} is neither a PNG nor an MP4 file",
+                where="--out",
+                fix="give such a name",
+            )
+        color = parse_background(background)
+        movie = out.suffix.lower() == ".mp4"
+        factors = as_floats(scale, name="--scale", shape=(3,))
+        if (factors <= 0).any():
+            raise InputError(f"{scale} is not positive", where="--scale")
+        chosen = tuple(view for word in views for view in _views(word, factors))
+        if not chosen:
+            raise InputError("there is none", where="--view")
+        if color is None and (movie or len(chosen) > 1 or keypoints is not None):
+            raise InputError(
+                "only a still without keypoints can be transparent", where="--background"
+            )
+        return cls(
+            scene=Scene(load_mesh(model)),
+            # Depth, normals, triangles and lines are cast in any case.
+            renderer=make_renderer(renderer if style == "color" else "raycast"),
+            views=chosen,
+            camera=camera,
+            out=out,
+            style=style,
+            background=color,
+            keypoints=None if keypoints is None else read_keypoints(keypoints, model),
+            scale=factors,
+            samples=samples,
+        )
+
+    @property
+    def is_movie(self) -> bool:
+        """Whether a turntable is asked for."""
+        return self.out.suffix.lower() == ".mp4"
+
+    def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
+        """One picture, (h, w, 3) uint8, or (h, w, 4) on a transparent background."""
+        color = draw_still(
+            self.renderer, self.scene, camera, pose, style=self.style, samples=self.samples
+        )
+        if self.background is None:
+            return color
+        image = on_background(color, self.background)
+        if self.keypoints is not None:
+            image = with_keypoints(image, self.scene, camera, pose, self.keypoints)
+        return image
+
+    def write_picture(self, image: ByteImage) -> None:
+        """Write a PNG file.
+
+        Raises
+        ------
+        DataError
+            If that is not possible.
+        """
+        try:
+            Image.fromarray(image).save(self.out, format="PNG")
+        except OSError as error:
+            raise DataError(f"cannot be written ({error})", where=str(self.out)) from None
+
+    def write_movie(self, frames: Iterable[ByteImage], *, fps: float) -> None:
+        """Write an MP4 file; see `write_movie`."""
+        write_movie(self.out, frames, fps=fps)
+
+
+def draw_picture(job: RenderJob) -> ByteImage:
+    """Draw a still, or a contact sheet if there are several views."""
+    images = []
+    for _, view in job.views:
+        if isinstance(view, Angles):
+            camera = job.camera
+            pose = pose_in_view(job.scene, camera, view, scale=job.scale)
+        else:
+            camera, pose = view
+        images.append(job.draw(camera, pose))
+    if len(images) == 1:
+        return images[0]
+    background = job.background or LIGHT_GREY
+    return contact_sheet(images, [label for label, _ in job.views], background=background)
+
+
+def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[ByteImage], int]:
+    """Draw a turntable that starts in the first view: its frames, and how many there are.
+
+    Raises
+    ------
+    InputError
+        If there would be no frames or more than 10,000, or the first view is a camera file.
+    """
+    frames = seconds * fps
+    if not 1 <= frames <= _MAX_FRAMES:
+        raise InputError(
+            f"{seconds:g} s at {fps:g} frames a second are not 1 to {_MAX_FRAMES} frames",
+            where="--seconds",
+        )
+    view = job.views[0][1]
+    if not isinstance(view, Angles):
+        raise InputError("a turntable starts from angles, not a camera file", where="--view")
+    count = round(frames)
+    poses = turntable(job.scene, job.camera, view, count=count, scale=job.scale)
+    return (job.draw(job.camera, pose) for pose in poses), count
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Read an image size ``WIDTHxHEIGHT``.
+
+    Raises
+    ------
+    InputError
+        If it is not one.
+
+    Examples
+    --------
+    >>> parse_size("640x480")
+    (640, 480)
+    """
+    match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", text.strip())
+    if match is None or not (int(match[1]) and int(match[2])):
+        raise InputError(
+            f"{text!r} is not an image size", where="--size", fix="give WIDTHxHEIGHT, as 640x480"
+        )
+    return int(match[1]), int(match[2])
+
+
+def parse_background(text: str) -> tuple[int, int, int] | None:
+    """Read a colour's name or ``#rrggbb``; None for ``transparent``.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+
+    Examples
+    --------
+    >>> parse_background("#ff8000")
+    (255, 128, 0)
+    """
+    if text == "transparent":
+        return None
+    if text in _COLORS:
+        return _COLORS[text]
+    if re.fullmatch(r"#[0-9a-fA-F]{6}", text):
+        return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
+    raise InputError(
+        f"{text!r} is not a colour",
+        where="--background",
+        fix=f"give {', '.join(_COLORS)}, transparent, or #rrggbb",
+    )
+
+
+def read_keypoints(path: Path, model: Path) -> FloatArray:
+    """Read keypoints (k, 3) from a list of [x, y, z] or from KeypointNet's annotations.
+
+    Of the latter those of the model are taken whose id occurs in its file's path.
+
+    Raises
+    ------
+    DataError
+        If the file is neither, or has no keypoints of this model.
+    """
+    entries = read_entries(path)
+    if entries and isinstance(entries[0], dict):
+        places = set(model.absolute().with_suffix("").parts)
+        for entry in entries:
+            if isinstance(entry, dict) and entry.get("model_id") in places:
+                where = f"{path}, {entry['model_id']}"
+                return parse_entry(entry, where=where).keypoints.xyz
+        raise DataError(
+            "has no annotations of a model whose id occurs in the model's path",
+            where=str(path),
+            fix=f"is {model} of this category?",
+        )
+    try:
+        return as_points(entries, name="keypoints", dimension=3)
+    except InputError as error:
+        raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None
+
+
+def _views(word: str, scale: FloatArray) -> list[tuple[str, Angles | tuple[Camera, Alignment]]]:
+    """The views that a word names, with labels."""
+    if word == "all":
+        return [(name, Angles(*angles)) for name, angles in VIEWS.items()]
+    if word not in VIEWS and (word.endswith(".json") or Path(word).exists()):
+        return [
+            _from_file(word, number, view, scale)
+            for number, view in enumerate(read_camera_views(word))
+        ]
+    return [(word, Angles.parse(word))]
+
+
+def _from_file(
+    word: str, number: int, view: CameraView, scale: FloatArray
+) -> tuple[str, tuple[Camera, Alignment]]:
+    check_image_size(view.camera)
+    pose = Alignment(view.cam_from_world.rotation, view.cam_from_world.translation, scale)
+    return view.name or f"{Path(word).stem} {number}", (view.camera, pose)

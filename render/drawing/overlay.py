@@ -1,0 +1,311 @@
+"""Overlays: boxes, axes and keypoints of an alignment drawn over its photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_points
+from cadalign.errors import InputError
+from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.model_layer import TRANSLUCENT, check_model_style, draw_lines, veil
+from cadalign.render.frame import LIGHT_GREY, Geometry, check_image_size
+from cadalign.render.views.lens_field import within_lens_field
+
+GT_COLOR: Color = (40, 205, 80)
+EST_COLOR: Color = (240, 50, 50)
+OBSERVED_COLOR: Color = (255, 255, 255)
+REPROJECTED_COLOR: Color = (255, 222, 40)
+# Red-ish, green-ish and blue-ish, but none of them a box's colour.
+AXIS_COLORS: tuple[Color, Color, Color] = ((255, 150, 60), (110, 235, 205), (95, 150, 255))
+
+_HIDDEN_OPACITY = 0.6
+# The near plane, in diagonals of the box.
+_NEAR = 1e-3
+# Lines are cut off this many half images from the middle.
+_CUT_OFF = 4.0
+_BENT_LINE_POINTS = 33
+
+
+@dataclass(frozen=True)
+class _Stroke:
+    """A line to be drawn: the farther away, the sooner."""
+
+    depth: float
+    points: FloatArray
+    color: Color
+    arrow: str = ""
+
+
+def draw_overlay(
+    image: npt.ArrayLike,
+    camera: Camera,
+    *,
+    gt_box: Box | None = None,
+    est_box: Box | None = None,
+    est_frame: Geometry | None = None,
+    model_style: str = "translucent",
+    observed: npt.ArrayLike | None = None,
+    reprojected: npt.ArrayLike | None = None,
+    axes: bool = True,
+    legend: bool = True,
+) -> ByteImage:
+    """Draw an alignment over its image.
+
+    The true box is green, the predicted one red; their far edges are dashed. Three arrows run from
+    the predicted box's centre (or the true one's, without a prediction) to its faces, so that
+    their lengths show the stretch. The predicted model itself lies over the photo as a red veil
+    with its edges. Observed keypoints are white rings, reprojected ones yellow
+    crosses, and a thin line between the two is the residual. What lies behind the camera is cut
+    off.
+
+    Parameters
+    ----------
+    image : (h, w), (h, w, 3) or (h, w, 4) uint8
+        Grey, RGB or RGBA (put on light grey), of the camera's size.
+    camera : Camera
+    gt_box, est_box : Box, optional
+        The true and the predicted box, in the camera frame.
+    est_frame : Geometry, optional
+        The predicted model as a renderer or `cast_geometry` gives it for this camera.
+    model_style : str
+        How to show it: ``translucent``, with its edges, or ``lines`` for the edges alone.
+    observed, reprojected : (k, 2) float, optional
+        Keypoints [px]; if both are given they belong together, row by row.
+    axes, legend : bool
+        Whether to draw these.
+
+    Returns
+    -------
+    (h, w, 3) uint8
+
+    Raises
+    ------
+    InputError
+        If the image is of another kind or size, the keypoints don't match, or there is no such
+        style.
+    RenderError
+        If the image is too large.
+
+    Examples
+    --------
+    >>> camera = Camera.from_fov(320, 240, fov_x=60.0)
+    >>> box = Box([0, 0, 4], np.eye(3), [1, 2, 1])
+    >>> draw_overlay(np.zeros((240, 320), np.uint8), camera, gt_box=box).shape
+    (240, 320, 3)
+    """
+    check_image_size(camera)
+    pixels = _as_rgb(image, camera)
+    if est_frame is not None:
+        check_model_style(est_frame, pixels, model_style)
+        if model_style == TRANSLUCENT:
+            pixels = veil(pixels, est_frame, EST_COLOR)
+    canvas = Canvas(pixels)
+    if est_frame is not None:
+        draw_lines(canvas, est_frame, EST_COLOR)
+    seen = None if observed is None else as_points(observed, name="observed", dimension=2)
+    back = None if reprojected is None else as_points(reprojected, name="reprojected", dimension=2)
+    if seen is not None and back is not None and len(seen) != len(back):
+        raise InputError(
+            f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
+        )
+    near: list[_Stroke] = []
+    far: list[_Stroke] = []
+    for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
+        if box is not None:
+            _collect_edges(box, color, camera, near, far)
+    main_box = est_box if est_box is not None else gt_box
+    if axes and main_box is not None:
+        near += _axis_strokes(main_box, camera)
+    near, far = ([_placed(stroke, canvas) for stroke in strokes] for strokes in (near, far))
+    seen, back = (None if points is None else canvas.place(points) for points in (seen, back))
+    _draw_strokes(canvas, near, far)
+    _draw_keypoints(canvas, seen, back)
+    predicted = est_box is not None or est_frame is not None
+    entries = _legend_entries(gt_box, predicted, seen, back, axes=axes and main_box is not None)
+    if legend and entries:
+        canvas.legend(entries, keep_clear=_drawn_pixels([*near, *far], seen, back))
+    return canvas.finished()
+
+
+def _as_rgb(image: Any, camera: Camera) -> ByteImage:
+    """Turn the image into RGB (h, w, 3), or say what is wrong with it."""
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8:
+        raise InputError(
+            f"its values are {pixels.dtype}, not uint8", where="image", fix="scale it to 0 to 255"
+        )
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
+        raise InputError(f"shape {np.shape(image)} is not a grey, RGB or RGBA image", where="image")
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"it is {pixels.shape[1]} x {pixels.shape[0]} px, the camera's image "
+            f"{camera.width} x {camera.height}",
+            where="image",
+            fix="give the image that the camera belongs to",
+        )
+    if pixels.shape[2] == 1:
+        return np.repeat(pixels, 3, axis=2)
+    if pixels.shape[2] == 4:
+        share = pixels[:, :, 3:] / np.float32(255)
+        mixed = pixels[:, :, :3] * share + np.array(LIGHT_GREY, dtype=np.float32) * (1 - share)
+        return np.asarray(mixed + 0.5, dtype=np.uint8)
+    return pixels
+
+
+def _collect_edges(
+    box: Box, color: Color, camera: Camera, near: list[_Stroke], far: list[_Stroke]
+) -> None:
+    """Sort a box's edges into those before and those behind the box itself."""
+    corners = box.corners
+    # Where the camera is, along each axis from the centre, in half extents.
+    position = -(box.center @ box.rotation)
+    half = box.extents / 2
+    shows = {(k, sign): sign * position[k] > half[k] for k in range(3) for sign in (-1, 1)}
+    inside = not any(shows.values())
+    for first, second in BOX_EDGES:
+        across = [k for k in range(3) if not (first ^ second) >> k & 1]
+        faces = [(k, 1 if first >> k & 1 else -1) for k in across]
+        strokes = _strokes(corners[[first, second]], color, camera, _near_plane(box))
+        (near if inside or any(shows[face] for face in faces) else far).extend(strokes)
+
+
+def _axis_strokes(box: Box, camera: Camera) -> list[_Stroke]:
+    """Arrows from the box's centre to its faces."""
+    strokes = []
+    for k, name in enumerate("xyz"):
+        tip = box.center + box.rotation[:, k] * box.extents[k] / 2
+        ends = np.array([box.center, tip])
+        for stroke in _strokes(ends, AXIS_COLORS[k], camera, _near_plane(box)):
+            strokes.append(replace(stroke, arrow=name))
+    return strokes
+
+
+def _near_plane(box: Box) -> float:
+    return _NEAR * (float(np.linalg.norm(box.extents)) or 1.0)
+
+
+def _strokes(ends: FloatArray, color: Color, camera: Camera, near_plane: float) -> list[_Stroke]:
+    """Project a segment (2, 3); none if it is not seen, several if a lens cuts it up."""
+    clipped = _clip(ends, camera, near_plane)
+    if clipped is None:
+        return []
+    depth = float(clipped[:, 2].mean())
+    count = _BENT_LINE_POINTS if camera.distortion else 2
+    share = np.linspace(0, 1, count)[:, None]
+    points = clipped[0] + share * (clipped[1] - clipped[0])
+    normalized = points[:, :2] / points[:, 2:]
+    kept = within_lens_field(camera, normalized)
+    pixels = camera.pixels_from_normalized(normalized)
+    runs = np.split(np.arange(count), np.flatnonzero(np.diff(kept)) + 1)
+    return [
+        _Stroke(depth=depth, points=pixels[run], color=color)
+        for run in runs
+        if kept[run[0]] and len(run) > 1
+    ]
+
+
+def _clip(ends: FloatArray, camera: Camera, near_plane: float) -> FloatArray | None:
+    """Cut a segment (2, 3) to what lies before the camera and not far outside the image."""
+    reach_x = _CUT_OFF * camera.width / camera.fx
+    reach_y = _CUT_OFF * camera.height / camera.fy
+    # Each row a half-space: normal and offset, positive inside.
+    planes = np.array(
+        [
+            [0, 0, 1, -near_plane],
+            [1, 0, reach_x, 0],
+            [-1, 0, reach_x, 0],
+            [0, 1, reach_y, 0],
+            [0, -1, reach_y, 0],
+        ]
+    )
+    first, second = (planes[:, :3] @ ends.T + planes[:, 3:]).T
+    low, high = 0.0, 1.0
+    for a, b in zip(first, second, strict=True):
+        if a < 0 and b < 0:
+            return None
+        if a < 0:
+            low = max(low, a / (a - b))
+        elif b < 0:
+            high = min(high, a / (a - b))
+    if low >= high:
+        return None
+    return np.asarray(ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0]))
+
+
+def _placed(stroke: _Stroke, canvas: Canvas) -> _Stroke:
+    return replace(stroke, points=canvas.place(stroke.points))
+
+
+def _draw_strokes(canvas: Canvas, near: list[_Stroke], far: list[_Stroke]) -> None:
+    """Far edges thin, dashed and faint; then the others, the nearest last."""
+    before = canvas.image.copy()
+    for stroke in sorted(far, key=lambda stroke: -stroke.depth):
+        canvas.line(stroke.points, stroke.color, width=1.2, dashed=True)
+    canvas.blend_from(before, opacity=_HIDDEN_OPACITY)
+    for stroke in sorted(near, key=lambda stroke: -stroke.depth):
+        if stroke.arrow:
+            canvas.arrow(stroke.points[0], stroke.points[-1], stroke.color, width=2.0)
+        else:
+            canvas.line(stroke.points, stroke.color, width=2.0)
+            for end in stroke.points[[0, -1]]:
+                # Fills the notch that a casing cuts into the edge it meets.
+                canvas.dot(end, stroke.color, radius=1.2)
+    for stroke in near:
+        if stroke.arrow:
+            along = stroke.points[-1] - stroke.points[0]
+            ahead = along / max(float(np.linalg.norm(along)), 1e-9) * 11 * canvas.unit
+            canvas.label(stroke.arrow, stroke.points[-1] + ahead, stroke.color)
+
+
+def _draw_keypoints(canvas: Canvas, seen: FloatArray | None, back: FloatArray | None) -> None:
+    """Rings, crosses and the residuals between them."""
+    if seen is not None and back is not None:
+        for pair in np.stack([seen, back], axis=1):
+            canvas.line(pair, REPROJECTED_COLOR, width=1.0)
+    for point in [] if seen is None else seen:
+        canvas.ring(point, OBSERVED_COLOR, radius=5)
+    for point in [] if back is None else back:
+        canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
+
+
+def _legend_entries(
+    gt_box: Box | None,
+    predicted: bool,
+    seen: FloatArray | None,
+    back: FloatArray | None,
+    *,
+    axes: bool,
+) -> list[LegendEntry]:
+    """What was drawn, by name."""
+    entries = []
+    if gt_box is not None:
+        entries.append(LegendEntry("ground truth", GT_COLOR))
+    if predicted:
+        entries.append(LegendEntry("prediction", EST_COLOR))
+    if axes:
+        names = zip("xyz", AXIS_COLORS, strict=True)
+        entries += [LegendEntry(f"{name} axis", color) for name, color in names]
+    if seen is not None:
+        entries.append(LegendEntry("observed", OBSERVED_COLOR, "ring"))
+    if back is not None:
+        entries.append(LegendEntry("reprojected", REPROJECTED_COLOR, "cross"))
+    return entries
+
+
+def _drawn_pixels(
+    strokes: list[_Stroke], seen: FloatArray | None, back: FloatArray | None
+) -> FloatArray:
+    """Pixels that the legend should not cover, (n, 2)."""
+    share = np.linspace(0, 1, 41)[:, None]
+    lines = [s.points[0] + share * (s.points[-1] - s.points[0]) for s in strokes]
+    markers = [points for points in (seen, back) if points is not None]
+    return np.concatenate([np.empty((0, 2)), *lines, *markers])

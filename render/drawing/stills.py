@@ -1,0 +1,217 @@
+"""Stills and turntables of one model: named views, styles, backgrounds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.pictures import (
+    depth_picture,
+    face_picture,
+    keypoint_picture,
+    line_picture,
+    normal_picture,
+)
+from cadalign.render.frame import Frame, Renderer
+from cadalign.render.raycast.renderer import cast_geometry
+from cadalign.render.scene import Scene
+from cadalign.render.views.views import frame_object, look_at
+from cadalign.render.views.visibility import visible_keypoints
+
+VIEWS: dict[str, tuple[float, float]] = {
+    "iso": (145.0, 25.0),
+    "front": (180.0, 0.0),
+    "right": (90.0, 0.0),
+    "back": (0.0, 0.0),
+    "left": (-90.0, 0.0),
+    "top": (180.0, 90.0),
+    "bottom": (180.0, -90.0),
+}
+"""Azimuth and elevation [degrees] of the named views, see `look_at`; ShapeNet's models face -z."""
+
+STYLES = ("color", "depth", "normals", "faces", "lines")
+_FILL = 0.88
+
+
+@dataclass(frozen=True)
+class Angles:
+    """From where a model is looked at; see `look_at`.
+
+    Parameters
+    ----------
+    azimuth, elevation, roll : float
+        Degrees.
+    """
+
+    azimuth: float
+    elevation: float
+    roll: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str) -> Angles:
+        """Read a view's name, or ``azimuth,elevation`` or ``azimuth,elevation,roll``.
+
+        Raises
+        ------
+        InputError
+            If it is neither.
+
+        Examples
+        --------
+        >>> Angles.parse("30,-10")
+        Angles(azimuth=30.0, elevation=-10.0, roll=0.0)
+        """
+        if text in VIEWS:
+            return cls(*VIEWS[text])
+        try:
+            values = [float(word) for word in text.split(",")]
+        except ValueError:
+            values = []
+        if len(values) not in (2, 3) or not np.isfinite(values).all():
+            raise InputError(
+                f"{text!r} is not a view",
+                where="view",
+                fix=f"give one of {', '.join(VIEWS)}, or azimuth,elevation[,roll] in degrees",
+            )
+        return cls(*values)
+
+
+def pose_in_view(
+    scene: Scene, camera: Camera, angles: Angles, *, scale: npt.ArrayLike = (1.0, 1.0, 1.0)
+) -> Alignment:
+    """Place a model so that it fills the image, looked at from some angles.
+
+    Raises
+    ------
+    InputError
+        If an angle or a scale is out of its range.
+    """
+    rotation = look_at(
+        azimuth=angles.azimuth,
+        elevation=angles.elevation,
+        roll=angles.roll,
+        distance=1.0,
+        scale=scale,
+    ).rotation
+    return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
+
+
+def draw_still(
+    renderer: Renderer,
+    scene: Scene,
+    camera: Camera,
+    cam_from_model: Alignment,
+    *,
+    style: str = "color",
+    samples: int = 8,
+) -> ByteImage:
+    """Draw a model in one of the styles; (h, w, 4) uint8, transparent where it is not.
+
+    Raises
+    ------
+    InputError
+        If there is no such style.
+    RenderError
+        If the image is too large.
+    """
+    if style == "color":
+        return renderer.render(scene, camera, cam_from_model, samples=samples).color
+    if style == "lines":
+        return _smooth_lines(scene, camera, cam_from_model)
+    pictures = {"depth": depth_picture, "normals": normal_picture, "faces": face_picture}
+    if style not in pictures:
+        raise InputError(
+            f"unknown style {style!r}", where="style", fix=f"known are {', '.join(STYLES)}"
+        )
+    return pictures[style](cast_geometry(scene, camera, cam_from_model))
+
+
+def on_background(color: ByteImage, background: tuple[int, int, int] | ByteImage) -> ByteImage:
+    """Put a picture with opacity (h, w, 4) on a colour or an image; (h, w, 3) uint8."""
+    empty = np.zeros(color.shape[:2])
+    frame = Frame(
+        depth=empty,
+        face_id=np.full(empty.shape, -1, dtype=np.int32),
+        normal=np.zeros((*empty.shape, 3), dtype=np.float32),
+        color=color,
+    )
+    return frame.composite(background)
+
+
+def with_keypoints(
+    image: ByteImage,
+    scene: Scene,
+    camera: Camera,
+    cam_from_model: Alignment,
+    keypoints: npt.ArrayLike,
+) -> ByteImage:
+    """Draw a model's keypoints (k, 3) over a picture of it, seen ones and hidden ones."""
+    visible = visible_keypoints(scene, keypoints, camera, cam_from_model)
+    return keypoint_picture(image, camera, keypoints, cam_from_model, visible=visible)
+
+
+def turntable(
+    scene: Scene,
+    camera: Camera,
+    angles: Angles,
+    *,
+    count: int,
+    scale: npt.ArrayLike = (1.0, 1.0, 1.0),
+) -> Iterator[Alignment]:
+    """Poses that turn a model once about its y axis, at a distance that fits all of them.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : Camera
+    angles : Angles
+        Of the first pose.
+    count : int
+        How many.
+    scale : (3,) float
+    """
+    low, high = scene.bounds
+    # The box about all the turned boxes: as wide as the farthest corner from the axis is.
+    middle, half = (low + high) / 2, (high - low) / 2 * np.asarray(scale, dtype=float)
+    reach = float(np.hypot(half[0], half[2]))
+    wide = np.array([reach, half[1], reach])
+    around = Alignment(np.eye(3), np.zeros(3), np.asarray(scale, dtype=float))
+    first = look_at(azimuth=angles.azimuth, elevation=angles.elevation, distance=1.0).rotation
+    placed = frame_object(np.array([-wide, wide]), camera, rotation=first, fill=_FILL)
+    depth = placed.translation
+    for number in range(count):
+        rotation = look_at(
+            azimuth=angles.azimuth + 360.0 * number / count,
+            elevation=angles.elevation,
+            roll=angles.roll,
+            distance=1.0,
+        ).rotation
+        center = rotation @ (middle * around.scale)
+        yield Alignment(rotation, depth - center, around.scale)
+
+
+def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
+    """Feature lines drawn at twice the size and shrunk."""
+    doubled = replace(
+        camera,
+        width=2 * camera.width,
+        height=2 * camera.height,
+        fx=2 * camera.fx,
+        fy=2 * camera.fy,
+        # Pixel borders, not centres, are what doubling keeps in place.
+        cx=2 * camera.cx + 0.5,
+        cy=2 * camera.cy + 0.5,
+    )
+    lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
+    # Two pixels wide there is one pixel wide here.
+    lines[:, :, 3] = cv2.dilate(lines[:, :, 3], np.ones((2, 2), np.uint8))
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.resize(lines, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

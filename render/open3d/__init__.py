@@ -1,0 +1,1 @@
+"""Cast rays with Open3D."""

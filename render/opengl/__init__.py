@@ -1,0 +1,1 @@
+"""Draw colour with OpenGL through pyrender."""

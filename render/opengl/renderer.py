@@ -1,0 +1,165 @@
+"""Colour by OpenGL, by way of pyrender; geometry, which OpenGL blurs, by ray casting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import ByteImage
+from cadalign.render.frame import Frame, check_image_size
+from cadalign.render.opengl.context import shared_context, straight_color
+from cadalign.render.raycast.occlusion import darken_corners
+from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
+from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
+from cadalign.render.raycast.shading import Studio
+from cadalign.render.scene import Scene
+
+# Larger images are drawn in tiles of this size: no graphics memory is too small for it.
+_TILE = 2048
+# Sizes of what is drawn are rounded up, so that buffers are not made anew for every frame.
+_SIZE_STEP = 64
+_MAX_UNBENT = 8192
+
+
+class PyrenderRenderer:
+    """Draws colour with OpenGL under EGL; depth, triangle numbers and normals are ray cast.
+
+    A model with transparent parts, which OpenGL would need sorted, is drawn by ray casting wholly.
+    A process has one OpenGL context, however many of these there are; a forked process must not
+    use its parent's, so start pools with "spawn" (or use loky).
+
+    Parameters
+    ----------
+    studio : Studio, optional
+        The lights.
+
+    Raises
+    ------
+    RenderError
+        If OpenGL does not start. Where its libraries are broken the whole process may die:
+        `make_renderer` tries it in another one first.
+    """
+
+    name = "pyrender"
+
+    def __init__(self, *, studio: Studio | None = None) -> None:
+        self.studio = studio or Studio()
+        self._context = shared_context()
+        self._context.check_process()
+        # It imports pyrender, which reads the environment that the context has set.
+        from cadalign.render.opengl.stage import GlStage
+
+        self._stage = GlStage(self.studio)
+        self._fallback = RaycastRenderer(studio=self.studio)
+
+    @property
+    def device(self) -> str:
+        """What draws: the graphics card's name, or llvmpipe for Mesa on the processor."""
+        return self._context.description()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # OpenGL's objects belong to this process; another one makes its own.
+        return _rebuild, (self.studio,)
+
+    def render(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
+    ) -> Frame:
+        """Draw a scene; see `RaycastRenderer.render`.
+
+        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
+
+        Raises
+        ------
+        RenderError
+            If the image is too large, OpenGL fails, or this process was forked from one that has
+            drawn with OpenGL.
+        InputError
+            If ``samples`` is not from 1 to 256.
+        """
+        if not scene.surface.opaque or samples == 1:
+            return self._fallback.render(scene, camera, cam_from_model, samples=samples)
+        self._fallback.check_samples(samples)
+        check_image_size(camera)
+        geometry = cast_geometry(scene, camera, cam_from_model)
+        color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
+        block = object_rectangle(scene, camera, cam_from_model)
+        if block is not None:
+            posed = PosedScene(scene, cam_from_model)
+            sides = posed.seen_sides(geometry.face_id[block.slices])
+            self._stage.place(scene, cam_from_model, sides=sides)
+            if camera.distortion:
+                color[block.slices] = self._draw_bent(camera, block)
+            else:
+                color[block.slices] = self._draw(camera, block)
+            darken_corners(color, geometry, block, posed, camera, studio=self.studio)
+        return Frame(
+            depth=geometry.depth, face_id=geometry.face_id, normal=geometry.normal, color=color
+        )
+
+    def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
+        """Draw a block of an image without lens distortion, straight colour (h, w, 4)."""
+        return straight_color(self._draw_premultiplied(camera, block))
+
+    def _draw_premultiplied(self, camera: Camera, block: Rectangle) -> ByteImage:
+        result: ByteImage = np.empty((block.height, block.width, 4), dtype=np.uint8)
+        for tile in _tiles(block):
+            width, height = (_rounded_up(size) for size in (tile.width, tile.height))
+            self._stage.look(camera, (tile.left, tile.top, width, height))
+            drawn = self._context.draw(self._stage.scene, width=width, height=height)
+            rows = slice(tile.top - block.top, tile.bottom - block.top)
+            columns = slice(tile.left - block.left, tile.right - block.left)
+            result[rows, columns] = drawn[: tile.height, : tile.width]
+        return result
+
+    def _draw_bent(self, camera: Camera, block: Rectangle) -> ByteImage:
+        """Draw as a pinhole camera would and bend that as the lens does."""
+        columns, rows = np.meshgrid(
+            np.arange(block.left, block.right), np.arange(block.top, block.bottom)
+        )
+        pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+        rays, valid = camera.normalize_where_valid(pixels)
+        if not valid.any():
+            return np.zeros((block.height, block.width, 4), dtype=np.uint8)
+        low, high = rays[valid].min(axis=0), rays[valid].max(axis=0)
+        pinhole = _pinhole_over(camera, low, high)
+        whole = Rectangle(0, 0, pinhole.width, pinhole.height)
+        drawn = self._draw_premultiplied(pinhole, whole)
+        at = pinhole.pixels_from_normalized(rays)
+        at[~valid] = -10
+        at_x, at_y = at.astype(np.float32).T.reshape(2, block.height, block.width)
+        bent = cv2.remap(drawn, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return straight_color(np.asarray(bent, dtype=np.uint8))
+
+
+def _tiles(block: Rectangle) -> Iterator[Rectangle]:
+    for top in range(block.top, block.bottom, _TILE):
+        for left in range(block.left, block.right, _TILE):
+            yield Rectangle(
+                left, top, min(left + _TILE, block.right), min(top + _TILE, block.bottom)
+            )
+
+
+def _rounded_up(size: int) -> int:
+    return -(-size // _SIZE_STEP) * _SIZE_STEP
+
+
+def _pinhole_over(camera: Camera, low: FloatArray, high: FloatArray) -> Camera:
+    """A camera without distortion that sees normalised coordinates from low to high."""
+    span = np.maximum(high - low, 1e-9)
+    focal = np.array([camera.fx, camera.fy])
+    size = np.ceil(span * focal) + 3
+    # A very wide lens would need a huge pinhole image; a coarser one then has to do.
+    shrink = min(1.0, float((_MAX_UNBENT / size).min()))
+    focal = focal * shrink
+    width, height = (int(value) for value in np.ceil(span * focal) + 3)
+    cx, cy = 1 - low * focal
+    return Camera(width, height, float(focal[0]), float(focal[1]), float(cx), float(cy))
+
+
+def _rebuild(studio: Studio) -> PyrenderRenderer:
+    return PyrenderRenderer(studio=studio)

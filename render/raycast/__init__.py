@@ -1,0 +1,1 @@
+"""Draw by ray casting: exact geometry and shaded colour on any machine."""

@@ -1,0 +1,189 @@
+"""First hits of rays with a triangle mesh: embree finds the triangle, float64 the point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from cadalign.arrays import FloatArray, IntArray
+
+FaceArray = npt.NDArray[np.int32]
+SingleArray = npt.NDArray[np.float32]
+
+# Embree counts in float32. Rays are perturbed by more than its rounding, so that a ray which passes
+# exactly through a shared edge does not slip between the two triangles (as 1 in 2,000 such rays
+# did, none with this). At a distance of 4 model radii that moves the hit by 1e-5 radii.
+_NUDGE = np.array([1.1e-6, 0.7e-6, -0.9e-6])
+# Farther than this from the mesh, in its radii, rays are started nearer by, or rounding shows.
+_FAR_ORIGIN = 8.0
+# Sine of the angle below which a triangle is seen so nearly edge-on that the intersection with its
+# plane is held to the triangle's own extent.
+_GRAZING = 1e-3
+
+
+class RayEngine(Protocol):
+    """A library's ray hierarchy over triangles, in single precision; safe in several threads."""
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """The first triangle on each of n rays (n, 3), (n,) int32; -1 where there is none."""
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """Whether anything is hit before ``origin + reach * direction``, (n,) bool."""
+
+
+EngineMaker = Callable[[SingleArray, FaceArray], RayEngine]
+
+
+class EmbreeEngine:
+    """Embree by way of embreex.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float32
+    faces : (m, 3) int32
+    """
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, vertices, faces)
+        # Embree builds the hierarchy on the first query; let no two threads make that one at once.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `RayEngine`."""
+        found: FaceArray = self._scene.run(origins, directions)
+        return found
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `RayEngine`."""
+        far = np.full(len(origins), reach, dtype=np.float32)
+        return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
+
+
+class RayCaster:
+    """A bounding volume hierarchy over a mesh; built once, then only read.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+        Positions [model units], finite.
+    faces : (m, 3) int
+        Vertex numbers of the triangles.
+    engine : callable
+        Makes the hierarchy.
+    """
+
+    def __init__(
+        self, vertices: FloatArray, faces: IntArray, *, engine: EngineMaker = EmbreeEngine
+    ) -> None:
+        used = vertices[np.unique(faces)]
+        low, high = used.min(axis=0), used.max(axis=0)
+        self._center = (low + high) / 2
+        # A mesh of a single point has no size; any radius serves.
+        self._radius = float(np.linalg.norm(high - low)) / 2 or 1.0
+        self._triangles = vertices[faces]
+        first = self._triangles[:, 0]
+        self._normals = np.cross(self._triangles[:, 1] - first, self._triangles[:, 2] - first)
+        length = np.linalg.norm(self._normals, axis=1, keepdims=True)
+        self._normals /= np.where(length > 0, length, 1.0)
+        unit = (vertices - self._center) / self._radius
+        self._engine = engine(unit.astype(np.float32), faces.astype(np.int32))
+
+    def first_hits(
+        self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
+    ) -> tuple[FaceArray, FloatArray]:
+        """Find the first triangle on each of many rays from one point.
+
+        Several threads may call this at once: embree lets go of the interpreter lock.
+
+        Parameters
+        ----------
+        origin : (3,) float
+            Where all rays begin [model units].
+        directions : (n, 3) float
+            Directions, of any length but 0.
+        start : (n,) float, optional
+            Ignore what lies before ``origin + start * direction``; by default 0.
+
+        Returns
+        -------
+        face : (n,) int32
+            The triangle's number, -1 where there is none.
+        distance : (n,) float
+            The point is ``origin + distance * direction``; infinite where nothing is hit.
+        """
+        face = self._first_faces(origin, directions, start)
+        return face, self._distances(origin, directions, face)
+
+    def blocked(
+        self, origins: FloatArray, directions: FloatArray, *, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """Say which rays hit anything on the way; to single precision.
+
+        Parameters
+        ----------
+        origins, directions : (n, 3) float
+            In model coordinates.
+        reach : float
+            How far each ray goes, in lengths of its direction.
+
+        Returns
+        -------
+        (n,) bool
+        """
+        unit = (origins - self._center) / self._radius
+        return self._engine.blocked(
+            unit.astype(np.float32), (directions / self._radius).astype(np.float32), reach
+        )
+
+    def _first_faces(
+        self, origin: FloatArray, directions: FloatArray, start: FloatArray | None
+    ) -> FaceArray:
+        """The triangles that the engine finds, (n,) int32."""
+        origin = (origin - self._center) / self._radius
+        length = np.sqrt(np.einsum("nk,nk->n", directions, directions))
+        unit = directions / length[:, None]
+        origins: FloatArray
+        if start is None and origin @ origin < _FAR_ORIGIN**2:
+            origins = np.empty((len(directions), 3), dtype=np.float32)
+            origins[:] = origin
+        else:
+            begin = np.maximum(-(unit @ origin) - 1.01, 0.0)
+            if start is not None:
+                begin = np.maximum(begin, start * length / self._radius)
+            origins = origin + begin[:, None] * unit
+        unit += _NUDGE
+        return self._engine.first_faces(
+            origins.astype(np.float32, copy=False), unit.astype(np.float32)
+        )
+
+    def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
+        """Where the rays cross the planes of their triangles, (n,) float."""
+        distance = np.full(len(face), np.inf)
+        hit = np.flatnonzero(face >= 0)
+        found, along = face[hit], directions[hit]
+        normals = self._normals[found]
+        towards = np.einsum("nk,nk->n", normals, along)
+        height = np.einsum("nk,nk->n", self._triangles[found, 0] - origin, normals)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = height / towards
+        length = np.sqrt(np.einsum("nk,nk->n", along, along))
+        grazing = np.flatnonzero(~(np.abs(towards) > _GRAZING * length))
+        if len(grazing):
+            corners = self._triangles[found[grazing]] - origin
+            along = along[grazing]
+            extent = np.einsum("nck,nk->nc", corners, along) / length[grazing, None] ** 2
+            low, high = extent.min(axis=1), extent.max(axis=1)
+            held = np.clip(crossing[grazing], low, high)
+            crossing[grazing] = np.where(np.isnan(held), (low + high) / 2, held)
+        distance[hit] = crossing
+        return distance

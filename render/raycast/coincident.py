@@ -1,0 +1,45 @@
+"""Faces that lie in the same place: which of them is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+
+
+def number_rows(rows: npt.NDArray[np.float64] | npt.NDArray[np.int64]) -> IntArray:
+    """Number the distinct rows of an (n, 3) array; (n,) int, equal for equal rows."""
+    # Adding 0 turns -0.0 into 0.0, which has other bytes.
+    packed = np.ascontiguousarray(rows + 0).view(np.dtype((np.void, 3 * rows.itemsize))).ravel()
+    return np.asarray(np.unique(packed, return_inverse=True)[1].ravel(), dtype=np.int64)
+
+
+def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Find, for each triangle, which one to show of those with the same three corners.
+
+    Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
+    front and of its back. The one to show is wound towards the viewer.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+    faces : (m, 3) int
+
+    Returns
+    -------
+    alike, opposite : (m,) int
+        The first triangle there that is wound as this one is, and the first that is wound the
+        other way, which is the triangle itself where there is none.
+    """
+    corners = number_rows(vertices)[faces]
+    place = number_rows(np.sort(corners, axis=1))
+    a, b, c = corners.T
+    # Sorting takes an even or odd number of swaps: that is the winding.
+    winding = (((a > b) ^ (b > c)) ^ (a > c)).astype(np.int64)
+    none = len(faces)
+    first = np.full((place.max() + 1, 2), none)
+    np.minimum.at(first, (place, winding), np.arange(none))
+    alike = first[place, winding]
+    opposite = first[place, 1 - winding]
+    return alike, np.where(opposite < none, opposite, alike)

@@ -1,0 +1,78 @@
+"""Smooth normals for meshes whose faces may be turned either way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.render.raycast.coincident import number_rows
+
+# A point at which more triangles meet than this is left faceted: pairs grow with the square.
+_MAX_VALENCE = 1024
+_PAIRS_AT_ONCE = 1 << 20
+
+
+def corner_normals(
+    vertices: FloatArray, faces: IntArray, face_normals: FloatArray, *, crease_angle: float
+) -> FloatArray:
+    """Average, at each corner of each face, the normals of the faces that continue it smoothly.
+
+    Faces meet where their vertices have the same position, whether they share the vertex or not.
+    Those that are turned the other way count with their normal reversed, since the faces of many
+    CAD models are turned at random. Each counts by its angle at the corner.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+    faces : (m, 3) int
+    face_normals : (m, 3) float
+        Unit normals.
+    crease_angle : float
+        Faces at a larger angle than this [degrees] meet in an edge.
+
+    Returns
+    -------
+    (m, 3, 3) float
+        A unit normal for each face's corner, on the side of that face's own normal.
+    """
+    point = number_rows(vertices)[faces].ravel()
+    weight = _corner_angles(vertices[faces]).ravel()
+    normals = np.repeat(face_normals, 3, axis=0)
+    order = np.argsort(point, kind="stable")
+    start, valence = _runs(point[order])
+    result = normals.copy()
+    for count in np.unique(valence):
+        if count == 1 or count > _MAX_VALENCE:
+            continue
+        first = start[valence == count]
+        step = max(1, _PAIRS_AT_ONCE // int(count) ** 2)
+        for begin in range(0, len(first), step):
+            corners = order[first[begin : begin + step, None] + np.arange(count)]
+            result[corners] = _smooth(normals[corners], weight[corners], crease_angle)
+    return result.reshape(-1, 3, 3)
+
+
+def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> FloatArray:
+    """Average within groups of corners (g, c, 3) that share a point."""
+    cosine = normals @ normals.transpose(0, 2, 1)
+    share = np.where(
+        np.abs(cosine) >= np.cos(np.radians(crease_angle)), np.sign(cosine) * weight[:, None, :], 0
+    )
+    total = share @ normals
+    length = np.linalg.norm(total, axis=2, keepdims=True)
+    return np.where(length > 1e-9, total / np.where(length > 0, length, 1.0), normals)
+
+
+def _runs(values: IntArray) -> tuple[IntArray, IntArray]:
+    """Where runs of equal values start in a sorted array, and how long they are."""
+    start = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
+    return start, np.diff(np.concatenate([start, [len(values)]]))
+
+
+def _corner_angles(triangles: FloatArray) -> FloatArray:
+    """The angles at the corners of triangles (m, 3, 3); (m, 3) radians."""
+    after = np.roll(triangles, -1, axis=1) - triangles
+    before = np.roll(triangles, 1, axis=1) - triangles
+    scale = np.linalg.norm(after, axis=2) * np.linalg.norm(before, axis=2)
+    cosine = np.einsum("mck,mck->mc", after, before) / np.where(scale > 0, scale, 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)))

@@ -1,0 +1,274 @@
+"""A scene seen by a camera: rays, hits and the light that comes back along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import LinearArray
+from cadalign.render.raycast.caster import FaceArray, RayCaster
+from cadalign.render.raycast.shading import Studio
+from cadalign.render.scene import Scene
+from cadalign.render.views.lens_field import within_lens_field
+
+_MAX_LAYERS = 8
+# What is hidden to this share is left out.
+_SEEN_THROUGH = 1 / 64
+# How far behind a transparent hit the ray goes on, in diagonals of the model.
+_LAYER_GAP = 2e-5
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A block of pixels: columns ``left`` to ``right - 1``, rows ``top`` to ``bottom - 1``."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def width(self) -> int:
+        """Columns [px]."""
+        return self.right - self.left
+
+    @property
+    def height(self) -> int:
+        """Rows [px]."""
+        return self.bottom - self.top
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """The block's rows and columns, to index images with."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+class PosedScene:
+    """A scene placed before a camera.
+
+    Parameters
+    ----------
+    scene : Scene
+    cam_from_model : Alignment
+    caster : RayCaster, optional
+        What finds the hits; by default the scene's own.
+    """
+
+    def __init__(
+        self, scene: Scene, cam_from_model: Alignment, *, caster: RayCaster | None = None
+    ) -> None:
+        self.scene = scene
+        self._caster = caster or scene.caster
+        self._alignment = cam_from_model
+        # Columns take normalised coordinates (u, v, 1) to directions in the model frame.
+        self._model_from_ray = cam_from_model.rotation.T / cam_from_model.scale[:, None]
+        self._origin = -self._model_from_ray @ cam_from_model.translation
+        first = scene.triangles[:, 0]
+        side = np.einsum("mk,mk->m", self._origin - first, scene.face_normals)
+        self._side = np.where(side < 0, -1.0, 1.0)
+        alike, opposite = scene.coincident_faces
+        self._shown = np.where(side < 0, opposite, alike).astype(np.int32)
+        self._normal_matrix = cam_from_model.rotation / cam_from_model.scale
+        self.normals = self._to_camera(scene.face_normals)
+        """The faces' unit normals in the camera frame, (m, 3) float32, on the side that is seen."""
+
+    def prepare_color(self) -> None:
+        """Make now what `light` needs, before several threads ask for it at once."""
+        _ = self.scene.surface, self.scene.is_smooth, self.scene.single_corner_normals
+        _ = self.scene.barycentric_gradients
+
+    def cast(
+        self, normalized: FloatArray, *, start: FloatArray | None = None
+    ) -> tuple[FaceArray, FloatArray]:
+        """Find what is seen in normalised directions (n, 2): triangles and depths, both (n,)."""
+        columns = self._model_from_ray.T
+        directions = normalized @ columns[:2] + columns[2]
+        face, depth = self._caster.first_hits(self._origin, directions, start=start)
+        return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
+
+    def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
+        """Whether any of the triangles in an image is seen from its front, and from its back."""
+        seen = np.zeros(len(self._side) + 1, dtype=bool)
+        # Where nothing is, -1 marks the last place, which is no triangle's.
+        seen[face_id.ravel()] = True
+        side = self._side[seen[:-1]]
+        return bool((side > 0).any()), bool((side < 0).any())
+
+    @cached_property
+    def diagonal(self) -> float:
+        """The diagonal of the stretched model's bounding box [model units]."""
+        extents = (self.scene.bounds[1] - self.scene.bounds[0]) * self._alignment.scale
+        return float(np.linalg.norm(extents))
+
+    def blocked(
+        self, points_cam: FloatArray, directions: FloatArray, *, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """Say which points (n, 3) of the camera frame see a part of the object on their rays.
+
+        Parameters
+        ----------
+        points_cam, directions : (n, 3) float
+            Rays in the camera frame; the directions have length 1.
+        reach : float
+            Parts farther off than this [model units] don't count.
+
+        Returns
+        -------
+        (n,) bool
+        """
+        columns = self._model_from_ray.T
+        return self._caster.blocked(
+            (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
+        )
+
+    def light(self, normalized: FloatArray, studio: Studio) -> LinearArray:
+        """Colour seen in normalised directions (n, 2), cast anew; see `light_of_hits`."""
+        return self.light_of_hits(normalized, *self.cast(normalized), studio)
+
+    def light_of_hits(
+        self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
+    ) -> LinearArray:
+        """Colour seen in normalised directions whose first hits are known.
+
+        Parameters
+        ----------
+        normalized : (n, 2) float
+        face : (n,) int
+        depth : (n,) float
+        studio : Studio
+
+        Returns
+        -------
+        (n, 4) float32
+            Linear light, premultiplied, and opacity.
+        """
+        result = np.zeros((len(face), 4), dtype=np.float32)
+        active = np.flatnonzero(face >= 0)
+        if self.scene.surface.opaque:
+            result[active] = self._shade(normalized[active], face[active], depth[active], studio)
+            return result
+        rays, face, depth = normalized[active], face[active], depth[active]
+        for _ in range(_MAX_LAYERS):
+            if not len(active):
+                break
+            color = self._shade(rays, face, depth, studio)
+            seen = result[active]
+            through = (1 - seen[:, 3]) * color[:, 3]
+            seen[:, :3] += color[:, :3] * through[:, None]
+            seen[:, 3] += through
+            result[active] = seen
+            going = np.flatnonzero(seen[:, 3] < 1 - _SEEN_THROUGH)
+            rays, depth = rays[going], depth[going]
+            along = rays @ self._model_from_ray.T[:2] + self._model_from_ray[:, 2]
+            speed = np.sqrt(np.einsum("nk,nk->n", along, along))
+            face, depth = self.cast(rays, start=depth + _LAYER_GAP * self.scene.diagonal / speed)
+            hit = np.flatnonzero(face >= 0)
+            active, rays, face, depth = active[going[hit]], rays[hit], face[hit], depth[hit]
+        return result
+
+    def _shade(
+        self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
+    ) -> LinearArray:
+        """Light and opacity (n, 4) of hits, not premultiplied."""
+        surface = self.scene.surface
+        normal = self.normals[face]
+        smooth = np.flatnonzero(self.scene.is_smooth[face])
+        weights: LinearArray | None = None
+        if surface.varies:
+            weights = self._weights(normalized, face, depth)
+        if len(smooth):
+            chosen = (
+                self._weights(normalized[smooth], face[smooth], depth[smooth])
+                if weights is None
+                else weights[smooth]
+            )
+            normal[smooth] = self._smooth_normals(face[smooth], chosen)
+        color = surface.color(face, weights)
+        view = np.empty((len(face), 3), dtype=np.float32)
+        view[:, :2] = -normalized
+        view[:, 2] = -1
+        view /= np.sqrt(np.einsum("nk,nk->n", view, view))[:, None]
+        up = self._alignment.rotation[:, 1]
+        return np.column_stack([studio.shade(color[:, :3], normal, view, up), color[:, 3]])
+
+    def _weights(self, normalized: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
+        """Barycentric coordinates of hits, (n, 3)."""
+        columns = self._model_from_ray.T
+        points = (normalized @ columns[:2] + columns[2]) * depth[:, None]
+        points += self._origin - self.scene.triangles[face, 0]
+        later = np.einsum("nck,nk->nc", self.scene.barycentric_gradients[face], points)
+        weights = np.column_stack([1 - later.sum(axis=1), later])
+        # The float32 caster may hit a triangle a hair outside of it.
+        return np.asarray(np.clip(weights, 0, 1), dtype=np.float32)
+
+    def _smooth_normals(self, face: FaceArray, weights: LinearArray) -> LinearArray:
+        """Unit normals (n, 3) in the camera frame, blended between the corners of triangles."""
+        corners = self.scene.single_corner_normals[face]
+        blended = weights[:, :1] * corners[:, 0]
+        blended += weights[:, 1:2] * corners[:, 1]
+        blended += weights[:, 2:] * corners[:, 2]
+        turned = blended @ self._normal_matrix.T.astype(np.float32)
+        length = np.sqrt(np.einsum("nk,nk->n", turned, turned))
+        side = self._side[face].astype(np.float32)
+        return np.asarray(turned * (side / np.maximum(length, np.float32(1e-30)))[:, None])
+
+    def _to_camera(self, normals: FloatArray) -> LinearArray:
+        rows = normals @ self._normal_matrix.T
+        rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
+        return (rows * self._side[:, None]).astype(np.float32)
+
+
+def object_rectangle(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, margin: int = 2
+) -> Rectangle | None:
+    """The block of pixels outside of which nothing of the object is seen; None if it is nowhere.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : Camera
+    cam_from_model : Alignment
+    margin : int
+        Pixels added on every side.
+    """
+    points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
+    nearest = points[:, 2].min()
+    if points[:, 2].max() <= 0:
+        return None
+    whole = Rectangle(0, 0, camera.width, camera.height)
+    if nearest <= 0:
+        return whole
+    normalized = points[:, :2] / points[:, 2:]
+    if not np.isfinite(normalized).all():
+        return whole
+    low, high = normalized.min(axis=0), normalized.max(axis=0)
+    if camera.distortion:
+        normalized = _outline(low, high)
+        if not within_lens_field(camera, normalized).all():
+            return whole
+    else:
+        normalized = np.array([low, high])
+    pixels = camera.pixels_from_normalized(normalized)
+    size = (camera.width, camera.height)
+    # Clip before converting to whole numbers, which far-off pixels would overflow.
+    first = np.clip(np.floor(pixels.min(axis=0)) - margin, 0, size).astype(int)
+    last = np.clip(np.ceil(pixels.max(axis=0)) + margin + 1, 0, size).astype(int)
+    if (first >= last).any():
+        return None
+    return Rectangle(int(first[0]), int(first[1]), int(last[0]), int(last[1]))
+
+
+def _outline(low: FloatArray, high: FloatArray, *, count: int = 65) -> FloatArray:
+    """Points along the border of a rectangle, (4 count, 2)."""
+    share = np.linspace(0, 1, count)[:, None]
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    following = np.roll(corners, -1, axis=0)
+    return np.concatenate(
+        [a + share * (b - a) for a, b in zip(corners, following, strict=True)], axis=0
+    )

@@ -1,0 +1,294 @@
+"""Drawing by ray casting: exact geometry and antialiased, shaded colour; needs no display."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from operator import attrgetter
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_linear
+from cadalign.render.frame import Frame, Geometry, check_image_size
+from cadalign.render.raycast.caster import RayCaster
+from cadalign.render.raycast.occlusion import darken_corners
+from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
+from cadalign.render.raycast.shading import Studio
+from cadalign.render.raycast.threads import in_threads
+from cadalign.render.scene import Scene
+
+# Small enough for the processor's caches, large enough for NumPy's overhead not to show.
+_RAYS_AT_ONCE = 1 << 15
+# Neighbouring pixels that differ by more than this in a channel (of 255) are sampled again.
+_VISIBLE_STEP = 6
+_MAX_SAMPLES = 256
+
+
+class RaycastRenderer:
+    """Draws with embree on the processor; the renderer that works everywhere.
+
+    Parameters
+    ----------
+    studio : Studio, optional
+        The lights.
+    caster_of : callable, optional
+        Gives what casts a scene's rays; by default the scene's own caster, embree's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign import Alignment, Camera, Mesh
+    >>> from cadalign.render import RaycastRenderer, Scene
+    >>> scene = Scene(Mesh([[-1, -1, 0], [1, -1, 0], [0, 2, 0]], [[0, 1, 2]]))
+    >>> camera = Camera.from_fov(65, 49, fov_x=60.0)
+    >>> frame = RaycastRenderer().render(scene, camera, Alignment(np.eye(3), [0, 0, 4], [1, 1, 1]))
+    >>> float(frame.depth[24, 32]), int(frame.face_id[24, 32]), bool(frame.mask[0, 0])
+    (4.0, 0, False)
+    """
+
+    name = "raycast"
+
+    def __init__(
+        self,
+        *,
+        studio: Studio | None = None,
+        caster_of: Callable[[Scene], RayCaster] = attrgetter("caster"),
+    ) -> None:
+        self.studio = studio or Studio()
+        self._caster_of = caster_of
+
+    def render(
+        self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
+    ) -> Frame:
+        """Draw a scene.
+
+        Parameters
+        ----------
+        scene : Scene
+            The prepared mesh.
+        camera : Camera
+            The camera; its lens distortion is drawn too.
+        cam_from_model : Alignment
+            Where the mesh is and how it is stretched. What lies behind the camera is not seen.
+        samples : int
+            Rays per pixel where the colour changes from one pixel to the next; 1 turns
+            antialiasing off.
+
+        Returns
+        -------
+        Frame
+            All of it empty if the object is not in the image; pixels are empty where the lens
+            model cannot be inverted.
+
+        Raises
+        ------
+        RenderError
+            If the image is too large.
+        InputError
+            If ``samples`` is not from 1 to 256.
+        """
+        self.check_samples(samples)
+        check_image_size(camera)
+        geometry = empty_geometry(camera)
+        color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
+        block = object_rectangle(scene, camera, cam_from_model)
+        if block is not None:
+            posed = PosedScene(scene, cam_from_model, caster=self._caster_of(scene))
+            posed.prepare_color()
+            self._draw(geometry, color, _bands(block), posed, camera)
+            if samples > 1:
+                self._antialias(color, block, posed, camera, samples)
+            darken_corners(color, geometry, block, posed, camera, studio=self.studio)
+        return Frame(
+            depth=geometry.depth, face_id=geometry.face_id, normal=geometry.normal, color=color
+        )
+
+    @staticmethod
+    def check_samples(samples: int) -> None:
+        """Refuse a number of rays per pixel that is out of range.
+
+        Raises
+        ------
+        InputError
+        """
+        if not 1 <= samples <= _MAX_SAMPLES:
+            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
+
+    def _draw(
+        self,
+        geometry: Geometry,
+        color: ByteImage,
+        bands: list[Rectangle],
+        posed: PosedScene,
+        camera: Camera,
+    ) -> None:
+        """Draw with one ray through each pixel's centre."""
+
+        def draw(band: Rectangle) -> None:
+            normalized, valid = _normalized(camera, band)
+            face, depth = posed.cast(normalized)
+            face[~valid] = -1
+            _fill(geometry, band, posed, face, depth)
+            light = posed.light_of_hits(normalized, face, depth, self.studio)
+            color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
+
+        in_threads(draw, bands)
+
+    def _antialias(
+        self,
+        color: ByteImage,
+        block: Rectangle,
+        posed: PosedScene,
+        camera: Camera,
+        samples: int,
+    ) -> None:
+        """Draw the pixels that differ from a neighbour again, with several rays each."""
+        part = color[block.slices]
+        unlike = _unlike_neighbours(part)
+        if posed.scene.surface.opaque:
+            self._sample(color, unlike, block, posed, camera, samples)
+            return
+        # What shows through is softer than an outline, and costs a ray for each layer.
+        outline = _unlike_neighbours(part[:, :, 3:])
+        self._sample(color, unlike & outline, block, posed, camera, samples)
+        self._sample(color, unlike & ~outline, block, posed, camera, -(-samples // 2))
+
+    def _sample(
+        self,
+        color: ByteImage,
+        chosen: npt.NDArray[np.bool_],
+        block: Rectangle,
+        posed: PosedScene,
+        camera: Camera,
+        samples: int,
+    ) -> None:
+        """Draw pixels of a block with several rays each."""
+        rows, columns = np.nonzero(chosen)
+        pixels = np.column_stack([columns + block.left, rows + block.top])
+        offsets = _subpixel_offsets(samples)
+        step = max(1, _RAYS_AT_ONCE // samples)
+
+        def draw(part: IntArray) -> None:
+            pixels = (part[:, None] + offsets).reshape(-1, 2)
+            rays, valid = camera.normalize_where_valid(pixels)
+            light = posed.light(rays, self.studio)
+            light[~valid] = 0
+            light = light.reshape(len(part), samples, 4)
+            color[part[:, 1], part[:, 0]] = _encode(light.mean(axis=1))
+
+        in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
+
+
+def cast_geometry(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None = None
+) -> Geometry:
+    """Depth, triangle numbers and normals without colour: one ray through each pixel's centre.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : Camera
+    cam_from_model : Alignment
+    caster : RayCaster, optional
+        What finds the hits; by default the scene's own.
+
+    Returns
+    -------
+    Geometry
+        Empty at pixels where the lens model cannot be inverted.
+
+    Raises
+    ------
+    RenderError
+        If the image is too large.
+    """
+    check_image_size(camera)
+    geometry = empty_geometry(camera)
+    block = object_rectangle(scene, camera, cam_from_model)
+    if block is not None:
+        posed = PosedScene(scene, cam_from_model, caster=caster)
+
+        def draw(band: Rectangle) -> None:
+            normalized, valid = _normalized(camera, band)
+            face, depth = posed.cast(normalized)
+            face[~valid] = -1
+            _fill(geometry, band, posed, face, depth)
+
+        in_threads(draw, _bands(block))
+    return geometry
+
+
+def empty_geometry(camera: Camera) -> Geometry:
+    shape = (camera.height, camera.width)
+    return Geometry(
+        depth=np.zeros(shape),
+        face_id=np.full(shape, -1, dtype=np.int32),
+        normal=np.zeros((*shape, 3), dtype=np.float32),
+    )
+
+
+def _fill(
+    geometry: Geometry,
+    band: Rectangle,
+    posed: PosedScene,
+    face: npt.NDArray[np.int32],
+    depth: FloatArray,
+) -> None:
+    """Write hits into the images."""
+    hit = np.flatnonzero(face >= 0)
+    shape = (band.height, band.width)
+    geometry.face_id[band.slices] = face.reshape(shape)
+    geometry.depth[band.slices] = np.where(face >= 0, depth, 0.0).reshape(shape)
+    normal = np.zeros((len(face), 3), dtype=np.float32)
+    normal[hit] = posed.normals[face[hit]]
+    geometry.normal[band.slices] = normal.reshape(*shape, 3)
+
+
+def _bands(block: Rectangle) -> list[Rectangle]:
+    """Cut a block into bands of rows, to be cast at a time."""
+    rows = max(1, _RAYS_AT_ONCE // block.width)
+    return [
+        Rectangle(block.left, top, block.right, min(top + rows, block.bottom))
+        for top in range(block.top, block.bottom, rows)
+    ]
+
+
+def _normalized(camera: Camera, block: Rectangle) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Normalised coordinates (n, 2) of pixel centres, row by row, and where they are valid."""
+    pixels = np.empty((block.height, block.width, 2))
+    pixels[:, :, 0] = np.arange(block.left, block.right)
+    pixels[:, :, 1] = np.arange(block.top, block.bottom)[:, None]
+    return camera.normalize_where_valid(pixels.reshape(-1, 2))
+
+
+def _unlike_neighbours(color: ByteImage) -> npt.NDArray[np.bool_]:
+    """Pixels of (h, w, k) that visibly differ from one of 8 neighbours, (h, w) bool."""
+    around = np.ones((3, 3), dtype=np.uint8)
+    span = cv2.subtract(cv2.dilate(color, around), cv2.erode(color, around))
+    return np.asarray(span.reshape(color.shape).max(axis=2) > _VISIBLE_STEP)
+
+
+def _subpixel_offsets(count: int) -> FloatArray:
+    """Points spread evenly over a pixel, (count, 2) from -0.5 to 0.5, their mean at the centre.
+
+    The R2 sequence: M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018.
+    """
+    plastic = 1.324717957244746
+    steps = np.arange(1, count + 1)[:, None] * (1 / plastic, 1 / plastic**2)
+    offsets = (steps + 0.5) % 1.0
+    return np.asarray(np.clip(offsets - offsets.mean(axis=0), -0.5, 0.5))
+
+
+def _encode(light: LinearArray) -> ByteImage:
+    """Turn premultiplied linear light (n, 4) into sRGB bytes with straight opacity."""
+    opacity = light[:, 3:]
+    straight = np.asarray(light[:, :3] / np.maximum(opacity, 1e-6), dtype=np.float32)
+    result: ByteImage = np.empty(light.shape, dtype=np.uint8)
+    result[:, :3] = bytes_from_linear(straight)
+    result[:, 3:] = (np.clip(opacity, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return result

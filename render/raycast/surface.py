@@ -1,0 +1,112 @@
+"""What colour a mesh has at a point of its surface: materials, vertex colours, textures."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.geometry.mesh import Mesh
+from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
+from cadalign.render.raycast.caster import FaceArray
+
+
+class Surface:
+    """The colours of a mesh, in linear light.
+
+    Vertex colours, where there are any, take the place of the materials' plain colour; a texture
+    multiplies with it. Textures repeat outside [0, 1]; their v runs up from the bottom row.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        plain = np.array([material.color for material in mesh.materials], dtype=np.float32)
+        plain[:, :3] = linear_from_srgb(plain[:, :3])
+        self._face_color: LinearArray = plain[mesh.face_material]
+        self._corner_color: LinearArray | None = None
+        if mesh.vertex_colors is not None:
+            color = mesh.vertex_colors.astype(np.float32)
+            color[:, :3] = linear_from_srgb(color[:, :3])
+            self._corner_color = color[mesh.faces]
+        self._face_material = mesh.face_material
+        self._corner_uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
+        self._textures: dict[int, LinearArray] = {}
+        if mesh.corner_uv is not None:
+            self._textures = {
+                number: _linear_texture(material.texture)
+                for number, material in enumerate(mesh.materials)
+                if material.texture is not None
+            }
+
+    @property
+    def varies(self) -> bool:
+        """Whether the colour changes within a face, so that a lookup needs weights."""
+        return self._corner_color is not None or bool(self._textures)
+
+    @property
+    def opaque(self) -> bool:
+        """Whether nothing can be seen through the surface."""
+        color = self._face_color if self._corner_color is None else self._corner_color
+        return bool((color[..., 3] >= 1).all()) and all(
+            bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()
+        )
+
+    def color(self, face: FaceArray, weights: LinearArray | None) -> LinearArray:
+        """Look up the colour at points of the surface.
+
+        Parameters
+        ----------
+        face : (n,) int
+            Triangle numbers.
+        weights : (n, 3) float, optional
+            Barycentric coordinates; needed where `varies`.
+
+        Returns
+        -------
+        (n, 4) float32
+            Linear red, green, blue, and opacity; not premultiplied.
+        """
+        if weights is None or not self.varies:
+            return np.asarray(self._face_color[face])
+        if self._corner_color is None:
+            color = self._face_color[face]
+        else:
+            color = np.einsum("nc,nck->nk", weights, self._corner_color[face])
+        if self._corner_uv is None:
+            return color
+        material = self._face_material[face]
+        for number, texture in self._textures.items():
+            chosen = np.flatnonzero(material == number)
+            if len(chosen):
+                uv = np.einsum("nc,nck->nk", weights[chosen], self._corner_uv[face[chosen]])
+                color[chosen] *= sample_texture(texture, uv)
+        return color
+
+
+def sample_texture(texture: LinearArray, uv: LinearArray) -> LinearArray:
+    """Read a texture (h, w, 4) bilinearly at (n, 2) texture coordinates; (n, 4) float32."""
+    height, width = texture.shape[:2]
+    uv = np.where(np.isfinite(uv), uv, 0.0)
+    x = (uv[:, 0] % 1.0) * width - 0.5
+    y = (1.0 - uv[:, 1] % 1.0) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    right_share, low_share = (x - left)[:, None], (y - top)[:, None]
+    x0, y0 = left.astype(np.int64) % width, top.astype(np.int64) % height
+    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
+    upper = texture[y0, x0] * (1 - right_share) + texture[y0, x1] * right_share
+    lower = texture[y1, x0] * (1 - right_share) + texture[y1, x1] * right_share
+    return np.asarray(upper * (1 - low_share) + lower * low_share, dtype=np.float32)
+
+
+def _linear_texture(texture: npt.NDArray[np.uint8]) -> LinearArray:
+    """Turn an image (h, w), (h, w, 3) or (h, w, 4) into linear light with opacity (h, w, 4)."""
+    image = texture[:, :, None] if texture.ndim == 2 else texture
+    channels = image.shape[2]
+    rgb = image[:, :, :3] if channels >= 3 else np.repeat(image[:, :, :1], 3, axis=2)
+    result = np.ones((*image.shape[:2], 4), dtype=np.float32)
+    result[:, :, :3] = linear_from_bytes(rgb)
+    if channels in (2, 4):
+        result[:, :, 3] = image[:, :, -1] / np.float32(255)
+    return result

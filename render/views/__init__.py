@@ -1,0 +1,1 @@
+"""Place cameras about an object, test visibility, compare silhouettes."""

@@ -1,0 +1,38 @@
+"""Which points the lens model can be trusted with."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.camera import Camera
+
+_STEPS = 24
+
+
+def within_lens_field(camera: Camera, normalized: FloatArray) -> npt.NDArray[np.bool_]:
+    """Say where the lens model still maps outer points farther out than inner ones.
+
+    A distortion polynomial turns back at some radius and from there on folds far-off directions
+    into the image. Points beyond are not seen by the camera, wherever the model puts them.
+
+    Parameters
+    ----------
+    camera : Camera
+    normalized : (n, 2) float
+        Normalised image coordinates, undistorted.
+
+    Returns
+    -------
+    (n,) bool
+        Whether the distorted radius grows all the way from the centre to the point.
+    """
+    if not camera.distortion:
+        return np.ones(len(normalized), dtype=bool)
+    share = np.linspace(0, 1, _STEPS + 1)
+    path = (normalized[:, None, :] * share[:, None]).reshape(-1, 2)
+    pixels = camera.pixels_from_normalized(path).reshape(len(normalized), _STEPS + 1, 2)
+    step = np.diff((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), axis=1)
+    growth = np.einsum("nsk,nk->ns", step, normalized)
+    return np.asarray((growth >= 0).all(axis=1))

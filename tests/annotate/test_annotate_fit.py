@@ -1,0 +1,342 @@
+"""The live alignment: what it says of the pairs, which contradict it, and what to mark next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cadalign import Alignment, Camera, fit
+from cadalign.annotate.advice import Advice, best_next, unknown_name, updated_variances
+from cadalign.annotate.alignment import Lens, LiveAlignment, align
+from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.prediction import projection_jacobian
+from cadalign.annotate.words import advice_text, facts_of, notes_of
+from cadalign.errors import InputError
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+
+KNOWN = FocalChoice(known=True)
+UNKNOWN = FocalChoice(known=False)
+LENS_CAMERA = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.2, 0.05, 0.003, -0.002))
+
+
+def problem_of(seed: int, points: int, *, noise_px: float = 1.0) -> Problem:
+    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
+
+
+def live_of(
+    problem: Problem, *, choice: FocalChoice = KNOWN, points_2d: np.ndarray | None = None
+) -> LiveAlignment:
+    return align(
+        problem.points_3d,
+        problem.points_2d if points_2d is None else points_2d,
+        None,
+        Lens(problem.camera, calibrated=True),
+        choice,
+    )
+
+
+# --- the alignment ---------------------------------------------------------------------------
+
+
+def test_is_what_fit_finds() -> None:
+    problem = problem_of(0, 9)
+    live = live_of(problem)
+    expected = fit(problem.points_3d, problem.points_2d, problem.camera)
+    assert live.result is not None
+    assert live.result.alignment == expected.alignment
+    assert not live.provisional
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (0, "4 more pairs to the first alignment"),
+        (2, "2 more pairs to the first alignment"),
+        (3, "1 more pair to the first alignment"),
+    ],
+)
+def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
+    problem = problem_of(0, 6)
+    few = Problem(
+        problem.points_3d[:points], problem.points_2d[:points], problem.camera, problem.alignment
+    )
+    live = live_of(few)
+    assert live.result is None
+    assert live.message == message
+
+
+def test_deviations_go_by_the_residuals() -> None:
+    problem = problem_of(3, 12, noise_px=8.0)
+    live = live_of(problem)
+    assert live.result is not None
+    assert live.cautious is not None
+    assert 4 < live.sigma < 14
+    np.testing.assert_allclose(live.cautious.covariance, live.result.covariance * live.sigma**2)
+    similar = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=None)
+    assert similar.sigma == pytest.approx(live.sigma, rel=1e-6)
+    assert live_of(problem_of(3, 12, noise_px=0.01)).sigma == 1.0
+
+
+def test_pairs_in_one_plane_give_a_provisional_alignment_that_says_so() -> None:
+    problem = problem_of(1, 6)
+    flat = problem.points_3d * [1, 1, 0]
+    points_2d = problem.camera.project(problem.alignment.apply(flat))
+    live = align(flat, points_2d, None, Lens(problem.camera, calibrated=True), KNOWN)
+    assert live.provisional
+    assert live.result is not None
+    assert live.message.startswith(
+        "Only a likely stretch is shown: the scale s_z is not determined"
+    )
+    assert live.message.endswith("Add a pair elsewhere.")
+
+
+def test_coinciding_pairs_give_no_alignment() -> None:
+    live = align(
+        np.zeros((5, 3)),
+        np.full((5, 2), 100.0),
+        None,
+        Lens(problem_of(0, 4).camera, calibrated=True),
+        KNOWN,
+    )
+    assert live.result is None
+    assert live.message.startswith("No alignment")
+
+
+def test_unknown_focal_length_is_estimated_from_the_fifth_pair_on() -> None:
+    problem = problem_of(5, 12, noise_px=0.3)
+    lens = Lens(problem.camera.with_focal(500.0), calibrated=False)
+    live = align(problem.points_3d, problem.points_2d, None, lens, UNKNOWN)
+    assert live.camera is not None
+    assert live.result is not None
+    expected = fit(
+        problem.points_3d, problem.points_2d, Camera.without_focal(640, 480), focal="estimate"
+    )
+    assert live.result.alignment == expected.alignment
+    assert live.camera == expected.camera
+    assert live.camera.fx == pytest.approx(150, rel=5 * expected.std.focal)
+    assert not live.provisional
+    four = align(problem.points_3d[:4], problem.points_2d[:4], None, lens, UNKNOWN)
+    assert four.provisional
+    assert four.camera == lens.camera
+    assert four.message == (
+        "With 4 pairs the focal length is assumed; the fifth pair begins to tell it."
+    )
+
+
+def test_typed_focal_length_is_used() -> None:
+    lens = Lens(LENS_CAMERA, calibrated=True)
+    assert lens.with_focal(FocalChoice(known=True, pixels=600.0)).fy == pytest.approx(620.0)
+    assert lens.with_focal(KNOWN) is LENS_CAMERA
+    written = lens.to_write(UNKNOWN)
+    assert not written.focal_known
+    assert (written.cx, written.cy, written.distortion) == (310.0, 250.0, LENS_CAMERA.distortion)
+    assert lens.to_write(KNOWN) is LENS_CAMERA
+
+
+# --- contradictions --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrong", [(4,), (0, 7), (1, 5, 9)])
+def test_wrong_pairs_are_named_with_how_far_they_are_off(wrong: tuple[int, ...]) -> None:
+    problem = problem_of(2, 14)
+    points_2d = problem.points_2d.copy()
+    for k, row in enumerate(wrong):
+        points_2d[row] += [(37, 5), (-30, 25), (10, -45)][k]
+    live = live_of(problem, points_2d=points_2d)
+    assert set(live.contradictions) == set(wrong)
+    true = np.linalg.norm(points_2d - problem.points_2d, axis=1)
+    for row in wrong:
+        assert live.contradictions[row] == pytest.approx(true[row], abs=12)
+
+
+@pytest.mark.parametrize("choice", [KNOWN, UNKNOWN])
+def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
+    suspected = 0
+    seeds = 60 if choice.known else 15
+    for seed in range(seeds):
+        for points, noise in ((6, 1.0), (10, 3.0), (20, 6.0)):
+            live = live_of(problem_of(seed, points, noise_px=noise), choice=choice)
+            suspected += len(live.contradictions)
+    assert suspected <= 0.005 * seeds * 36
+
+
+def test_one_wrong_pair_is_found_among_few() -> None:
+    found = alone = 0
+    for seed in range(40):
+        problem = problem_of(seed, 8)
+        points_2d = problem.points_2d.copy()
+        points_2d[3] += [0, 60]
+        contradictions = live_of(problem, points_2d=points_2d).contradictions
+        found += 3 in contradictions
+        alone += set(contradictions) == {3}
+    assert found >= 32
+    assert alone >= 30
+
+
+def test_too_few_pairs_accuse_nobody() -> None:
+    problem = problem_of(0, 5)
+    points_2d = problem.points_2d + [[90, 0], *[[0, 0]] * 4]
+    assert live_of(problem, points_2d=points_2d).contradictions == {}
+
+
+# --- the next keypoint -----------------------------------------------------------------------
+
+
+def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -> np.ndarray:
+    """The covariance of a fit to which the candidate was added, measured where it is predicted."""
+    pixel = result.camera.project(result.alignment.apply(candidate[None]))
+    again = fit(
+        np.vstack([problem.points_3d, candidate]),
+        np.vstack([problem.points_2d, pixel]),
+        problem.camera,
+        focal=focal,
+    )
+    assert again.covariance is not None
+    return again.covariance
+
+
+@pytest.mark.parametrize("focal", ["known", "estimate"])
+@given(st.integers(0, 10_000))
+@settings(max_examples=15)
+def test_advice_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
+    problem = problem_of(seed, 9, noise_px=0.5)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
+    assert result.covariance is not None
+    rng = np.random.default_rng(seed + 1)
+    candidates = rng.uniform(-1, 1, (6, 3))
+    candidates = candidates[result.alignment.apply(candidates)[:, 2] > 0.5]
+    brute = np.array([refitted(problem, result, point, focal).diagonal() for point in candidates])
+    predicted = updated_variances(
+        candidates, result.camera, result.alignment, result.covariance, sigma=1.0
+    )
+    np.testing.assert_allclose(predicted, brute, rtol=2e-3)
+    advice = best_next(candidates, result.camera, result.alignment, result.covariance, sigma=1.0)
+    assert advice is not None
+    column = brute[:, advice.unknown]
+    assert column[advice.row] <= column.min() * (1 + 5e-3)
+    assert advice.after < advice.before
+
+
+def test_advice_looks_at_the_least_known_unknown() -> None:
+    problem = problem_of(4, 10)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 1e-4, 0.04])
+    advice = best_next(problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0)
+    assert advice is not None
+    assert advice.unknown == 7
+    assert advice.before == pytest.approx(0.2)
+    distance = np.linalg.norm(result.alignment.translation)
+    covariance[5, 5] = (0.3 * distance) ** 2  # in shares of the distance
+    assert (
+        best_next(
+            problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0
+        ).unknown
+        == 5
+    )
+
+
+def test_equally_good_candidates_give_the_first() -> None:
+    problem = problem_of(4, 10)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    same = np.repeat(problem.points_3d[:1], 5, axis=0)
+    advice = best_next(same, problem.camera, result.alignment, result.covariance, sigma=1.0)
+    assert advice is not None
+    assert advice.row == 0
+    assert (
+        best_next(same[:0], problem.camera, result.alignment, result.covariance, sigma=1.0) is None
+    )
+    assert best_next(same, problem.camera, result.alignment, np.zeros((8, 8)), sigma=1.0) is None
+
+
+# --- derivatives -----------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20)
+def test_projection_jacobian_matches_differences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    pose = Alignment(rotation, [0.2, -0.3, 6.0], [1.0, *rng.uniform(0.6, 1.6, 2)])
+    points = rng.uniform(-1, 1, (5, 3))
+
+    def project(step: np.ndarray) -> np.ndarray:
+        x, y, z = step[:3]
+        turn = np.array([[1, -z, y], [z, 1, -x], [-y, x, 1.0]])
+        linear = turn @ pose.rotation * (pose.scale * np.exp([0, step[6], step[7]]))
+        camera = LENS_CAMERA.with_focal(LENS_CAMERA.fx * np.exp(step[8]))
+        return camera.project(points @ linear.T + pose.translation + step[3:6])
+
+    jacobian = projection_jacobian(points, LENS_CAMERA, pose, unknowns=9)
+    for unknown in range(9):
+        step = np.zeros(9)
+        step[unknown] = 1e-6
+        difference = (project(step) - project(-step)) / 2e-6
+        np.testing.assert_allclose(jacobian[:, :, unknown], difference, rtol=1e-5, atol=1e-4)
+    np.testing.assert_array_equal(
+        projection_jacobian(points, LENS_CAMERA, pose), jacobian[:, :, :8]
+    )
+
+
+def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
+    pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
+    with pytest.raises(InputError, match=r"^unknowns: 7 is neither 8 nor 9$"):
+        projection_jacobian(np.zeros((1, 3)), LENS_CAMERA, pose, unknowns=7)
+    with pytest.raises(InputError, match=r"^points_3d: a point lies behind the camera$"):
+        projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose)
+
+
+# --- words -----------------------------------------------------------------------------------
+
+
+def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
+    problem = problem_of(7, 15)
+    facts = {fact.label: fact for fact in facts_of(live_of(problem))}
+    assert list(facts) == [
+        "Stretch along y",
+        "Stretch along z",
+        "Rotation",
+        "Distance",
+        "Focal length",
+        "Pairs agree to",
+    ]
+    value, _, deviation = facts["Stretch along y"].value.partition(" ± ")
+    assert abs(float(value) - problem.alignment.scale[1]) < 5 * float(deviation)
+    longer = problem.alignment.scale[1] > 1
+    assert facts["Stretch along y"].note.endswith(
+        f"{'longer' if longer else 'shorter'} than the model"
+    )
+    assert facts["Focal length"].value == "150 px"
+    assert facts["Rotation"].value.startswith("known to ± ")
+    assert facts["Pairs agree to"].value.endswith(" px")
+    assert facts_of(LiveAlignment()) == ()
+
+
+def test_estimated_focal_length_has_a_deviation() -> None:
+    facts = {fact.label: fact for fact in facts_of(live_of(problem_of(7, 15), choice=UNKNOWN))}
+    assert " ± " in facts["Focal length"].value
+    assert facts["Focal length"].note == "estimated"
+
+
+def test_notes_name_alternatives_and_weak_stretches() -> None:
+    problem = problem_of(0, 4, noise_px=0.0)
+    notes = notes_of(live_of(problem))
+    assert any("one more pair tells them apart" in note for note in notes)
+    weak = problem_of(7, 12, noise_px=15.0)
+    assert any("is known only to ± " in note for note in notes_of(live_of(weak)))
+    assert notes_of(LiveAlignment(message="wait")) == ()
+
+
+def test_advice_names_point_and_gain() -> None:
+    assert advice_text(Advice(0, 7, 0.12, 0.034), "left arm") == (
+        "left arm: it would tell the stretch along z to ± 3.4 % instead of 12 %"
+    )
+    assert advice_text(Advice(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
+        "tip: it would tell the rotation to ± 0.5° instead of 4°"
+    )
+    assert unknown_name(8) == "the focal length"
+    assert unknown_name(6, "y") == "the stretch along x"

@@ -1,0 +1,620 @@
+"""A session without its page: every action, what is written, and what is found again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from annotating import Case, make_case, place, place_all, place_twenty
+from PIL import Image
+
+from cadalign import Camera, FitResult, fit
+from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.prepare import open_session
+from cadalign.annotate.session import Session
+from cadalign.annotate.state import state_of
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoints
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.io.observation import Observation
+
+# Down onto the seat, in the page's coordinates.
+FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
+
+
+@pytest.fixture(scope="module")
+def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return make_case(sample_root, tmp_path_factory.mktemp("annotate"))
+
+
+@pytest.fixture
+def case(original: Case, tmp_path: Path) -> Case:
+    """A copy in a folder of its own."""
+    return original.copied_to(tmp_path / "photos")
+
+
+def refusal(act: Callable[[], object]) -> str:
+    with pytest.raises(CadalignError) as error:
+        act()
+    return str(error.value)
+
+
+def comparable(state: dict[str, Any]) -> dict[str, Any]:
+    """A state without what a new session cannot know: undo, times, the pairs' own numbers."""
+    left_out = {"saved", "selected", "message", "can_undo", "can_redo"}
+    kept = {key: value for key, value in state.items() if key not in left_out}
+    kept["focal"] = {k: v for k, v in state["focal"].items() if k != "typed"}
+    kept["pairs"] = [{k: v for k, v in pair.items() if k != "pair"} for pair in state["pairs"]]
+    return json.loads(json.dumps(kept))
+
+
+# --- what is written -------------------------------------------------------------------------
+
+
+def test_nothing_is_written_before_anything_is_placed(case: Case) -> None:
+    before = sorted(case.folder.rglob("*"))
+    session = case.open()
+    state_of(session, 0)
+    assert sorted(case.folder.rglob("*")) == before
+
+
+def test_file_gives_the_same_alignment_as_the_page(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = place_all(case.open(), case)
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["alignment"] == state["alignment"]["alignment"]
+    written = FitResult.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    assert written.alignment.to_dict() == state["alignment"]["alignment"]
+    observation = Observation.load(case.observation)
+    assert observation.semantic_ids is not None
+    assert observation.semantic_ids.tolist() == case.instance.semantic_ids.tolist()
+    np.testing.assert_array_equal(observation.points_2d, case.instance.points_2d)
+    assert observation.camera == case.instance.camera
+    assert observation.image is not None
+    assert observation.model is not None
+    assert observation.image.resolve() == case.photo.resolve()
+    assert observation.model.resolve() == case.model.resolve()
+
+
+def test_every_change_is_on_disk_at_once_and_found_again(case: Case) -> None:
+    session = case.open()
+    ids = [keypoint for keypoint, _ in case.clicks]
+    actions: list[dict[str, Any]] = [
+        {"do": "place_uv", "uv": case.clicks[0][1]},
+        {"do": "place_keypoint", "keypoint": ids[0]},
+        {"do": "place_keypoint", "keypoint": ids[1]},
+        {"do": "place_uv", "uv": case.clicks[1][1]},
+        {"do": "pick", **FROM_ABOVE},
+        {"do": "rename", "pair": 1, "name": "the first"},
+        {"do": "move", "pair": 1, "uv": [5.25, 6.5]},
+        {"do": "release", "pair": 2},
+        {"do": "delete", "pair": 1},
+        {"do": "undo"},
+        {"do": "redo"},
+        {"do": "focal", "known": True, "pixels": 800},
+    ]
+    for action in actions:
+        session.act(0, action)
+        for keypoints in (case.keypoints, None):
+            again = case.open(keypoints=keypoints)
+            assert comparable(state_of(again, 0)) == comparable(state_of(session, 0)), action
+
+
+def test_unfinished_halves_have_a_file_of_their_own_while_there_are_any(case: Case) -> None:
+    session = case.open()
+    unfinished = case.folder / "photo.unfinished.json"
+    session.act(0, {"do": "place_uv", "uv": [10, 20]})
+    session.act(0, {"do": "place_uv", "uv": [30, 40]})
+    assert json.loads(unfinished.read_text())["pairs"] == [{"uv": [10, 20]}, {"uv": [30, 40]}]
+    session.act(0, {"do": "place_keypoint", "keypoint": 0})
+    assert json.loads(unfinished.read_text())["pairs"] == [{"uv": [30, 40]}]
+    session.act(0, {"do": "delete", "pair": 2})
+    assert not unfinished.exists()
+
+
+def test_all_pairs_can_be_deleted_and_the_camera_stays(case: Case) -> None:
+    session = case.open()
+    session.act(0, {"do": "place_uv", "uv": [10, 20]})
+    session.act(0, {"do": "focal", "known": True, "pixels": 700})
+    session.act(0, {"do": "delete", "pair": 1})
+    state = state_of(case.open(camera=None), 0)
+    assert state["pairs"] == []
+    assert state["focal"]["pixels"] == 700
+
+
+def test_fit_file_goes_with_the_alignment(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    file = case.folder / "photo_fit" / "fit.json"
+    assert file.exists()
+    for pair in (1, 2, 3):
+        session.act(0, {"do": "delete", "pair": pair})
+    assert not file.exists()
+
+
+def test_fit_file_waits_for_the_solvers(case: Case) -> None:
+    place_all(case.open(), case, count=7)
+    file = case.folder / "photo_fit" / "fit.json"
+    before = file.read_bytes()
+    unready = open_session(image=case.photo, model=case.model)
+    unready.act(0, {"do": "delete", "pair": 1})
+    assert file.read_bytes() == before
+    unready.warm_up()
+    state = state_of(unready, 0)
+    assert (
+        FitResult.from_json(file.read_text()).alignment.to_dict()
+        == (state["alignment"]["alignment"])
+    )
+    assert file.read_bytes() != before
+
+
+def test_fit_file_goes_when_ready_solvers_find_no_alignment(case: Case) -> None:
+    place_all(case.open(), case, count=6)
+    file = case.folder / "photo_fit" / "fit.json"
+    unready = open_session(image=case.photo, model=case.model)
+    for pair in (1, 2, 3):
+        unready.act(0, {"do": "delete", "pair": pair})
+    assert file.exists()
+    unready.warm_up()
+    assert not file.exists()
+
+
+def test_placed_points_are_written_with_face_and_barycentrics(case: Case) -> None:
+    session = case.open(keypoints=None)
+    session.act(0, {"do": "pick", **FROM_ABOVE})
+    session.act(0, {"do": "rename", "pair": 1, "name": "seat"})
+    written = ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json")
+    (point,) = written.keypoints
+    assert point.name == "seat"
+    assert point.face_index is not None
+    rebuilt = session.model.scene.mesh.surface_points([point.face_index], [point.barycentric])
+    np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-9)
+    session.act(0, {"do": "undo"})
+    assert ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json").keypoints == ()
+
+
+def test_trouble_with_saving_is_shown_and_nothing_is_lost(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = case.open()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.replace", full)
+        session.act(0, {"do": "place_uv", "uv": [10, 20]})
+    state = state_of(session, 0)
+    assert "No space left on device" in state["saved"]["trouble"]
+    assert len(state["pairs"]) == 1
+    assert not list(case.folder.glob(".unfinished-*"))
+    session.act(0, {"do": "place_uv", "uv": [30, 40]})
+    assert state_of(session, 0)["saved"]["trouble"] == ""
+    assert len(state_of(case.open(), 0)["pairs"]) == 2
+
+
+def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
+    instance = case.instance
+    count = len(instance.points_3d)
+    sigma, confidences = np.linspace(0.5, 3, count), np.linspace(0, 0.9, count)
+    names = tuple(f"detected {k}" for k in range(count))
+    Observation(
+        instance.points_3d,
+        instance.points_2d,
+        instance.camera,
+        sigma=sigma,
+        names=names,
+        confidences=confidences,
+    ).save(case.observation)
+    session = case.open()
+    expected = fit(instance.points_3d, instance.points_2d, instance.camera, sigma=sigma)
+    assert state_of(session, 0)["alignment"]["alignment"] == expected.alignment.to_dict()
+    session.act(0, {"do": "place_uv", "uv": [10, 20]})
+    session.act(0, {"do": "pick", **FROM_ABOVE})
+    written = Observation.load(case.observation)
+    assert written.sigma is not None
+    assert written.names is not None
+    assert written.confidences is not None
+    assert written.sigma.tolist() == [*sigma.tolist(), 1.0]
+    assert written.names[:-1] == names
+    assert written.confidences.tolist() == [*confidences.tolist(), 1.0]
+
+
+# --- actions ---------------------------------------------------------------------------------
+
+
+def test_suggested_point_becomes_the_pairs_model_half(case: Case) -> None:
+    session = case.open()
+    state = place_all(session, case, count=6)
+    suggestion = state["suggestion"]
+    assert suggestion["keypoint"] not in {pair["keypoint"] for pair in state["pairs"]}
+    outcome = session.act(0, {"do": "suggested"})
+    assert session.slides[0].document.pair(outcome.selected).keypoint == suggestion["keypoint"]
+
+
+def test_corners_of_the_surface_are_suggested_where_no_keypoint_is_left(case: Case) -> None:
+    session = case.open(keypoints=None)
+    given = {point.semantic_id: point for point in ModelKeypoints.load(case.keypoints).keypoints}
+    for keypoint, uv in case.clicks:
+        place(session, session.book.add(given[keypoint]), uv)
+    suggestion = state_of(session, 0)["suggestion"]
+    assert suggestion is not None
+    assert suggestion["keypoint"] is None
+    before = len(session.book)
+    session.act(0, {"do": "suggested"})
+    assert len(session.book) == before + 1
+
+
+def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> None:
+    session = case.open()
+    model, book = session.model, session.book
+    xyz = np.array(book[0].xyz)
+    outwards = xyz - model.center
+    front = model.to_display(xyz + 3 * outwards)
+    back = model.to_display(xyz - 6 * outwards)
+    if not model.is_seen(model.from_display(front), xyz):
+        pytest.skip("the keypoint is not seen from outside")
+    ray = {"origin": front.tolist(), "direction": (-outwards).tolist(), "near": 0}
+    session.act(0, {"do": "pick", **ray})
+    assert session.slides[0].document.pairs[0].keypoint == 0
+    session.act(0, {"do": "undo"})
+    ray = {"origin": back.tolist(), "direction": outwards.tolist(), "near": 0}
+    session.act(0, {"do": "pick", **ray})
+    assert 0 not in session.slides[0].document.keypoints
+
+
+def test_click_beside_the_model_says_so_and_changes_nothing(case: Case) -> None:
+    session = case.open()
+    outcome = session.act(0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
+    assert outcome.message == "That click missed the model."
+    assert not session.slides[0].history.can_undo
+
+
+def test_contradicting_pair_is_marked(case: Case) -> None:
+    session = case.open()
+    for row, (keypoint, (u, v)) in enumerate(case.clicks):
+        place(session, keypoint, [u + (45 if row == 4 else 0), v])
+    marked = {
+        pair["position"]: pair["off"] for pair in state_of(session, 0)["pairs"] if pair["off"]
+    }
+    assert list(marked) == [5]
+    assert marked[5] == pytest.approx(45, abs=15)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ({}, "do: None is not an action; known are place_uv, "),
+        ({"do": "__init__"}, "do: '__init__' is not an action; "),
+        ({"do": ["undo"]}, "do: ['undo'] is not an action; "),
+        ({"do": "place_uv"}, "uv: shape (), expected (2)"),
+        ({"do": "place_uv", "uv": [1, "x"]}, "uv: not an array of numbers"),
+        ({"do": "place_uv", "uv": [1, 2, 3]}, "uv: shape (3,), expected (2)"),
+        ({"do": "place_uv", "uv": [1, float("nan")]}, "uv: NaN or infinite values"),
+        ({"do": "place_uv", "uv": [-1, 2]}, "uv: (-1.0, 2.0) is outside the photo"),
+        ({"do": "place_uv", "uv": [1, 2], "pair": "1"}, "pair: '1' is not a whole number"),
+        ({"do": "place_keypoint", "keypoint": 999}, "keypoint: there is no keypoint 999"),
+        ({"do": "pick", "origin": [0, 0, 1], "direction": [0, 0, 0]}, "direction: is zero"),
+        ({"do": "pick", "origin": [0, 0], "direction": [0, 0, 1]}, "origin: shape (2,)"),
+        ({"do": "suggested"}, "suggestion: there is none; place more pairs"),
+        ({"do": "move", "pair": 7, "uv": [1, 2]}, "pair: there is no pair 7; reload the page"),
+        ({"do": "delete", "pair": None}, "pair: None is not a whole number"),
+        ({"do": "rename", "pair": 7, "name": "x"}, "pair: there is no pair 7"),
+        ({"do": "focal", "known": 1}, "known: 1 is neither true nor false"),
+        ({"do": "focal", "known": True, "pixels": 0}, "pixels: 0 px is no focal length of this"),
+        ({"do": "focal", "known": True, "pixels": "x"}, "pixels: not an array of numbers"),
+    ],
+)
+def test_bad_actions_are_refused_and_change_nothing(
+    original: Case, action: dict[str, Any], message: str
+) -> None:
+    session = open_session(image=original.photo, model=original.model, keypoints=original.keypoints)
+    assert refusal(lambda: session.act(0, action)).startswith(message)
+    assert session.slides[0].document.pairs == ()
+    assert not original.observation.exists()
+
+
+def test_unknown_photo_is_refused(original: Case) -> None:
+    session = open_session(image=original.photo, model=original.model)
+    assert refusal(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
+    assert refusal(lambda: state_of(session, -1)) == "image: there is no photo 0"
+
+
+def test_name_needs_a_model_point(case: Case) -> None:
+    session = case.open()
+    session.act(0, {"do": "place_uv", "uv": [1, 2]})
+    act = {"do": "rename", "pair": 1, "name": "x"}
+    assert refusal(lambda: session.act(0, act)) == "pair: this pair has no model point yet"
+
+
+# --- focal length ----------------------------------------------------------------------------
+
+
+def test_without_a_camera_the_focal_length_is_estimated_and_the_file_says_so(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = case.open(camera=None)
+    state = place_all(session, case)
+    assert not state["focal"]["known"]
+    true = case.instance.camera.fx
+    result = session.live(session.slides[0])[0].result
+    assert result is not None
+    assert abs(state["alignment"]["focal"] / true - 1) < 5 * result.std.focal
+    camera = Observation.load(case.observation).camera
+    assert not camera.focal_known
+    assert not state_of(case.open(camera=None), 0)["focal"]["known"]
+    command = ["fit", str(case.observation), "--focal", "estimate", "--json"]
+    assert main([*command, "--out", str(case.folder / "x")]) == 0
+    assert json.loads(capsys.readouterr().out)["alignment"] == state["alignment"]["alignment"]
+
+
+def test_focal_length_can_be_said_to_be_known_and_not(case: Case) -> None:
+    session = case.open()
+    known = place_all(session, case)
+    session.act(0, {"do": "focal", "known": False})
+    estimated = state_of(session, 0)
+    assert estimated["alignment"]["focal"] != known["alignment"]["focal"]
+    assert case.open().slides[0].document.focal.known is False  # the file says so
+    session.act(0, {"do": "focal", "known": True})
+    assert state_of(session, 0)["alignment"]["focal"] == case.instance.camera.fx
+    session.act(0, {"do": "undo"})
+    assert state_of(session, 0)["alignment"]["focal"] == estimated["alignment"]["focal"]
+
+
+def test_camera_of_an_observation_is_used(case: Case) -> None:
+    instance = case.instance
+    Observation(instance.points_3d, instance.points_2d, instance.camera).save(case.observation)
+    state = state_of(case.open(camera=None), 0)
+    assert state["focal"]["known"]
+    assert state["focal"]["pixels"] == instance.camera.fx
+    assert len(state["pairs"]) == len(instance.points_3d)
+
+
+def exif_photo(path: Path, *, orientation: int = 1, focal_35mm: int | None = None) -> None:
+    """A photo whose left half is red, stored as its EXIF orientation says."""
+    pixels = np.zeros((300, 400, 3), dtype=np.uint8)
+    pixels[:, :200, 0] = 250
+    image = Image.fromarray(pixels)
+    turns = {6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
+    if orientation in turns:
+        image = image.transpose(turns[orientation])
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    if focal_35mm is not None:
+        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+    image.save(path, exif=exif, quality=95)
+
+
+def test_exif_focal_length_is_a_hint(case: Case) -> None:
+    photo = case.folder / "exif.jpg"
+    exif_photo(photo, focal_35mm=50)
+    state = state_of(case.open(camera=None, image=photo), 0)
+    # 50 mm on a film of 43.27 mm diagonal; the photo's diagonal is 500 px.
+    assert state["focal"]["pixels"] == pytest.approx(50 / 43.2666 * 500, rel=0.01)
+    assert state["focal"]["note"].startswith("The photo's EXIF data say about 578 px")
+    assert not state["focal"]["known"]
+
+
+def test_exif_focal_length_of_zero_is_ignored(case: Case) -> None:
+    photo = case.folder / "exif.jpg"
+    exif_photo(photo, focal_35mm=0)
+    state = state_of(case.open(camera=None, image=photo), 0)
+    assert state["focal"]["note"] == ""
+
+
+# --- photos ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("orientation", [1, 6, 8])
+def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> None:
+    path = case.folder / "turned.jpg"
+    exif_photo(path, orientation=orientation)
+    photo = Photo.open(path)
+    assert (photo.width, photo.height) == (400, 300)
+    kind, data = photo.encoded()
+    assert kind == "image/jpeg"
+    (case.folder / "shown.jpg").write_bytes(data)
+    shown = np.asarray(Image.open(case.folder / "shown.jpg"))
+    assert shown.shape == (300, 400, 3)
+    assert shown[150, 50, 0] > 200
+    assert shown[150, 350, 0] < 50
+    assert (orientation == 1) == (data == path.read_bytes())
+    session = case.open(camera=None, image=path)
+    place_keypoint = {"do": "place_keypoint", "keypoint": 0}
+    session.act(0, {"do": "place_uv", "uv": [390, 10]})
+    session.act(0, place_keypoint)
+    camera = Observation.load(case.folder / "turned.json").camera
+    assert (camera.width, camera.height) == (400, 300)
+
+
+def test_orientation_that_does_not_exist_is_ignored(case: Case) -> None:
+    path = case.folder / "odd.jpg"
+    exif_photo(path, orientation=99)
+    assert Photo.open(path).orientation == 1
+
+
+def test_what_is_not_a_photo_is_refused(case: Case) -> None:
+    text = case.folder / "text.jpg"
+    text.write_text("no photo")
+    assert refusal(lambda: case.open(image=text)).startswith(
+        f"{text}: not an image that can be read ("
+    )
+    cut = case.folder / "cut.png"
+    cut.write_bytes(case.photo.read_bytes()[:3000])
+    assert refusal(lambda: case.open(image=cut, camera=None)).startswith(
+        f"{cut}: not an image that can be read ("
+    )
+    missing = case.folder / "none.png"
+    assert refusal(lambda: case.open(image=missing)) == f"{missing}: no such file or folder"
+    assert refusal(lambda: case.open(model=missing.with_suffix(".obj"))).endswith(
+        "no such mesh file"
+    )
+
+
+def test_photo_and_camera_must_have_the_same_size(case: Case) -> None:
+    case.camera.write_text(json.dumps(Camera.from_fov(100, 80, fov_x=50).to_dict()))
+    assert refusal(case.open) == (
+        f"{case.photo}: the photo is 640 x 480, the camera 100 x 80; give the camera of this photo"
+    )
+
+
+def test_camera_file_is_checked(case: Case) -> None:
+    case.camera.write_text('{"params": [1]}')
+    assert refusal(case.open).startswith(f"{case.camera}: camera: missing model, width, height")
+
+
+def test_photos_of_a_folder_come_in_turn_each_with_its_file(
+    case: Case, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("b.png", "a.jpg", "b.jpg"):
+        Image.open(case.photo).convert("RGB").save(case.folder / name)
+    (case.folder / "broken.png").write_text("no photo")
+    out = case.folder / "out"
+    out.mkdir()
+    session = case.open(image=case.folder, out=out)
+    names = [slide.photo.path.name for slide in session.slides]
+    assert names == ["a.jpg", "b.jpg", "b.png", "photo.png"]
+    assert "left out: " in caplog.text
+    assert "broken.png" in caplog.text
+    for number in range(4):
+        place(session, number, [10.0 * number, 5], image=number)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "a.json",
+        "b.jpg.json",
+        "b.png.json",
+        "photo.json",
+        "sample_chair_000.keypoints.json",
+    ]
+    assert Observation.load(out / "b.png.json").points_2d.tolist() == [[20, 5]]
+    state = state_of(session, 2)
+    assert (state["image"]["number"], state["image"]["count"], state["image"]["name"]) == (
+        2,
+        4,
+        "b.png",
+    )
+
+
+def test_folder_without_photos_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"there are no photos in this folder; photos end in .bmp"):
+        find_photos(tmp_path)
+    (tmp_path / "x.png").write_text("no photo")
+    with pytest.raises(DataError, match=r"none of its photos can be read$"):
+        open_session(image=tmp_path, model=tmp_path / "m.ply")
+
+
+def test_observation_goes_with_one_photo(case: Case) -> None:
+    assert refusal(lambda: case.open(image=case.folder, observation=case.observation)) == (
+        "--observation: names the file of a single photo; "
+        "with a folder of photos, or --out, leave it away"
+    )
+
+
+# --- files that are there already ------------------------------------------------------------
+
+
+def test_files_of_others_are_never_overwritten(case: Case) -> None:
+    case.observation.write_text('{"images": []}')
+    assert refusal(case.open).startswith(f"{case.observation}: top level: unknown field 'images'")
+    assert case.observation.read_text() == '{"images": []}'
+    case.observation.unlink()
+    unfinished = case.folder / "photo.unfinished.json"
+    unfinished.write_text('{"pairs": []}')
+    assert refusal(case.open) == (
+        f"{unfinished}: not a file of cadalign unfinished pairs; delete it to go on without"
+    )
+
+
+def test_observation_of_another_model_is_refused(case: Case) -> None:
+    instance = case.instance
+    Observation(
+        instance.points_3d, instance.points_2d, instance.camera, model=case.folder / "table.ply"
+    ).save(case.observation)
+    assert refusal(case.open) == (
+        f"{case.observation}: belongs to the model table.ply, not sample_chair_000.ply; "
+        "give another --observation or --out"
+    )
+
+
+def namesake(case: Case) -> Path:
+    """Another model whose file has the same name."""
+    other = case.folder / "other" / case.model.name
+    other.parent.mkdir()
+    shutil.copy(case.model, other)
+    return other
+
+
+def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
+    place_all(case.open(), case)
+    other = namesake(case)
+    book = case.folder / "sample_chair_000.keypoints.json"
+    kept = case.observation.read_bytes(), book.read_bytes()
+    ours = f"belongs to the model {case.model.resolve()}, not {other.resolve()}; "
+    advice = "give another --observation or --out"
+    assert refusal(lambda: case.open(model=other)) == f"{book}: {ours}{advice}"
+    assert (case.observation.read_bytes(), book.read_bytes()) == kept
+    book.unlink()  # the observation is refused without its help
+    assert refusal(lambda: case.open(model=other)) == f"{case.observation}: {ours}{advice}"
+    assert case.observation.read_bytes() == kept[0]
+    state_of(case.open(), 0)
+
+
+def test_halves_of_pairs_of_a_namesake_are_refused(case: Case) -> None:
+    case.open().act(0, {"do": "place_keypoint", "keypoint": 0})
+    (case.folder / "sample_chair_000.keypoints.json").unlink()
+    other = namesake(case)
+    assert refusal(lambda: case.open(model=other)).startswith(
+        f"{case.observation}: belongs to the model {case.model.resolve()}, not "
+    )
+
+
+def test_model_reached_by_another_way_is_the_same(case: Case) -> None:
+    place_all(case.open(), case, count=6)
+    link = case.folder / "link"
+    link.symlink_to(case.model.parent)
+    session = case.open(model=link / case.model.name)
+    assert len(session.slides[0].document.complete_pairs) == 6
+
+
+def test_given_keypoints_without_ids_all_come(case: Case) -> None:
+    given = ModelKeypoints.load(case.keypoints).keypoints
+    bare = tuple(replace(point, semantic_id=None) for point in given)
+    ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
+    session = case.open()
+    assert [point.name for _, point in session.book] == [point.name for point in given]
+    assert len(session.book.given) == len(given)
+
+
+def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
+    ids = [keypoint for keypoint, _ in case.clicks]
+    places = {p.semantic_id: p.xyz for p in ModelKeypoints.load(case.keypoints).keypoints}
+    points = np.array([places[keypoint] for keypoint in ids])
+    points[0] += 0.01  # no keypoint is here
+    Observation(points, case.instance.points_2d, case.instance.camera).save(case.observation)
+    session = case.open()
+    keypoints = [pair.keypoint for pair in session.slides[0].document.pairs]
+    assert keypoints[1:] == ids[1:]
+    assert keypoints[0] not in session.book.given
+
+
+def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:
+    session = open_session(image=case.photo, model=case.model, camera=case.camera)
+    assert isinstance(session, Session)
+    state = state_of(session, 0)
+    assert state["alignment"]["status"] == "preparing"
+    session.warm_up()
+    assert state_of(session, 0)["alignment"]["status"] == "none"
+
+
+def test_state_of_twenty_pairs_is_plain_data(case: Case) -> None:
+    session = case.open()
+    place_twenty(session, case)
+    assert len(session.slides[0].document.complete_pairs) == 20
+    json.dumps(state_of(session, 0), allow_nan=False)

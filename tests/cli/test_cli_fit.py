@@ -1,0 +1,296 @@
+"""`cadalign fit`: what it prints and writes, and one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign import FitResult, fit
+from cadalign.cli import main
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.io.observation import Observation
+
+PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+
+
+def write_observation(path: Path, problem: Problem = PROBLEM, **fields: Any) -> Path:
+    Observation(problem.points_3d, problem.points_2d, problem.camera, **fields).save(path)
+    return path
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    return path
+
+
+def colors_in(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return picture[..., ::-1].reshape(-1, 3).astype(int)
+
+
+def has_color(path: Path, color: tuple[int, int, int]) -> bool:
+    return bool((np.abs(colors_in(path) - color).max(axis=1) < 12).any())
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run a command that is to be refused; its one line on standard error."""
+    assert main(list(arguments)) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("cadalign: ")
+    assert captured.err.count("\n") == 1
+    assert captured.err.endswith("\n")
+    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
+
+
+# --- what it does ----------------------------------------------------------------------------
+
+
+def test_prints_the_summary_and_writes_fit_and_overlay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path)]) == 0
+    captured = capsys.readouterr()
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera)
+    assert captured.out == f"{expected}\n"
+    out = tmp_path / "chair_fit"
+    assert sorted(entry.name for entry in out.iterdir()) == ["fit.json", "overlay.png"]
+    written = FitResult.from_json((out / "fit.json").read_text())
+    assert written.alignment == expected.alignment
+    assert str(written) == str(expected)
+    overlay = cv2.imread(str(out / "overlay.png"))
+    assert overlay.shape == (480, 640, 3)
+    assert has_color(out / "overlay.png", (240, 50, 50))  # the predicted box
+
+
+def test_json_goes_to_standard_output_and_nothing_else_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path), "--json", "--out", str(tmp_path / "out")]) == 0
+    captured = capsys.readouterr()
+    data = json.loads(captured.out)
+    assert data == json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert data["method"] == "optimal"
+    assert len(data["residuals"]) == 10
+
+
+def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path), "--method", "aepnp"]) == 0
+    assert capsys.readouterr().out.startswith("aepnp: 10 keypoints, rms ")
+
+
+def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sigma = np.linspace(0.2, 5, 10)
+    path = write_observation(tmp_path / "chair.json", sigma=sigma)
+    assert main(["fit", str(path)]) == 0
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, sigma=sigma)
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
+    blue = np.full((480, 640, 3), (200, 90, 40), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), blue)
+    (tmp_path / "model.obj").write_text(TETRAHEDRON)
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
+    edit(path, lambda data: data.update(model="model.obj"))
+    assert main(["fit", str(path)]) == 0
+    picture = tmp_path / "chair_fit" / "overlay.png"
+    assert has_color(picture, (40, 90, 200))
+    assert has_color(picture, (240, 50, 50))
+
+
+# --- what it refuses -------------------------------------------------------------------------
+
+
+def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "nothing.json"
+    assert refusal(capsys, "fit", str(path)) == f"{path}: no such file"
+
+
+def test_malformed_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "chair.json"
+    path.write_text('{"camera": \n {"model": }')
+    assert refusal(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
+
+
+def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
+    assert refusal(capsys, "fit", str(path)) == (
+        f"{path}: keypoints[4].uv: NaN or infinite values in row 0; remove or repair these"
+    )
+
+
+def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
+    assert refusal(capsys, "fit", str(path)) == (
+        f"{path}: keypoints[4].uv: shape (3,), expected (2)"
+    )
+
+
+def test_camera_without_focal_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    edit(path, lambda data: data["camera"].update(params=[0, 150, 320, 240]))
+    assert refusal(capsys, "fit", str(path)) == (
+        f"{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels"
+    )
+
+
+def first_of(count: int) -> Problem:
+    points_3d, points_2d = PROBLEM.points_3d[:count], PROBLEM.points_2d[:count]
+    return Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
+
+
+@pytest.mark.parametrize(
+    ("method", "count", "text"),
+    [
+        (
+            "optimal",
+            3,
+            "points_3d: 3 keypoints are too few for 8 unknowns; "
+            "give at least 4, fewer unknowns by stretch=, or a prior",
+        ),
+        (
+            "aepnp",
+            5,
+            "points_3d: 5 keypoints are too few for the method 'aepnp'; give at least 6",
+        ),
+    ],
+)
+def test_too_few_keypoints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, count: int, text: str
+) -> None:
+    path = write_observation(tmp_path / "chair.json", first_of(count))
+    assert refusal(capsys, "fit", str(path), "--method", method) == text
+
+
+def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points_3d = PROBLEM.points_3d.copy()
+    points_3d[:, 2] = 0.1
+    points_2d = PROBLEM.camera.project(PROBLEM.alignment.apply(points_3d))
+    flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
+    path = write_observation(tmp_path / "chair.json", flat)
+    assert refusal(capsys, "fit", str(path), "--method", "aepnp") == (
+        "points_3d: the points lie in the plane z = 0.1; "
+        "a linear solver needs keypoints that span a volume"
+    )
+    assert refusal(capsys, "fit", str(path)) == (
+        "points_3d: the scale s_z is not determined: the points lie in the plane z = 0.1; "
+        "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+    )
+
+
+def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert refusal(capsys, "fit", str(path), "--method", "best") == (
+        "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+    )
+
+
+def test_missing_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
+    assert refusal(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
+
+
+def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((10, 20, 3), dtype=np.uint8))
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
+    assert refusal(capsys, "fit", str(path)) == (
+        f"{tmp_path / 'photo.png'}: the image is 20 x 10, the camera 640 x 480; "
+        "give the camera of this image"
+    )
+
+
+def test_photo_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "photo.png").write_text("not a picture")
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
+    assert refusal(capsys, "fit", str(path)).startswith(
+        f"{tmp_path / 'photo.png'}: not an image that can be read ("
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (None, "no such mesh file"),
+        ("", "the mesh file is empty; get it again"),
+        (TETRAHEDRON[:34], None),
+        (TETRAHEDRON.replace("f 2 3 4", "f 2 3 9"), None),
+    ],
+    ids=["missing", "empty", "cut short", "damaged"],
+)
+def test_model_that_cannot_be_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str | None, text: str | None
+) -> None:
+    model = tmp_path / "model.obj"
+    if content is not None:
+        model.write_text(content)
+    path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
+    line = refusal(capsys, "fit", str(path))
+    assert line.startswith(str(model))
+    if text is not None:
+        assert line == f"{model}: {text}"
+
+
+def test_output_folder_that_cannot_be_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    (tmp_path / "out").write_text("a file in the way")
+    line = refusal(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
+    assert line == f"{tmp_path / 'out'}: cannot be made (File exists); choose another --out"
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fit"], ["fit", "a.json", "--nonsense"], ["align", "a.json"]]
+)
+def test_wrong_command_lines_exit_with_2(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_help_exits_with_0(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["fit", "--help"])
+    assert caught.value.code == 0
+    assert "--method" in capsys.readouterr().out
+
+
+# --- as a process ----------------------------------------------------------------------------
+
+
+def run_process(*arguments: str) -> subprocess.CompletedProcess[str]:
+    program = Path(sys.executable).with_name("cadalign")
+    command = [str(program), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_installed_command_runs_and_refuses(tmp_path: Path) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    done = run_process("fit", str(path), "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["method"] == "optimal"
+    refused = run_process("fit", str(tmp_path / "nothing.json"))
+    assert refused.returncode == 1
+    assert refused.stdout == ""
+    assert refused.stderr == f"cadalign: {tmp_path / 'nothing.json'}: no such file\n"

@@ -1,0 +1,243 @@
+"""From a detector's file and a photo to an alignment: `cadalign observe`, then `cadalign fit`."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cadalign import Alignment, Camera, FitResult, FocalPrior, fit
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign.evaluation.simulation.problems import Problem, random_rotation
+from cadalign.io.observation import Observation
+
+TRUE = Camera(640, 480, 620.0, 620.0, 319.5, 239.5)
+ALIGNMENT = Alignment(random_rotation(np.random.default_rng(5)), [0.1, -0.2, 4.0], [1, 1.3, 0.8])
+POINTS_3D = np.random.default_rng(1).uniform(-1, 1, (24, 3)) / ALIGNMENT.scale
+POINTS_2D = TRUE.project(ALIGNMENT.apply(POINTS_3D)) + np.random.default_rng(2).normal(
+    scale=0.3, size=(24, 2)
+)
+PROBLEM = Problem(POINTS_3D, POINTS_2D, TRUE, ALIGNMENT)
+NAMES = [f"corner {n}" for n in range(24)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A photo with EXIF, a detector's file, and the model's keypoints."""
+    photo = Image.new("RGB", (480, 640), (90, 120, 150))
+    exif = photo.getexif()
+    exif[0x0112] = 6  # held upright, stored on its side: 640 x 480 when turned
+    exif.get_ifd(0x8769)[0xA405] = 34
+    photo.save(tmp_path / "photo.jpg", exif=exif)
+    scores = np.random.default_rng(0).uniform(0.3, 1, 24)
+    flat = np.column_stack([POINTS_2D, scores]).ravel().tolist()
+    (tmp_path / "found.json").write_text(
+        json.dumps([{"image_id": 1, "category_id": 1, "keypoints": flat, "score": 0.9}])
+    )
+    rows = zip(NAMES, POINTS_3D.tolist(), strict=True)
+    ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in rows)).save(
+        tmp_path / "model.keypoints.json"
+    )
+    return tmp_path
+
+
+def observe(folder: Path, *options: str) -> int:
+    return main(
+        ["observe", str(folder / "found.json"), str(folder / "model.keypoints.json"), *options]
+    )
+
+
+def refusal(capsys: pytest.CaptureFixture[str], run: Callable[[], int]) -> str:
+    """What is to be refused; its one line on standard error."""
+    assert run() == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
+
+
+def fitted(folder: Path, name: str, *options: str) -> FitResult:
+    assert main(["fit", str(folder / f"{name}.json"), *options]) == 0
+    return FitResult.from_json((folder / f"{name}_fit" / "fit.json").read_text())
+
+
+def test_photo_and_detection_become_an_observation(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert observe(folder, "--image", str(folder / "photo.jpg")) == 0
+    out = folder / "found.observation.json"
+    assert capsys.readouterr().out == f"24 of 24 keypoints: {out}\n"
+    observation = Observation.load(out)
+    assert observation.camera == Camera.without_focal(640, 480)
+    assert observation.names == tuple(NAMES)
+    np.testing.assert_allclose(observation.points_2d, POINTS_2D)
+    assert observation.confidences is not None
+    assert observation.confidences.min() >= 0.3
+    assert observation.image == folder / "photo.jpg"
+    assert json.loads(out.read_text())["image"] == "photo.jpg"
+
+
+def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    observe(folder, "--image", str(folder / "photo.jpg"))
+    capsys.readouterr()
+    result = fitted(folder, "found.observation")
+    captured = capsys.readouterr()
+    focal = 34 / np.hypot(36, 24) * 800
+    assert f"Focal length by the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
+    assert "  focal length " in captured.out
+    prior = FocalPrior.from_exif(folder / "photo.jpg")
+    expected = fit(
+        POINTS_3D, POINTS_2D, Camera.without_focal(640, 480), focal="estimate", focal_prior=prior
+    )
+    assert result.camera.fx == pytest.approx(expected.camera.fx, rel=1e-9)
+    assert result.camera.fx == pytest.approx(620, rel=0.03)
+    assert result.focal_prior == prior
+    without = fitted(folder, "found.observation", "--no-exif")
+    assert without.focal_prior is None
+    assert without.std is not None
+    assert result.std is not None
+    assert without.std.focal > result.std.focal
+
+
+def test_exif_that_lies_is_ignored_with_a_warning(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    photo = Image.new("RGB", (640, 480))
+    exif = photo.getexif()
+    exif.get_ifd(0x8769)[0x920A] = 0.0
+    photo.save(folder / "photo.jpg", exif=exif)
+    observe(folder, "--image", str(folder / "photo.jpg"))
+    with caplog.at_level(logging.WARNING, logger="cadalign"):
+        result = fitted(folder, "found.observation")
+    assert result.focal_prior is None
+    assert result.camera.fx == pytest.approx(620, rel=0.1)
+    (record,) = caplog.records
+    assert record.getMessage() == (
+        f"{folder / 'photo.jpg'}: the EXIF data state FocalLength 0.0; ignored"
+    )
+
+
+def test_known_focal_length_can_be_estimated_all_the_same(folder: Path) -> None:
+    wrong = TRUE.with_focal(900.0)
+    Observation(POINTS_3D, POINTS_2D, wrong).save(folder / "known.json")
+    assert fitted(folder, "known").camera == wrong
+    estimated = fitted(folder, "known", "--focal", "estimate", "--json")
+    assert estimated.camera.fx == pytest.approx(620, rel=0.1)
+    assert estimated.covariance is not None
+    assert estimated.covariance.shape == (9, 9)
+
+
+def test_robust_fit_draws_by_the_scores(folder: Path) -> None:
+    points_2d = POINTS_2D.copy()
+    points_2d[:8] += 60.0
+    scores = np.where(np.arange(24) < 8, 0.1, 0.9)
+    camera = Camera.without_focal(640, 480)
+    Observation(POINTS_3D, points_2d, camera, confidences=scores).save(folder / "spoiled.json")
+    result = fitted(folder, "spoiled", "--robust")
+    assert result.inliers.tolist() == [False] * 8 + [True] * 16
+    assert result.camera.fx == pytest.approx(620, rel=0.1)
+
+
+def test_scores_can_weigh_instead(folder: Path) -> None:
+    observe(
+        folder, "--image", str(folder / "photo.jpg"), "--weigh", "--sigma", "2", "--min-score", ".5"
+    )
+    observation = Observation.load(folder / "found.observation.json")
+    assert observation.confidences is None
+    assert observation.sigma is not None
+    assert observation.sigma.min() >= 2.0
+    assert observation.sigma.max() <= 4.0
+    assert len(observation.points_2d) < 24
+
+
+def test_camera_can_be_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
+    out = folder / "elsewhere" / "a.json"
+    assert observe(folder, "--camera", str(folder / "camera.json"), "--out", str(out)) == 0
+    assert Observation.load(out).camera == TRUE
+
+
+def test_csv_goes_the_same_way(folder: Path) -> None:
+    lines = [f"{n},{u!r},{v!r}" for n, (u, v) in zip(NAMES, POINTS_2D.tolist(), strict=True)]
+    (folder / "found.csv").write_text("name,u,v\n" + "\n".join(reversed(lines)) + "\ntail,1,2\n")
+    arguments = [
+        "observe",
+        str(folder / "found.csv"),
+        str(folder / "model.keypoints.json"),
+        "--image",
+        str(folder / "photo.jpg"),
+    ]
+    assert main(arguments) == 1
+    assert main([*arguments, "--ignore-unknown"]) == 0
+    observation = Observation.load(folder / "found.observation.json")
+    np.testing.assert_allclose(observation.points_3d, POINTS_3D[::-1])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ([], "{folder}/found.json: [0]: the photo's size is not known; give --image or --camera"),
+        (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
+        (
+            ["--image", "{folder}/found.json"],
+            "{folder}/found.json: not an image that can be read (",
+        ),
+        (["--camera", "{folder}/none.json"], "{folder}/none.json: no such file"),
+        (
+            ["--camera", "{folder}/found.json"],
+            "{folder}/found.json: camera: expected an object, got list",
+        ),
+        (["--image", "{folder}/photo.jpg", "--object", "3"], "number: object 3 of 1; "),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
+) -> None:
+    given = [option.format(folder=folder) for option in options]
+    line = refusal(capsys, lambda: observe(folder, *given))
+    assert line.startswith(text.format(folder=folder))
+
+
+def test_observation_of_an_upright_photo_is_drawn_upright(folder: Path) -> None:
+    observe(folder, "--image", str(folder / "photo.jpg"))
+    fitted(folder, "found.observation")
+    with Image.open(folder / "found.observation_fit" / "overlay.png") as overlay:
+        assert overlay.size == (640, 480)
+
+
+def test_unknown_focal_length_survives_the_file(tmp_path: Path) -> None:
+    lens: Any = (-0.1, 0.02, 0.0, 0.0)
+    for camera in (
+        Camera.without_focal(640, 480),
+        Camera.without_focal(640, 480, cx=300.25, cy=251.5, distortion=lens),
+    ):
+        Observation(POINTS_3D, POINTS_2D, camera).save(tmp_path / "a.json")
+        assert Observation.load(tmp_path / "a.json").camera == camera
+    data = json.loads((tmp_path / "a.json").read_text())
+    assert data["camera"]["params"][:2] == [None, None]
+    data["camera"] = {"width": 640, "height": 480}
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    assert Observation.load(tmp_path / "a.json").camera == Camera.without_focal(640, 480)
+
+
+def test_photo_and_camera_of_different_sizes_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = folder / "camera.json"
+    camera.write_text(json.dumps(Camera(100, 50, 60.0, 60.0, 50.0, 25.0).to_dict()))
+    photo = folder / "photo.jpg"
+    options = ("--image", str(photo), "--camera", str(camera))
+    text = refusal(capsys, lambda: observe(folder, *options))
+    assert text == (
+        f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
+        "give what belongs together"
+    )

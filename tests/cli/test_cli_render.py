@@ -1,0 +1,266 @@
+"""`cadalign render` and `cadalign doctor`: what they write, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import tyro
+from PIL import Image
+
+from cadalign import Camera
+from cadalign.cli.doctor import Doctor
+from cadalign.cli.render import Render
+from cadalign.errors import DataError, InputError, RenderError
+from cadalign.health import Health, compiled_cache
+from cadalign.render import look_at
+from cadalign.render.probe import Probe
+from cadalign.render.views.camera_files import CameraView, write_open3d
+
+
+@pytest.fixture
+def model(tmp_path) -> Path:
+    path = tmp_path / "parts" / "box.obj"
+    path.parent.mkdir()
+    trimesh.creation.box((0.4, 0.8, 0.6)).export(path)
+    return path
+
+
+def _run(model, *arguments, renderer="raycast"):
+    """Run the command as the command line does."""
+    command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
+    return command.run()
+
+
+def _pixels(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_one_view_gives_a_still(model, tmp_path):
+    out = tmp_path / "new" / "still.png"
+    assert _run(model, "--out", out, "--size", "200x150") == 0
+    pixels = _pixels(out)
+    assert pixels.shape == (150, 200, 3)
+    assert tuple(pixels[0, 0]) == (228, 230, 233)
+    changed = (pixels != pixels[0, 0]).any(axis=2)
+    assert 0.15 < changed.mean() < 0.8
+
+
+def test_a_transparent_still_has_opacity(model, tmp_path):
+    _run(model, "--out", tmp_path / "s.png", "--size", "80x60", "--background", "transparent")
+    pixels = _pixels(tmp_path / "s.png")
+    assert pixels.shape == (60, 80, 4)
+    assert pixels[0, 0, 3] == 0
+    assert pixels[30, 40, 3] == 255
+
+
+@pytest.mark.parametrize("views", [["front", "top"], ["30,20", "-30,20,10", "left"], ["all"]])
+def test_several_views_give_a_contact_sheet(model, tmp_path, views):
+    _run(model, "--out", tmp_path / "s.png", "--size", "80x60", "--view", *views)
+    height, width = _pixels(tmp_path / "s.png").shape[:2]
+    assert width > 160
+    assert height > 60 * (1 if len(views) == 2 else 2)
+
+
+def test_an_mp4_is_a_turntable(model, tmp_path):
+    out = tmp_path / "t.mp4"
+    _run(model, "--out", out, "--size", "81x60", "--seconds", 0.4, "--fps", 10)
+    video = cv2.VideoCapture(str(out))
+    frames = []
+    while True:
+        ok, image = video.read()
+        if not ok:
+            break
+        frames.append(image.astype(int))
+    assert len(frames) == 4
+    assert frames[0].shape == (60, 82, 3)
+    assert np.abs(frames[0] - frames[1]).max() > 40
+
+
+def test_a_camera_file_gives_the_view(model, tmp_path):
+    camera = Camera.from_fov(120, 90, fov_x=40)
+    view = CameraView(camera, look_at(azimuth=90, elevation=0, distance=2))
+    write_open3d(tmp_path / "viewpoint.json", [view])
+    out = tmp_path / "v.png"
+    _run(model, "--out", out, "--view", tmp_path / "viewpoint.json", "--style", "depth")
+    pixels = _pixels(out)
+    assert pixels.shape == (90, 120, 3)
+    changed = (pixels != pixels[0, 0]).any(axis=2)
+    rows, columns = np.nonzero(changed)
+    # The side of 0.8 x 0.6, at a depth of 2 - 0.2.
+    assert np.ptp(rows) + 1 == pytest.approx(0.8 / 1.8 * camera.fx, abs=1.5)
+    assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
+
+
+def test_the_stretch_shows(model, tmp_path):
+    extents = []
+    for scale in ((1, 1, 1), (1, 0.5, 1)):
+        out = tmp_path / "s.png"
+        _run(model, "--out", out, "--view", "front", "--style", "faces", "--scale", *scale)
+        rows, columns = np.nonzero((_pixels(out) != (228, 230, 233)).any(axis=2))
+        extents.append(np.ptp(rows) / np.ptp(columns))
+    assert extents[0] / extents[1] == pytest.approx(2, abs=0.1)
+
+
+def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
+    corner = [0.2, 0.4, -0.3]
+    (tmp_path / "points.json").write_text(json.dumps([corner]))
+    entry = {
+        "class_id": "03001627",
+        "model_id": "parts",
+        "keypoints": [
+            {
+                "xyz": corner,
+                "semantic_id": 0,
+                "mesh_info": {"face_index": 0, "face_uv": [1, 0, 0]},
+            }
+        ],
+    }
+    (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
+    drawn = []
+    for name in ("points.json", "chair.json"):
+        out = tmp_path / "k.png"
+        _run(model, "--out", out, "--keypoints", tmp_path / name, "--size", "160x120")
+        drawn.append(_pixels(out).astype(int))
+    np.testing.assert_array_equal(*drawn)
+    assert ((drawn[0][:, :, 0] - drawn[0][:, :, 2]) > 100).sum() > 10
+    (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}]))
+    with pytest.raises(DataError, match="no annotations of a model whose id"):
+        _run(model, "--out", out, "--keypoints", tmp_path / "chair.json")
+    (tmp_path / "points.json").write_text("[[1, 2]]")
+    with pytest.raises(DataError, match="give a list of"):
+        _run(model, "--out", out, "--keypoints", tmp_path / "points.json")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (["--size", "0x0"], InputError, "'0x0' is not an image size"),
+        (["--size", "640"], InputError, "give WIDTHxHEIGHT"),
+        (["--size", "20000x20000"], RenderError, "the limits are 16384 px a side"),
+        (["--size", "999999999x1"], RenderError, "the limits are"),
+        (["--view", "sideways"], InputError, "is not a view"),
+        (["--view", "nothing.json"], DataError, "no such file"),
+        (["--out", "picture.jpeg"], InputError, "neither a PNG nor an MP4"),
+        (["--background", "mauve"], InputError, "is not a colour"),
+        (["--background", "transparent", "--view", "all"], InputError, "can be transparent"),
+        (["--scale", "1", "0", "1"], InputError, "is not positive"),
+        (["--fov", "180"], InputError, "between 0 and 180"),
+        (["--samples", "0"], InputError, "samples"),
+        (["--out", "t.mp4", "--seconds", "0"], InputError, "not 1 to 10000 frames"),
+    ],
+)
+def test_wrong_words_are_refused(model, tmp_path, monkeypatch, arguments, error, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=message):
+        _run(model, *arguments)
+    assert not [path for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4", ".jpeg")]
+
+
+def _write(tmp_path, text, name="bad.obj"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("v 0 0 0\n", "no faces"),
+        ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite|cannot read"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "names vertex 9"),
+    ],
+)
+def test_bad_meshes_are_refused_by_name(tmp_path, text, message):
+    path = _write(tmp_path, text)
+    with pytest.raises(DataError, match=message) as caught:
+        _run(path, "--out", tmp_path / "x.png")
+    assert "bad.obj" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_million_faces_are_drawn(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=8)
+    assert len(ball.faces) > 1_000_000
+    path = tmp_path / "fine.ply"
+    ball.export(path)
+    _run(path, "--out", tmp_path / "x.png", "--size", "160x120")
+    assert (_pixels(tmp_path / "x.png") != (228, 230, 233)).any(axis=2).mean() > 0.1
+
+
+def test_a_file_that_cannot_be_written_is_named(model, tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(DataError, match="taken"):
+        _run(model, "--out", tmp_path / "taken" / "x.png")
+
+
+# doctor
+
+
+def _health(**changes):
+    good = Probe("raycast", True, "processor", "trimesh 5, embreex 4", 80.0)
+    bad = Probe("pyrender", False, "OpenGL does not start", "pyrender2 0.2")
+    values = {
+        "renderers": (bad, good),
+        "best": "raycast",
+        "remedies": {"pyrender": "sudo apt-get install libegl1 libgl1"},
+        "cores": 8,
+        "usable_cores": 2,
+        "cache": "12 functions kept in /somewhere",
+        "python": "3.11",
+        "numpy": "2.4",
+        "numba": "0.68",
+    }
+    return Health(**{**values, **changes})
+
+
+def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
+    monkeypatch.setattr("cadalign.health.examine", _health)
+    monkeypatch.setenv("COLUMNS", "160")
+    assert Doctor().run() == 0
+    text = capsys.readouterr().out
+    assert "To enable pyrender: sudo apt-get install libegl1 libgl1" in text
+    assert "--renderer auto takes: raycast" in text
+    assert "OpenGL does not start" in text
+    assert "of which this process may use 2" in text
+    assert Doctor(json=True).run() == 0
+    assert json.loads(capsys.readouterr().out)["renderers"][1]["milliseconds"] == 80.0
+
+
+def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
+    broken = Probe("raycast", False, "embreex is gone", "")
+    monkeypatch.setattr("cadalign.health.examine", lambda: _health(renderers=(broken,)))
+    assert Doctor().run() == 1
+
+
+def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert compiled_cache() == f"none yet; they will be kept in {tmp_path / 'cache'}"
+    (tmp_path / "cache" / "x").mkdir(parents=True)
+    (tmp_path / "cache" / "x" / "one.nbi").write_text("")
+    assert compiled_cache().startswith("1 functions kept")
+    if hasattr(os, "getuid") and os.getuid():
+        (tmp_path / "shut").mkdir(mode=0o500)
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shut" / "cache"))
+        assert "set NUMBA_CACHE_DIR" in compiled_cache()
+
+
+@pytest.mark.slow
+def test_doctor_runs_for_real():
+    code = "from cadalign.cli.doctor import Doctor; raise SystemExit(Doctor(json=True).run())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    health = json.loads(done.stdout)
+    names = [renderer["name"] for renderer in health["renderers"]]
+    assert names == ["pyrender", "open3d", "raycast"]
+    for renderer in health["renderers"]:
+        assert renderer["works"] == (renderer["milliseconds"] is not None)
+        assert renderer["works"] or renderer["detail"]

@@ -1,0 +1,143 @@
+"""A real street photo: 36 keypoints from a network, a generic car, and a car of another shape."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign import Box, Camera, FitResult, RansacOptions, fit
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign.io.images import read_photo
+
+THRESHOLD_PX = 8.0
+# The generic car is a saloon, the photo's an estate: its tail is another.
+TAIL = [11, 12, 13, 29, 30, 31]
+
+
+@pytest.fixture(scope="module")
+def car(real_data: Path) -> Path:
+    return real_data / "photos" / "kitti_car_01"
+
+
+def keypoints_in(car: Path) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """The generic car's points, the network's pixels, and the camera."""
+    matrix = np.loadtxt(car / "intrinsics.txt")
+    box = np.loadtxt(car / "bbox.txt")
+    in_crop = np.loadtxt(car / "keypoints.txt").reshape(-1, 3)[:, :2]
+    height, width = read_photo(car / "image.png").shape[:2]
+    camera = Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    return np.loadtxt(car / "meanShape.txt"), box[:2] - 1 + in_crop * box[2:] / 64, camera
+
+
+def overlap(points_2d: np.ndarray, box: np.ndarray) -> float:
+    """Intersection over union of the points' bounding box and a box (x, y, width, height)."""
+    low, high = points_2d.min(axis=0), points_2d.max(axis=0)
+    shared = np.prod(np.minimum(high, box[:2] + box[2:]) - np.maximum(low, box[:2]))
+    return float(shared / (np.prod(high - low) + np.prod(box[2:]) - shared))
+
+
+def test_box_and_points_lie_on_the_car(car: Path) -> None:
+    points_3d, points_2d, camera = keypoints_in(car)
+    result = fit(
+        points_3d, points_2d, camera, sigma=None, ransac=RansacOptions(max_reproj_error=8.0)
+    )
+    assert result.inliers.sum() >= 28
+    assert not result.inliers[TAIL].any()
+    assert np.median(np.linalg.norm(result.residuals, axis=1)) < 4.5
+    assert result.std is not None
+    assert result.std.rotation_deg < 2.0
+    assert max(result.std.scale) < 0.1
+    assert result.alignment.scale.min() > 0.7
+    assert result.alignment.scale.max() < 1.2
+    box = np.loadtxt(car / "bbox.txt")
+    kept = result.inliers
+    reprojected = camera.project(result.alignment.apply(points_3d))
+    seen = np.concatenate([points_2d[kept].min(axis=0), np.ptp(points_2d[kept], axis=0)])
+    assert overlap(reprojected[kept], seen) > 0.9
+    bounds = np.array([points_3d.min(axis=0), points_3d.max(axis=0)])
+    corners = Box.from_model(bounds, result.alignment).corners
+    assert overlap(camera.project(corners), box) > 0.75
+    # The model's y is up, and it stands on the road: the camera's y points down.
+    assert result.alignment.rotation[1, 1] < -0.99
+
+
+def test_trusted_keypoints_on_one_side_do_not_mislead(car: Path) -> None:
+    # The first 18 keypoints are the car's left side, nearly a plane.
+    points_3d, points_2d, camera = keypoints_in(car)
+    for seed in range(5):
+        ransac = RansacOptions(max_reproj_error=THRESHOLD_PX, seed=seed)
+        scores = np.linspace(1.0, 0.5, 36)
+        result = fit(points_3d, points_2d, camera, sigma=None, ransac=ransac, confidences=scores)
+        assert result.inliers.sum() >= 25
+
+
+def test_detection_goes_all_the_way_from_file_to_picture(
+    car: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points_3d, points_2d, camera = keypoints_in(car)
+    names = [f"car {n}" for n in range(36)]
+    detection = {
+        "images": [{"id": 0, "file_name": "image.png", "width": 1242, "height": 375}],
+        "categories": [{"id": 1, "name": "car", "keypoints": names}],
+        "annotations": [
+            {
+                "image_id": 0,
+                "category_id": 1,
+                "keypoints": np.column_stack([points_2d, np.full(36, 2)]).ravel().tolist(),
+            }
+        ],
+    }
+    (tmp_path / "found.json").write_text(json.dumps(detection))
+    (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
+    rows = zip(names, points_3d.tolist(), strict=True)
+    ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in rows)).save(
+        tmp_path / "car.keypoints.json"
+    )
+    files = [str(tmp_path / name) for name in ("found.json", "car.keypoints.json")]
+    given = ["--image", str(car / "image.png"), "--camera", str(tmp_path / "camera.json")]
+    assert main(["observe", *files, *given]) == 0
+    options = ["--robust", "--similar", "--max-reproj-error", str(THRESHOLD_PX)]
+    assert main(["fit", str(tmp_path / "found.observation.json"), *options]) == 0
+    printed = capsys.readouterr().out
+    assert "ransac-optimal: 30 of 36 keypoints, rms 4." in printed
+    assert "  scale        (1, 0.8" in printed
+    out = tmp_path / "found.observation_fit"
+    written = FitResult.from_json((out / "fit.json").read_text())
+    direct = fit(
+        points_3d,
+        points_2d,
+        camera,
+        sigma=None,
+        ransac=RansacOptions(max_reproj_error=THRESHOLD_PX),
+    )
+    np.testing.assert_allclose(written.alignment.scale, direct.alignment.scale, rtol=1e-6)
+    overlay = cv2.imread(str(out / "overlay.png"))
+    photo = cv2.imread(str(car / "image.png"))
+    assert overlay.shape == photo.shape
+    x, y, width, height = np.loadtxt(car / "bbox.txt").astype(int)
+    drawn = np.abs(overlay.astype(int) - photo).max(axis=2) > 40
+    inside = drawn[y - 10 : y + height + 10, x - 10 : x + width + 10].sum()
+    assert inside > 2000
+    legend = drawn[:110, :110].sum()
+    assert drawn.sum() - inside - legend < 100
+
+
+def test_focal_length_of_a_shape_that_is_only_similar_is_not_claimed(car: Path) -> None:
+    points_3d, points_2d, camera = keypoints_in(car)
+    result = fit(
+        points_3d,
+        points_2d,
+        Camera.without_focal(camera.width, camera.height, cx=camera.cx, cy=camera.cy),
+        sigma=None,
+        focal="estimate",
+        ransac=RansacOptions(max_reproj_error=THRESHOLD_PX),
+    )
+    assert result.std is not None
+    off = abs(np.log(result.camera.fx / camera.fx))
+    assert off < 3 * result.std.focal
+    assert any(text.startswith("the focal length is known only to") for text in result.warnings)

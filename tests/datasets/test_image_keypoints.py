@@ -1,0 +1,542 @@
+"""Keypoints from detectors: what is read, how it is paired with a model, what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import replaced
+
+from cadalign import Camera
+from cadalign.datasets import (
+    ImageKeypoints,
+    ModelKeypoint,
+    ModelKeypoints,
+    choose_object,
+    join_keypoints,
+    read_image_keypoints,
+)
+from cadalign.errors import CadalignError, DataError, InputError
+
+CAMERA = Camera.without_focal(640, 480)
+MODEL = ModelKeypoints(
+    (
+        ModelKeypoint("left ear", (0.0, 1.0, 0.0), semantic_id=4),
+        ModelKeypoint("right ear", (1.0, 1.0, 0.0), semantic_id=5),
+        ModelKeypoint("nose", (0.5, 0.5, 1.0), semantic_id=0),
+    ),
+    Path("/models/cat.obj"),
+)
+NAMES = ["nose", "left_ear", "right_ear"]
+POINTS = [[100.5, 200.25], [80.0, 120.0], [130.0, 121.0]]
+ANNOTATIONS: dict[str, Any] = {
+    "info": {"description": "two cats"},
+    "images": [
+        {"id": 3, "file_name": "cats/a.jpg", "width": 640, "height": 480},
+        {"id": 4, "file_name": "cats/b.jpg", "width": 320, "height": 240},
+    ],
+    "categories": [{"id": 17, "name": "cat", "keypoints": NAMES, "skeleton": [[1, 2]]}],
+    "annotations": [
+        {
+            "image_id": 3,
+            "category_id": 17,
+            "keypoints": [100.5, 200.25, 2, 80, 120, 1, 0, 0, 0],
+            "num_keypoints": 2,
+        },
+        {"image_id": 3, "category_id": 17, "keypoints": [0] * 9, "num_keypoints": 0},
+        {"image_id": 4, "category_id": 17, "keypoints": [9, 9, 2, 8, 8, 2, 7, 7, 2]},
+    ],
+}
+CSV = "image,name,u,v,score\na.jpg,nose,100.5,200.25,0.9\na.jpg,left ear,80,120,0.4\n"
+
+
+def write(path: Path, data: Any) -> Path:
+    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
+    return path
+
+
+def read(tmp_path: Path, data: Any, name: str = "keypoints.json") -> list[ImageKeypoints]:
+    return read_image_keypoints(write(tmp_path / name, data))
+
+
+def changed(path: str, value: Any) -> dict[str, Any]:
+    """The annotations with the entry at a dotted path replaced; removed where it is `...`."""
+    return replaced(ANNOTATIONS, path, value)
+
+
+# --- COCO and its relatives -------------------------------------------------------------------
+
+
+def test_coco_annotations_have_names_flags_and_images(tmp_path: Path) -> None:
+    first, second = read(tmp_path, ANNOTATIONS)
+    assert first.names == tuple(NAMES)
+    assert first.points_2d[:2].tolist() == POINTS[:2]
+    assert first.scores is not None
+    assert first.scores.tolist() == [1.0, 0.5, 0.0]
+    assert (first.image, first.size) == ("cats/a.jpg", (640, 480))
+    assert (second.image, second.size) == ("cats/b.jpg", (320, 240))
+
+
+def flat(scores: list[float]) -> list[float]:
+    return [n for point, score in zip(POINTS, scores, strict=True) for n in (*point, score)]
+
+
+@pytest.mark.parametrize(
+    ("data", "score"),
+    [
+        # MMPose's and Detectron2's result files, ultralytics' predictions.json.
+        (
+            [
+                {
+                    "image_id": 7,
+                    "category_id": 1,
+                    "keypoints": flat([0.9, 0.8, 0.1]),
+                    "score": 0.75,
+                }
+            ],
+            0.75,
+        ),
+        # MMPose's inferencer.
+        (
+            [
+                {
+                    "keypoints": POINTS,
+                    "keypoint_scores": [0.9, 0.8, 0.1],
+                    "bbox": [[1, 2, 3, 4]],
+                    "bbox_score": 0.75,
+                }
+            ],
+            0.75,
+        ),
+        # ultralytics' results.to_json().
+        (
+            [
+                {
+                    "name": "cat",
+                    "class": 0,
+                    "confidence": 0.75,
+                    "box": {"x1": 1, "y1": 2, "x2": 3, "y2": 4},
+                    "keypoints": {
+                        "x": [100.5, 80.0, 130.0],
+                        "y": [200.25, 120.0, 121.0],
+                        "visible": [0.9, 0.8, 0.1],
+                    },
+                }
+            ],
+            0.75,
+        ),
+        # Pairs with scores beside them, nested.
+        (
+            [{"keypoints": [[*p, s] for p, s in zip(POINTS, [0.9, 0.8, 0.1], strict=True)]}],
+            None,
+        ),
+    ],
+    ids=["results", "mmpose", "ultralytics", "rows"],
+)
+def test_detectors_files_are_read(tmp_path: Path, data: Any, score: float | None) -> None:
+    (found,) = read(tmp_path, data)
+    assert found.points_2d.tolist() == POINTS
+    assert found.scores is not None
+    assert found.scores.tolist() == [0.9, 0.8, 0.1]
+    assert found.score == score
+    assert found.names is None
+    assert found.source == f"{tmp_path / 'keypoints.json'}: [0]"
+
+
+def test_mmpose_predictions_name_their_keypoints(tmp_path: Path) -> None:
+    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.1]}
+    meta = {"keypoint_id2name": {str(n): name for n, name in enumerate(NAMES)}}
+    (image,) = read(tmp_path, {"meta_info": meta, "instance_info": [instance]})
+    assert image.names == tuple(NAMES)
+    frames = [{"frame_id": n, "instances": [instance] * n} for n in (1, 2)]
+    video = read(tmp_path, {"meta_info": meta, "instance_info": frames})
+    assert [found.image for found in video] == ["1", "2", "2"]
+
+
+@pytest.mark.parametrize(
+    ("third", "scores"),
+    [
+        ([0, 1, 2], [0.0, 0.5, 1.0]),
+        ([2, 2, 2], [1.0, 1.0, 1.0]),
+        ([0.0, 1.0, 1.0], [0.0, 1.0, 1.0]),
+        ([0.5, 1.0, 2.0], [0.5, 1.0, 2.0]),
+    ],
+)
+def test_flags_are_told_from_scores(
+    tmp_path: Path, third: list[float], scores: list[float]
+) -> None:
+    (found,) = read(tmp_path, [{"keypoints": flat(third)}])
+    assert found.scores is not None
+    assert found.scores.tolist() == scores
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (3, "{path}: expected an object, got int"),
+        (
+            {"frames": []},
+            "{path}: top level: neither annotations nor instance_info; is it COCO's keypoint "
+            "JSON, or a detector's? see cadalign.datasets.detections.coco_keypoints",
+        ),
+        ([], "{path}: there are no keypoints"),
+        ({"annotations": []}, "{path}: there are no keypoints"),
+        ([7], "{path}: [0]: expected an object, got int"),
+        (
+            [{"bbox": [1, 2, 3, 4]}],
+            "{path}: [0].keypoints: missing; is it COCO's keypoint JSON, or a detector's? "
+            "see cadalign.datasets.detections.coco_keypoints",
+        ),
+        (
+            changed("annotations.0.keypoints", ...),
+            "{path}: annotations[0].keypoints: missing; is it COCO's keypoint JSON, or a "
+            "detector's? see cadalign.datasets.detections.coco_keypoints",
+        ),
+        (
+            changed("annotations.0.keypoints", []),
+            "{path}: annotations[0].keypoints: expected a list of numbers",
+        ),
+        (
+            changed("annotations.0.keypoints", [1, 2, 2, 3]),
+            "{path}: annotations[0].keypoints: 4 numbers are not x, y and visibility of keypoints",
+        ),
+        (
+            changed("annotations.0.keypoints", [1, 2, 2]),
+            "{path}: annotations[0].keypoints: 1 keypoints, but the category names 3",
+        ),
+        (
+            changed("annotations.0.keypoints", [1, 2, "two"] * 3),
+            "{path}: annotations[0].keypoints: not an array of numbers "
+            "(could not convert string to float: 'two')",
+        ),
+        (
+            changed("annotations.0.keypoints", [1, None, 2] * 3),
+            "{path}: annotations[0].keypoints: NaN or infinite values in rows 1, 4, 7; "
+            "remove or repair these",
+        ),
+        (
+            changed("annotations.0.image_id", 12),
+            "{path}: annotations[0].image_id: there is no image 12",
+        ),
+        (changed("annotations.0.image_id", ...), "{path}: annotations[0].image_id: missing"),
+        (changed("images.0.id", ...), "{path}: images[0].id: missing"),
+        (changed("images.0.width", "wide"), "{path}: images[0].width: not an array of numbers "),
+        (changed("images.0.file_name", 5), "{path}: images[0].file_name: 5 is not a text"),
+        (changed("images", 5), "{path}: images: expected a list"),
+        (changed("categories.0.id", [1]), "{path}: categories[0].id: [1] is no id"),
+        (
+            changed("categories.0.keypoints", "nose"),
+            "{path}: categories[0].keypoints: expected a list of names",
+        ),
+        (
+            changed("categories.0.keypoints.2", "nose"),
+            "{path}: categories[0].keypoints[2]: 'nose' occurs twice",
+        ),
+        (changed("annotations", 5), "{path}: annotations: expected a list"),
+        (
+            [{"keypoints": {"x": [1, 2]}}],
+            "{path}: [0].keypoints.y: missing",
+        ),
+        (
+            [{"keypoints": {"x": [1, 2], "y": [1]}}],
+            "{path}: [0].keypoints.y: shape (1,), expected (2)",
+        ),
+        (
+            [{"keypoints": [[1, 2, 3, 4]]}],
+            "{path}: [0].keypoints: 4 numbers for a keypoint",
+        ),
+        (
+            [{"keypoints": [[1, 2]], "keypoint_scores": [1, 2]}],
+            "{path}: [0].keypoints: shape (2,), expected (1)",
+        ),
+        (
+            [{"keypoints": [[1, 2, -0.5]]}],
+            "[0]: scores: keypoint 0 has the value -0.5, which is negative",
+        ),
+        (
+            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": [1]}},
+            "{path}: meta_info.keypoint_id2name: expected an object, got list",
+        ),
+        (
+            {"instance_info": [{"keypoints": [[1, 2]]}], "meta_info": {"keypoint_id2name": {}}},
+            "{path}: instance_info[0].keypoints: 1 keypoints, but the category names 0",
+        ),
+        ("[", "{path}, line 1: not valid JSON: Expecting value"),
+    ],
+)
+def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, text: str) -> None:
+    path = write(tmp_path / "keypoints.json", data)
+    with pytest.raises(DataError) as caught:
+        read_image_keypoints(path)
+    assert text.format(path=path) in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+
+
+# --- CSV --------------------------------------------------------------------------------------
+
+
+def test_csv_columns_arrive(tmp_path: Path) -> None:
+    (found,) = read(tmp_path, CSV, "keypoints.csv")
+    assert found.names == ("nose", "left ear")
+    assert found.points_2d.tolist() == POINTS[:2]
+    assert found.scores is not None
+    assert found.scores.tolist() == [0.9, 0.4]
+    assert found.image == "a.jpg"
+
+
+def test_csv_needs_pixels_only(tmp_path: Path) -> None:
+    text = "\ufeffX, Y ,visibility,semantic_id,sigma\r\n1,2,2,4,0.5\r\n,,0,5,\r\n\r\n3,4,1,0,2\r\n"
+    (found,) = read(tmp_path, text, "keypoints.csv")
+    assert found.points_2d.tolist() == [[1, 2], [3, 4]]
+    assert found.semantic_ids == (4, 0)
+    assert found.scores is not None
+    assert found.scores.tolist() == [1.0, 0.5]
+    assert found.sigma is not None
+    assert found.sigma.tolist() == [0.5, 2.0]
+    (plain,) = read(tmp_path, "u,v\n1,2\n", "plain.CSV")
+    assert plain.names is None
+    assert plain.semantic_ids is None
+    assert plain.scores is None
+
+
+def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
+    objects = read(tmp_path, CSV + "b.jpg,nose,1,2,1\n", "keypoints.csv")
+    assert [(found.image, len(found)) for found in objects] == [("a.jpg", 2), ("b.jpg", 1)]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "{path}, line 1: the column 'u' is missing; the first line names the columns, "),
+        ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are image, name, "),
+        ("name,u\na,1\n", "{path}, line 1: the column 'v' is missing; "),
+        ("u,x,v\n", "{path}, line 1: the column 'u' occurs twice"),
+        ("u,v,score,visibility\n", "{path}, line 1: give score or visibility, not both"),
+        ("u,v\n", "{path}: there are no keypoints"),
+        ("u,v\n1,2,3\n", "{path}, line 2: 3 values for 2 columns"),
+        ("u,v\n1,2\n3,four\n", "{path}, line 3: v is 'four', not a number"),
+        ("u,v\n1,nan\n", "{path}, line 2: v is 'nan', not a number"),
+        ("u,v\n1,\n", "{path}, line 2: v is '', not a number"),
+        ("u,v,name\n1,2,\n", "{path}, line 2: the name is empty"),
+        ("u,v,semantic_id\n1,2,3.5\n", "{path}, line 2: semantic_id is '3.5', not a whole number"),
+        ("u,v,visibility\n1,2,3\n", "{path}, line 2: visibility is 3, not 0, 1 or 2"),
+        ("u,v,sigma\n1,2,0\n", "{path}: sigma: keypoint 0 has the value 0, which is not positive"),
+        ("u,v,score\n1,2,-1\n", "{path}: scores: keypoint 0 has the value -1, which is negative"),
+        ('u,v\n1,"2\n', "{path}: cannot be read (unexpected end of data)"),
+    ],
+)
+def test_malformed_csv_is_refused_by_file_and_line(
+    tmp_path: Path, text: str, expected: str
+) -> None:
+    path = write(tmp_path / "keypoints.csv", text)
+    with pytest.raises(DataError) as caught:
+        read_image_keypoints(path)
+    assert str(caught.value).startswith(expected.format(path=path))
+
+
+@pytest.mark.parametrize("name", ["nothing.csv", "nothing.json"])
+def test_missing_and_binary_files_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(DataError) as caught:
+        read_image_keypoints(tmp_path / name)
+    assert str(caught.value) == f"{tmp_path / name}: no such file"
+    (tmp_path / name).write_bytes(b"\x89PNG\xff\xfe\x00")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_image_keypoints(tmp_path / name)
+
+
+# --- which object -----------------------------------------------------------------------------
+
+
+def seen(image: str | None, score: float | None = None) -> ImageKeypoints:
+    return ImageKeypoints(np.zeros((1, 2)), image=image, score=score)
+
+
+def test_object_is_chosen_by_image_number_and_score() -> None:
+    objects = [seen("x/a.jpg", 0.5), seen("x/a.jpg", 0.9), seen("42", 0.1)]
+    assert choose_object(objects, image="a.jpg") is objects[1]
+    assert choose_object(objects, image="a.jpg", number=0) is objects[0]
+    assert choose_object(objects, image="42.png") is objects[2]
+    # A file about a single image may call it what it likes.
+    assert choose_object(objects[:2], image="other.jpg") is objects[1]
+    assert choose_object([seen(None)], image="other.jpg").image is None
+
+
+@pytest.mark.parametrize(
+    ("objects", "options", "text"),
+    [
+        ([seen("a"), seen("b")], {}, "image: 2 images; choose one of a, b"),
+        (
+            [seen(name) for name in "abcdefg"],
+            {"image": "z"},
+            "image: 7 images, none of which is 'z'; choose one of a, b, c, d, e, ...",
+        ),
+        ([seen("a"), seen("a")], {"number": 2}, "number: object 2 of 2; count from 0"),
+        (
+            [seen("a"), seen("a", 0.5)],
+            {},
+            "number: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
+        ),
+    ],
+)
+def test_choices_that_are_none_are_refused(
+    objects: list[ImageKeypoints], options: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        choose_object(objects, **options)
+    assert str(caught.value) == text
+
+
+# --- pairing ----------------------------------------------------------------------------------
+
+
+def test_names_pair_whatever_their_spelling() -> None:
+    found = ImageKeypoints(
+        np.array(POINTS), scores=np.array([0.9, 0.8, 0.0]), names=("NOSE", "Left-Ear", "right ear")
+    )
+    observation = join_keypoints(found, MODEL, CAMERA, image=Path("a.jpg"))
+    assert observation.names == ("nose", "left ear")
+    assert observation.points_3d.tolist() == [[0.5, 0.5, 1.0], [0.0, 1.0, 0.0]]
+    assert observation.points_2d.tolist() == POINTS[:2]
+    assert observation.semantic_ids is not None
+    assert observation.semantic_ids.tolist() == [0, 4]
+    assert observation.confidences is not None
+    assert observation.confidences.tolist() == [0.9, 0.8]
+    assert observation.sigma is None
+    assert (observation.image, observation.model) == (Path("a.jpg"), MODEL.model)
+    assert observation.camera == CAMERA
+
+
+def test_ids_pair_where_there_are_no_names_and_order_where_there_is_neither() -> None:
+    by_id = join_keypoints(ImageKeypoints(np.array(POINTS), semantic_ids=(0, 4, 5)), MODEL, CAMERA)
+    assert by_id.names == ("nose", "left ear", "right ear")
+    by_order = join_keypoints(ImageKeypoints(np.array(POINTS)), MODEL, CAMERA)
+    assert by_order.names == MODEL.names
+    assert by_order.confidences is None
+
+
+def test_scores_leave_out_or_weigh() -> None:
+    found = ImageKeypoints(np.array(POINTS), scores=np.array([0.25, 0.8, 1.0]))
+    assert len(join_keypoints(found, MODEL, CAMERA, min_score=0.5).points_2d) == 2
+    weighed = join_keypoints(found, MODEL, CAMERA, sigma_from_scores=2.0)
+    assert weighed.sigma is not None
+    assert weighed.sigma.tolist() == [8.0, 2.5, 2.0]
+    assert weighed.confidences is None
+
+
+def test_unknown_keypoints_can_be_left_out() -> None:
+    found = ImageKeypoints(np.array(POINTS), names=("nose", "tail", "left ear"))
+    observation = join_keypoints(found, MODEL, CAMERA, ignore_unknown=True)
+    assert observation.names == ("nose", "left ear")
+
+
+def test_model_keypoints_without_ids_give_none() -> None:
+    nameless = ModelKeypoints(tuple(ModelKeypoint(n, (0.0, 0.0, 0.0)) for n in "abc"))
+    assert join_keypoints(ImageKeypoints(np.array(POINTS)), nameless, CAMERA).semantic_ids is None
+
+
+@pytest.mark.parametrize(
+    ("fields", "options", "text"),
+    [
+        (
+            {"names": ("nose", "tail", "left ear")},
+            {},
+            "photo.json: the model has no keypoint 'tail'; "
+            "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
+        ),
+        (
+            {"semantic_ids": (0, 4, 9)},
+            {},
+            "photo.json: the model has no keypoint 9; "
+            "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
+        ),
+        (
+            {"names": ("nose", "Nose", "left ear")},
+            {},
+            "photo.json: keypoints 0 and 1 are both 'nose'; leave one of them out",
+        ),
+        (
+            {"names": ("a", "b", "c")},
+            {"ignore_unknown": True},
+            "photo.json: none of 3 keypoints is found in the image and on the model; "
+            "the model has left ear, right ear, nose",
+        ),
+        (
+            {"scores": np.zeros(3)},
+            {},
+            "photo.json: none of 3 keypoints is found in the image and on the model; "
+            "the model has left ear, right ear, nose",
+        ),
+        (
+            {"points_2d": np.zeros((4, 2))},
+            {},
+            "photo.json: 4 keypoints without names, but the model has 3; "
+            "give names, or as many keypoints as the model has, in its order",
+        ),
+        ({}, {"sigma_from_scores": 1.0}, "photo.json: there are no scores to weigh by"),
+    ],
+)
+def test_keypoints_that_cannot_be_paired_are_refused(
+    fields: dict[str, Any], options: dict[str, Any], text: str
+) -> None:
+    found = ImageKeypoints(**({"points_2d": np.array(POINTS), "source": "photo.json"} | fields))
+    with pytest.raises(DataError) as caught:
+        join_keypoints(found, MODEL, CAMERA, **options)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"points_2d": np.zeros((3, 3))}, "keypoints: keypoints: shape (3, 3), expected (n, 2)"),
+        ({"scores": np.ones(2)}, "keypoints: scores: shape (2,), expected (3)"),
+        ({"names": ("a",)}, "keypoints: 3 keypoints but 1 names"),
+        ({"semantic_ids": (1, 2)}, "keypoints: 3 keypoints but 2 semantic ids"),
+    ],
+)
+def test_fields_that_do_not_match_are_refused(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(CadalignError) as caught:
+        ImageKeypoints(**({"points_2d": np.array(POINTS)} | fields))
+    assert str(caught.value) == text
+
+
+# --- what does not belong together ------------------------------------------------------------
+
+
+def test_photo_without_keypoints_does_not_get_those_of_another(tmp_path: Path) -> None:
+    data = changed("annotations.2", ...)
+    with pytest.raises(InputError, match=r"2 images, and no keypoints in 'b\.jpg'.*cats/a\.jpg"):
+        choose_object(read(tmp_path, data), image="b.jpg")
+
+
+def test_empty_frames_of_a_video_are_passed_over(tmp_path: Path) -> None:
+    instance = {"keypoints": POINTS, "keypoint_scores": [0.9, 0.8, 0.7]}
+    frames = [
+        {"frame_id": 1, "instances": [instance]},
+        {"frame_id": 2, "instances": []},
+    ]
+    (found,) = read(tmp_path, {"meta_info": {}, "instance_info": frames})
+    assert found.image == "1"
+
+
+@pytest.mark.parametrize("value", [[1], {"a": 1}])
+def test_category_that_is_no_id_is_refused(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(DataError, match=r"annotations\[0\]\.category_id: .* is no id"):
+        read(tmp_path, changed("annotations.0.category_id", value))
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan")])
+def test_weights_need_a_positive_deviation(tmp_path: Path, sigma: float) -> None:
+    found = read(tmp_path, ANNOTATIONS)[0]
+    with pytest.raises(InputError, match=r"sigma_from_scores: .* is not positive"):
+        join_keypoints(found, MODEL, CAMERA, sigma_from_scores=sigma)
+
+
+def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
+    huge = changed("annotations.0.keypoints.0", 10**400)
+    with pytest.raises(CadalignError, match=r"keypoints: not an array of numbers"):
+        read(tmp_path, huge)
+    with pytest.raises(DataError, match="not valid JSON"):
+        read(tmp_path, '{"annotations": ' + "1" * 5000 + "}")

@@ -1,0 +1,564 @@
+"""`cadalign evaluate correspondences`: formats, inputs, rows, summaries, real models, refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cadalign.cli import main
+from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_correspondences
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.accuracy.methods import fit_with
+from cadalign.evaluation.correspondences import figures as correspondences_report
+from cadalign.evaluation.correspondences.experiment import (
+    CorrespondenceExperiment,
+    CorrespondenceOptions,
+    CorrespondenceTask,
+    CorrespondenceTasks,
+    run_correspondences,
+    spoil,
+)
+from cadalign.evaluation.correspondences.figures import (
+    Quartiles,
+    draw_quartiles,
+    summarize_correspondences,
+    write_correspondences_report,
+)
+from cadalign.evaluation.correspondences.outcome import CorrespondenceOutcome
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_table
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.fitting.result import FitResult
+from cadalign.fitting.robust import RansacOptions
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+DATA = os.environ.get("CADALIGN_DATA")
+needs_data = pytest.mark.skipif(DATA is None, reason="CADALIGN_DATA is unset")
+
+POINTS = 60
+CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5)
+QUICK = CorrespondenceOptions(outliers=(0.0, 0.3), draws=2, methods=("epnp", "ransac-optimal"))
+
+
+def seen_image(name: str, seed: int, camera: Camera = CAMERA) -> Correspondences:
+    """A made image: points about the world's origin, 0.2 px noise."""
+    made = simulate_problem(
+        np.random.default_rng(seed),
+        points=POINTS,
+        noise_px=0.2,
+        camera=camera,
+        stretch=(1.0, 1.0),
+    )
+    return Correspondences(name, made.points_3d, made.points_2d, camera, made.alignment)
+
+
+def write_colmap(folder: Path, *, images: int = 2, broken: tuple[int, ...] = ()) -> Path:
+    """Write a COLMAP text model; images in ``broken`` observe a point that does not exist."""
+    folder.mkdir(parents=True, exist_ok=True)
+    views, points = [], []
+    for number in range(images):
+        seen = seen_image(f"{number}.jpg", seed=number)
+        first = 1 + POINTS * number
+        points += [
+            f"{first + i} {x!r} {y!r} {z!r} 0 0 0 0.2"
+            for i, (x, y, z) in enumerate(seen.points_3d.tolist())
+        ]
+        pose = seen.cam_from_world
+        numbers = [*quat_wxyz(pose.rotation), *pose.translation.tolist()]
+        views.append(f"{number + 1} {' '.join(map(repr, numbers))} 1 {seen.id}")
+        ids = [10_000 if number in broken and i == 5 else first + i for i in range(POINTS)]
+        # COLMAP's pixels begin half a pixel earlier.
+        pixels = (seen.points_2d + 0.5).tolist()
+        views.append(" ".join(f"{u!r} {v!r} {i}" for (u, v), i in zip(pixels, ids, strict=True)))
+    c = CAMERA
+    camera = f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx + 0.5} {c.cy + 0.5}"
+    (folder / "cameras.txt").write_text(camera + "\n")
+    (folder / "images.txt").write_text("\n".join(views) + "\n")
+    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+    return folder
+
+
+def quat_wxyz(rotation: np.ndarray) -> list[float]:
+    """A rotation's quaternion: the main eigenvector of Bar-Itzhack's matrix."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    matrix = np.array(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    return np.linalg.eigh(matrix)[1][:, -1].tolist()
+
+
+def write_bundler(file: Path) -> Path:
+    """Write a Bundler model of one photo without points."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    camera = "500 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n"
+    file.write_text(f"# Bundle file v0.3\n1 0\n{camera}")
+    return file
+
+
+def write_pickles(folder: Path, names: tuple[str, ...]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps([np.zeros(3)]))
+    return folder
+
+
+def run(
+    root: Path, out: Path, options: CorrespondenceOptions = QUICK, *, workers: int = 0
+) -> list[dict[str, object]]:
+    """Do a run; its rows."""
+    run_correspondences(root, options, RunFolder(out), workers=workers)
+    return read_table(RunFolder(out).results).to_pylist()
+
+
+@pytest.fixture(scope="module")
+def colmap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_colmap(tmp_path_factory.mktemp("colmap"))
+
+
+@pytest.fixture(scope="module")
+def finished(colmap: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
+    run(colmap, folder.path)
+    return folder
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the writing of figures, which takes seconds and has a test of its own."""
+    monkeypatch.setattr(correspondences_report, "save_figure", lambda figure, path: [])
+
+
+class TestFormats:
+    @pytest.mark.parametrize("below", ["", "sparse/0", "sparse", "0"])
+    def test_colmap_is_recognised_wherever_its_loader_looks(self, tmp_path, below):
+        write_colmap(tmp_path / below)
+        assert isinstance(open_correspondences(tmp_path), Colmap)
+
+    @pytest.mark.parametrize("name", ["bundle.out", "bundle/bundle.out", "house.out"])
+    def test_bundler_is_recognised_wherever_its_loader_looks(self, tmp_path, name):
+        file = write_bundler(tmp_path / name)
+        assert isinstance(open_correspondences(tmp_path), Bundler)
+        assert isinstance(open_correspondences(file), Bundler)
+
+    @pytest.mark.parametrize("below", ["", "preprocessed"])
+    @pytest.mark.parametrize("names", [("matches", "R", "t"), ("p2d", "p3d", "R_gt", "t_gt")])
+    def test_blind_pnp_is_recognised_wherever_its_loader_looks(self, tmp_path, below, names):
+        write_pickles(tmp_path / below, names)
+        assert isinstance(open_correspondences(tmp_path), BlindPnP)
+
+    @pytest.mark.parametrize("format", ["auto", "colmap"])
+    def test_a_format_can_be_named(self, colmap, format):
+        assert open_correspondences(colmap, format=format).ids == ("0.jpg", "1.jpg")
+
+    def test_a_log_is_not_taken_for_a_bundler_file(self, tmp_path):
+        write_colmap(tmp_path)
+        (tmp_path / "job.out").write_text("started\n")
+        assert isinstance(open_correspondences(tmp_path), Colmap)
+
+    def test_an_empty_folder_is_refused_and_says_what_was_sought(self, tmp_path):
+        with pytest.raises(DataError, match=r"known format.*points3D.*bundle\.out.*matches\.pkl"):
+            open_correspondences(tmp_path)
+
+    def test_two_formats_in_one_folder_are_refused_unless_one_is_named(self, tmp_path):
+        write_colmap(tmp_path)
+        write_bundler(tmp_path / "bundle.out")
+        with pytest.raises(DataError, match="files of colmap and bundler"):
+            open_correspondences(tmp_path)
+        assert isinstance(open_correspondences(tmp_path, format="bundler"), Bundler)
+
+    def test_of_an_incomplete_model_the_missing_file_is_named(self, tmp_path):
+        write_colmap(tmp_path)
+        (tmp_path / "points3D.txt").unlink()
+        with pytest.raises(DataError, match=r"points3D\.txt is missing"):
+            open_correspondences(tmp_path)
+
+    def test_another_file_is_refused(self, colmap):
+        with pytest.raises(DataError, match="not a Bundler file"):
+            open_correspondences(colmap / "images.txt")
+
+    def test_a_missing_folder_and_an_unknown_format_are_refused(self, tmp_path):
+        with pytest.raises(DataError, match="no such folder"):
+            open_correspondences(tmp_path / "nowhere")
+        with pytest.raises(InputError, match="known are auto, colmap, bundler, blind-pnp"):
+            open_correspondences(tmp_path, format="nerf")
+
+
+class TestInputs:
+    def test_only_the_given_share_is_moved_and_the_rest_is_the_image(self):
+        seen = seen_image("a", 1)
+        problem = spoil(seen, 0.35, rng=np.random.default_rng(0))
+        wrong = problem.outliers
+        assert wrong.sum() == 21
+        np.testing.assert_array_equal(problem.points_2d[~wrong], seen.points_2d[~wrong])
+        assert np.linalg.norm(problem.points_2d - seen.points_2d, axis=1)[wrong].min() > 0
+
+    def test_the_true_alignment_puts_the_stretched_points_where_they_were(self):
+        seen = seen_image("a", 1)
+        problem = spoil(seen, 0.5, rng=np.random.default_rng(0))
+        np.testing.assert_allclose(
+            problem.alignment.apply(problem.points_3d),
+            seen.cam_from_world.apply(seen.points_3d),
+            atol=1e-12,
+        )
+        scale = problem.alignment.scale
+        assert scale[0] == 1
+        assert ((scale[1:] > 0.5) & (scale[1:] < 2)).all()
+        assert scale[1] != scale[2]
+
+    def test_moved_points_lie_all_over_the_image_and_where_its_lens_model_holds(self):
+        # Its lens model folds back at 230 px from the middle: it holds in half of the image.
+        camera = replace(CAMERA, distortion=(-0.7, 0.0, 0.0, 0.0))
+        corner = camera.normalize_where_valid(np.zeros((1, 2)))[1]
+        assert not corner[0]
+        seen = seen_image("a", 1)
+        pose = Alignment(np.eye(3), [0, 0, 12], [1, 1, 1])
+        points_2d = camera.project(pose.apply(seen.points_3d))
+        seen = Correspondences("a", seen.points_3d, points_2d, camera, pose)
+        rng = np.random.default_rng(0)
+        moved = np.concatenate(
+            [p.points_2d[p.outliers] for p in (spoil(seen, 0.9, rng=rng) for _ in range(20))]
+        )
+        assert camera.contains(moved, margin=0.5).all()
+        assert camera.normalize_where_valid(moved)[1].all()
+        radius = np.linalg.norm(moved - (camera.cx, camera.cy), axis=1)
+        assert (radius < 115).mean() == pytest.approx(0.25, abs=0.05)
+
+    def test_inputs_depend_on_seed_image_draw_and_share_alone(self, colmap, tmp_path):
+        def rows(name, **changes):
+            found = run(colmap, tmp_path / name, replace(QUICK, **changes))
+            return {
+                (row["image"], row["draw"], row["outliers"]): row
+                for row in found
+                if row["method"] == "ransac-optimal"
+            }
+
+        both = rows("both")
+        alone = rows("alone", outliers=(0.3,), draws=1, methods=("ransac-optimal",))
+        assert set(alone) == {("0.jpg", 0, 0.3), ("1.jpg", 0, 0.3)}
+        assert all(both[key] == row for key, row in alone.items())
+        other = rows("other", seed=1)
+        for key, row in other.items():
+            assert row["scale_y_error"] != both[key]["scale_y_error"]
+        draws = {both["0.jpg", draw, 0.3]["scale_y_error"] for draw in (0, 1)}
+        assert len(draws) == 2
+
+
+class TestRows:
+    def test_there_is_a_row_for_every_image_share_draw_and_method(self, finished):
+        rows = read_table(finished.results).to_pylist()
+        keys = [(row["image"], row["outliers"], row["draw"], row["method"]) for row in rows]
+        assert keys == [
+            (image, share, draw, method)
+            for image in ("0.jpg", "1.jpg")
+            for share in (0.0, 0.3)
+            for draw in (0, 1)
+            for method in ("epnp", "ransac-optimal")
+        ]
+        assert {row["status"] for row in rows} == {"ok"}
+        timings = read_table(finished.timings).to_pylist()
+        assert [
+            tuple(row[name] for name in ("image", "outliers", "draw", "method")) for row in timings
+        ] == keys
+        assert all(row["seconds"] > 0 for row in timings)
+
+    def test_the_robust_method_succeeds_and_finds_exactly_the_points_that_were_not_moved(
+        self, finished
+    ):
+        for row in read_table(finished.results).to_pylist():
+            assert row["points"] == POINTS
+            if row["method"] == "epnp":  # it does not search
+                assert (row["inliers"], row["inlier_precision"], row["success"]) == (
+                    None,
+                    None,
+                    False,
+                )
+                continue
+            assert row["success"]
+            assert row["inlier_recall"] == 1
+            assert row["inlier_precision"] > 0.95
+            assert row["inliers"] >= round((1 - row["outliers"]) * POINTS)
+
+    def test_errors_are_counted_as_they_are_described(self):
+        # All points 10 from the camera; the last of 4 was moved.
+        points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=float)
+        truth = Problem(
+            points,
+            np.zeros((4, 2)),
+            CAMERA,
+            Alignment(np.eye(3), [0, 0, 10], [1, 1.0, 2.0]),
+            np.array([False, False, False, True]),
+        )
+        angle = np.radians(0.4)
+        turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        est = FitResult(
+            alignment=Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99]),
+            points_3d=points,
+            residuals=np.zeros((4, 2)),
+            inliers=np.array([True, False, True, True]),
+            method="",
+            camera=CAMERA,
+        )
+        labels = {"image": "a", "draw": 0, "outliers": 0.25}
+        row = CorrespondenceOutcome.of_fit(est, truth, method="ransac-optimal", **labels)
+        assert row.rotation_error_deg == pytest.approx(0.4)
+        assert row.translation_error == pytest.approx(0.05)
+        assert (row.scale_y_error, row.scale_z_error) == pytest.approx((0.005, 0.005))
+        assert row.success
+        assert (row.inliers, row.inlier_precision, row.inlier_recall) == (3, 2 / 3, 2 / 3)
+        every = replace(est, inliers=np.ones(4, dtype=bool))
+        row = CorrespondenceOutcome.of_fit(every, truth, method="ransac-optimal", **labels)
+        assert (row.inliers, row.inlier_precision, row.inlier_recall) == (4, 3 / 4, 1)
+        for scale in ([1, 1.02, 2.0], [1, 1.0, 1.97]):
+            off = replace(est, alignment=Alignment(turn, [0, 0, 10], scale))
+            assert not CorrespondenceOutcome.of_fit(off, truth, method="epnp", **labels).success
+
+    def test_options_of_the_search_reach_it(self):
+        problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))
+        given = (problem.points_3d, problem.points_2d, problem.camera)
+        wide = fit_with("ransac-optimal", *given, ransac=RansacOptions(max_reproj_error=4.0))
+        narrow = fit_with("ransac-optimal", *given, ransac=RansacOptions(max_reproj_error=0.1))
+        assert narrow.inliers.sum() < wide.inliers.sum() <= 44
+        # The method's own minimal solver is taken, whatever the options say.
+        few = fit_with("ransac-aepnp", *given, ransac=RansacOptions(minimal="ap4p", seed=1))
+        assert few.method == "ransac-aepnp"
+
+    def test_too_few_points_become_a_failed_row_with_the_reason(self):
+        few = seen_image("a", 1).subset(np.arange(5))
+        task = CorrespondenceTask("a", 0.0, 0, few)
+        options = CorrespondenceOptions(methods=("aepnp-paper", "epnp"))
+        paper, epnp = CorrespondenceExperiment(options).evaluate([task]).rows
+        assert (paper["status"], epnp["status"]) == ("failed", "ok")
+        assert "5" in paper["reason"]
+        assert (paper["points"], paper["success"], paper["rotation_error_deg"]) == (5, False, None)
+
+
+class TestBrokenImages:
+    def test_one_becomes_failed_rows_and_the_others_go_on(self, tmp_path, capsys, no_figures):
+        root = write_colmap(tmp_path / "model", images=3, broken=(1,))
+        out = tmp_path / "run"
+        arguments = ["evaluate", "correspondences", str(root), "--outliers", "0", "--draws", "2"]
+        arguments += ["--methods", "epnp", "ransac-optimal", "--workers", "0", "--out", str(out)]
+        assert main(arguments) == 3
+        rows = read_table(RunFolder(out).results).to_pylist()
+        failed = [row for row in rows if row["status"] == "failed"]
+        assert len(rows) == 12
+        assert {row["image"] for row in failed} == {"1.jpg"}
+        assert len(failed) == 4
+        assert all("point 10000" in row["reason"] and row["points"] is None for row in failed)
+        assert "4 of 12 rows failed, 4 of them because their image" in capsys.readouterr().err
+        for summary in summarize_correspondences(RunFolder(out)):
+            assert (summary.inputs, summary.failed, summary.unreadable) == (4, 0, 2)
+            assert math.isfinite(summary.rotation_error_deg.upper)
+
+    def test_nothing_but_broken_ones_is_refused(self, tmp_path):
+        root = write_colmap(tmp_path, images=2, broken=(0, 1))
+        with pytest.raises(DataError, match=r"none of 2 images can be read.*do not exist"):
+            CorrespondenceTasks(open_correspondences(root), QUICK)
+
+
+class TestRuns:
+    def test_only_the_first_images_are_taken_if_asked_for(self, colmap, tmp_path):
+        rows = run(colmap, tmp_path / "run", replace(QUICK, max_images=1))
+        assert {row["image"] for row in rows} == {"0.jpg"}
+
+    def test_the_same_command_does_nothing_twice_and_other_data_are_refused(self, tmp_path):
+        root = write_colmap(tmp_path / "model")
+        rows = run(root, tmp_path / "run")
+        before = RunFolder(tmp_path / "run").results.stat().st_mtime_ns
+        assert run(root, tmp_path / "run") == rows
+        assert RunFolder(tmp_path / "run").results.stat().st_mtime_ns == before
+        file = root / "points3D.txt"
+        lines = file.read_text().split("\n")
+        number, x, rest = lines[0].split(" ", 2)
+        lines[0] = f"{number} {float(x) + 1e-6!r} {rest}"
+        file.write_text("\n".join(lines))
+        with pytest.raises(DataError, match="another configuration: correspondences is"):
+            run(root, tmp_path / "run")
+
+    @pytest.mark.slow
+    def test_results_are_the_same_bytes_with_and_without_workers(self, colmap, tmp_path):
+        options = CorrespondenceOptions(outliers=(0.0, 0.4), draws=5)
+        run(colmap, tmp_path / "none", options, workers=0)
+        run(colmap, tmp_path / "two", options, workers=2)
+        one, other = RunFolder(tmp_path / "none"), RunFolder(tmp_path / "two")
+        assert one.results.read_bytes() == other.results.read_bytes()
+        assert one.config_file.read_bytes() == other.config_file.read_bytes()
+
+
+class TestReport:
+    def test_failures_count_as_infinite(self):
+        values = np.array([1.0, 2.0, np.inf, np.inf])
+        found = Quartiles.of(values)
+        assert (found.lower, found.median) == (1.0, 2.0)
+        assert math.isnan(found.upper)
+        assert Quartiles.of(np.arange(1.0, 101.0)) == Quartiles(25.0, 50.0, 75.0)
+
+    def test_summaries_agree_with_the_rows(self, finished):
+        rows = read_table(finished.results).to_pylist()
+        for summary in summarize_correspondences(finished):
+            some = [
+                row
+                for row in rows
+                if (row["outliers"], row["method"]) == (summary.outliers, summary.method)
+            ]
+            assert (summary.inputs, summary.failed, summary.unreadable) == (4, 0, 0)
+            assert summary.success == np.mean([row["success"] for row in some])
+            errors = sorted(row["scale_z_error"] for row in some)
+            assert summary.scale_z_error == Quartiles(*errors[:3])
+            assert summary.milliseconds.median > 0
+            assert math.isnan(summary.inlier_recall) == (summary.method == "epnp")
+
+    def test_table_and_figures_are_written(self, finished):
+        write_correspondences_report(finished)
+        with finished.summary.open() as file:
+            rows = list(csv.DictReader(file))
+        assert [(row["outliers"], row["method"]) for row in rows] == [
+            ("0.0", "epnp"),
+            ("0.0", "ransac-optimal"),
+            ("0.3", "epnp"),
+            ("0.3", "ransac-optimal"),
+        ]
+        assert float(rows[1]["rotation_error_deg_median"]) < 0.5
+        assert rows[0]["inlier_recall"] == ""
+        assert rows[1]["success"] == "1.0"
+        metrics = (
+            "rotation_error_deg",
+            "translation_error",
+            "scale_y_error",
+            "scale_z_error",
+            "success",
+            "milliseconds",
+        )
+        for metric in metrics:
+            for ending in ("png", "pdf"):
+                file = finished.figures / f"outliers_{metric}.{ending}"
+                assert file.stat().st_size > 5000
+
+    def test_a_method_that_fails_everywhere_has_no_quartiles_but_a_figure(self, colmap, tmp_path):
+        folder = RunFolder(tmp_path / "run")
+        # Nothing agrees to a thousandth of a pixel.
+        options = CorrespondenceOptions(
+            outliers=(0.2,), draws=1, methods=("ransac-ap4p",), max_reproj_error=1e-3
+        )
+        assert {row["status"] for row in run(colmap, folder.path, options)} == {"failed"}
+        (summary,) = summarize_correspondences(folder)
+        assert (summary.failed, summary.success) == (2, 0)
+        assert math.isnan(summary.rotation_error_deg.lower)
+        files = draw_quartiles(tmp_path / "figure", [summary], "rotation_error_deg")
+        assert all(file.is_file() for file in files)
+
+
+class TestCommand:
+    def test_it_prints_a_table_and_where_the_run_is(self, colmap, tmp_path, capsys, no_figures):
+        arguments = ["evaluate", "correspondences", str(colmap), "--outliers", "0.5", "--draws"]
+        arguments += ["1", "--methods", "ransac-optimal", "--workers", "0"]
+        assert main([*arguments, "--out", str(tmp_path / "run")]) == 0
+        printed = capsys.readouterr()
+        (line,) = [line for line in printed.out.split("\n") if "ransac-optimal" in line]
+        assert line.split()[:5] == ["50", "%", "ransac-optimal", "0", "100.0"]
+        assert "…" not in printed.out
+        assert "0 of 2 rows failed" in printed.err
+
+    def test_json_is_valid_and_complete(self, colmap, tmp_path, capsys, no_figures):
+        arguments = ["evaluate", "correspondences", str(colmap), "--format", "colmap", "--draws"]
+        arguments += ["1", "--outliers", "0", "0.4", "--methods", "epnp", "ransac-optimal"]
+        arguments += ["--workers", "0", "--out", str(tmp_path / "run"), "--json"]
+        assert main(arguments) == 0
+
+        def refuse(name):
+            raise AssertionError(name)
+
+        found = json.loads(capsys.readouterr().out, parse_constant=refuse)
+        assert (found["rows"], found["failed"], len(found["summary"])) == (8, 0, 4)
+        assert found["summary"][0]["inlier_recall"] is None
+        assert found["summary"][3]["rotation_error_deg"]["median"] < 0.5
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (["--outliers", "1"], "1 is not a share of wrong points"),
+            (["--outliers", "0", "-0.1"], "-0.1 is not a share of wrong points"),
+            (["--outliers", "nan"], "nan is not a share of wrong points"),
+            (["--methods", "ransac-optimum"], "did you mean 'ransac-optimal'?"),
+            (["--methods", "limit"], "the limit needs the noise"),
+            (["--draws", "0"], "draws: 0 is less than 1"),
+            (["--max-reproj-error", "0"], "max_reproj_error"),
+            (["--max-iterations", "0"], "max_iterations"),
+            (["--max-images", "0"], "max_images: 0 is less than 1"),
+            (["--workers", "-2"], "-2 is not a number of processes"),
+        ],
+    )
+    def test_a_bad_option_is_refused_before_anything_is_done(
+        self, colmap, tmp_path, capsys, options, message
+    ):
+        out = tmp_path / "run"
+        arguments = ["evaluate", "correspondences", str(colmap), "--out", str(out), *options]
+        assert main(arguments) == 1
+        assert message in capsys.readouterr().err
+        assert not out.exists()
+
+    def test_an_unknown_format_is_a_wrong_command_line(self, colmap, tmp_path):
+        with pytest.raises(SystemExit) as error:
+            main(["evaluate", "correspondences", str(colmap), "--format", "nerf"])
+        assert error.value.code == 2
+
+    def test_an_empty_folder_is_refused(self, tmp_path, capsys):
+        out = tmp_path / "run"
+        (tmp_path / "empty").mkdir()
+        arguments = ["evaluate", "correspondences", str(tmp_path / "empty"), "--out", str(out)]
+        assert main(arguments) == 1
+        assert "no correspondences of a known format" in capsys.readouterr().err
+        assert not out.exists()
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["maupertuis_colmap", "balbianello"])
+class TestRealModels:
+    def test_the_robust_optimum_succeeds_where_others_do_not(self, name, tmp_path):
+        options = CorrespondenceOptions(
+            outliers=(0.0, 0.5),
+            draws=3,
+            methods=(
+                "epnp",
+                "aepnp-paper",
+                "ransac-aepnp",
+                "ransac-aepnp-refined",
+                "ransac-optimal",
+            ),
+        )
+        folder = RunFolder(tmp_path / "run")
+        run(Path(str(DATA)) / "sfm" / name, folder.path, options)
+        found = {(s.outliers, s.method): s for s in summarize_correspondences(folder)}
+        for share in (0.0, 0.5):
+            assert found[share, "ransac-optimal"].success == 1
+            assert found[share, "ransac-optimal"].inlier_recall > 0.95
+            assert found[share, "ransac-aepnp-refined"].success == 1
+            assert found[share, "epnp"].success == 0
+            refined = found[share, "ransac-aepnp-refined"].rotation_error_deg.median
+            assert refined < 0.3 * found[share, "ransac-aepnp"].rotation_error_deg.median
+        assert found[0.0, "aepnp-paper"].success == 1
+        assert found[0.5, "aepnp-paper"].success == 0
+
+    def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, name, tmp_path):
+        options = CorrespondenceOptions(
+            outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")
+        )
+        folder = RunFolder(tmp_path / "run")
+        run(Path(str(DATA)) / "sfm" / name, folder.path, options)
+        six, four = summarize_correspondences(folder)
+        assert four.success == 1
+        assert six.success < 0.5

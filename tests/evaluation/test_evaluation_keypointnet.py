@@ -1,0 +1,236 @@
+"""The KeypointNet experiment: rows, failures, summaries, overlays, the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cadalign
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.accuracy.outcome import FAILED, OK, Outcome
+from cadalign.evaluation.accuracy.summary import summarize, summary_csv
+from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+
+METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
+
+
+def entry(model_id: str, points: Any) -> dict[str, Any]:
+    keypoints = [
+        {
+            "xyz": point,
+            "semantic_id": row,
+            "mesh_info": {"face_index": 0, "face_uv": [1.0, 0.0, 0.0]},
+        }
+        for row, point in enumerate(np.asarray(points).tolist())
+    ]
+    return {"class_id": "03624134", "model_id": model_id, "keypoints": keypoints}
+
+
+@pytest.fixture
+def annotated(tmp_path: Path) -> Path:
+    """Knives without meshes: a good one, a flat one, one with few keypoints, a malformed one."""
+    rng = np.random.default_rng(0)
+    good = rng.uniform(-0.3, 0.3, (12, 3))
+    entries = [entry("good", good), entry("flat", good * [1, 1, 0]), entry("few", good[:5])]
+    entries.append({**entry("malformed", good), "keypoints": "none"})
+    folder = tmp_path / "data" / "annotations"
+    folder.mkdir(parents=True)
+    (folder / "knife.json").write_text(json.dumps(entries))
+    return folder.parent
+
+
+def evaluate(root: Path, **options: Any) -> Any:
+    return cadalign.evaluate(root, workers=0, **options)
+
+
+def test_every_model_view_and_method_has_a_row(sample_root: Path) -> None:
+    table = evaluate(sample_root, views_per_model=2, methods=["optimal", "epnp", "limit"])
+    assert len(table) == 4 * 2 * 3
+    assert not table.duplicated(["category", "model_id", "view", "method"]).any()
+    assert (table.status == OK).all()
+    assert (table.visibility == "rays").all()
+    optimal = table[table.method == "optimal"]
+    assert (optimal.rotation_error_deg < 10).all()
+    assert optimal.box_iou.between(0.3, 1).all()
+    assert (optimal.keypoints >= 6).all()
+
+
+def test_without_noise_the_optimum_is_exact(sample_root: Path) -> None:
+    table = evaluate(sample_root, noise_px=0.0, methods=["optimal", "limit"])
+    for metric in METRICS:
+        assert (table[metric] < 1e-5).all(), metric
+    assert (table.box_iou > 1 - 1e-5).all()
+    assert (table.sym_box_iou > 1 - 1e-5).all()
+
+
+def test_symmetry_aware_errors_never_exceed_the_plain_ones(sample_root: Path) -> None:
+    table = evaluate(sample_root, methods=["optimal", "epnp", "aepnp-paper"], views_per_model=3)
+    assert (table.sym_rotation_error_deg <= table.rotation_error_deg + 1e-9).all()
+    bottles = table[table.category == "bottle"]
+    assert (bottles.symmetry == "circle").all()
+    assert (bottles.sym_rotation_error_deg < bottles.rotation_error_deg).all()
+    chairs = table[table.category == "chair"]
+    assert (chairs.sym_rotation_error_deg == chairs.rotation_error_deg).all()
+
+
+def test_models_that_cannot_be_used_become_failed_rows(annotated: Path) -> None:
+    table = evaluate(annotated, methods=["optimal", "aepnp", "limit"])
+    assert len(table) == 4 * 3
+    good = table[table.model_id == "good"]
+    assert (good.status == OK).all()
+    assert (good.visibility == "hull").all()
+    failed = table[table.model_id != "good"]
+    assert (failed.status == FAILED).all()
+    assert (failed.reason != "").all()
+    reasons = failed.groupby("model_id").reason.first()
+    assert "there are only 5" in reasons["few"]
+    assert "keypoints" in reasons["malformed"]
+    assert reasons["flat"]
+    for metric in METRICS:
+        assert failed[metric].isna().all()
+
+
+def test_rays_without_a_mesh_are_a_failed_row(annotated: Path) -> None:
+    table = evaluate(annotated, methods=["optimal"], visibility="rays")
+    reason = table[table.model_id == "good"].reason.item()
+    assert "there is no mesh" in reason
+
+
+def test_an_instance_does_not_depend_on_its_neighbours(sample_root: Path) -> None:
+    tasks = KeypointTasks(KeypointNet(sample_root), views=2)
+    experiment = KeypointNetExperiment(("optimal", "aepnp-paper", "limit"))
+    together = experiment.evaluate(tasks[:]).rows
+    alone = [row for task in reversed(tasks[:]) for row in experiment.evaluate([task]).rows]
+    assert sorted(map(str, together)) == sorted(map(str, alone))
+
+
+def test_a_run_does_not_go_on_with_other_annotations(annotated: Path, tmp_path: Path) -> None:
+    evaluate(annotated, out=tmp_path / "run", methods=["aepnp"])
+    file = annotated / "annotations" / "knife.json"
+    entries = json.loads(file.read_text())
+    entries[0]["keypoints"][0]["xyz"][0] += 0.01
+    file.write_text(json.dumps(entries))
+    with pytest.raises(DataError, match="annotations is"):
+        evaluate(annotated, out=tmp_path / "run", methods=["aepnp"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"categories": ["chiar"]}, "did you mean 'chair'"),
+        ({"split": "trian"}, "unknown split"),
+        ({"methods": ["optimum"]}, "did you mean 'optimal'"),
+        ({"methods": []}, "none is given"),
+        ({"noise_px": float("nan")}, "not a noise level"),
+        ({"noise_px": -1.0}, "not a noise level"),
+        ({"min_visible": 0}, "min_visible"),
+        ({"views_per_model": 0}, "views_per_model"),
+        ({"visibility": "guess"}, "known are auto, rays, hull"),
+    ],
+)
+def test_bad_options_are_named(sample_root: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        evaluate(sample_root, **options)
+
+
+def test_a_folder_without_annotations_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no annotations"):
+        evaluate(tmp_path)
+
+
+def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    options = ["--render", "overlay", "--workers", "0", "--methods", "optimal"]
+    arguments = ["evaluate", "keypointnet", str(sample_root), "--out", str(out), *options]
+    assert main([*arguments, "--categories", "chair", "car"]) == 0
+    models = KeypointNet(sample_root).subset(categories=["chair", "car"])
+    wanted = {exhibit_stem(*key) for key in models.ids()}
+    endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "sketches": ".json"}
+    for folder, ending in endings.items():
+        files = {path.name for path in (out / folder).iterdir()}
+        assert files == {f"{name}{ending}" for name in wanted}
+    assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}
+
+
+def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(
+    annotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = str(tmp_path / "run")
+    options = ["--out", run, "--workers", "0", "--methods", "optimal", "limit", "--json"]
+    assert main(["evaluate", "keypointnet", str(annotated), *options]) == 3
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["rows"], printed["failed"]) == (8, 6)
+    assert {row["method"] for row in printed["summary"]} == {"optimal", "limit"}
+    assert main(["evaluate", "show", run, "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["summary"] == printed["summary"]
+
+
+def test_a_run_of_nothing_but_failures_exits_with_1(annotated: Path, tmp_path: Path) -> None:
+    options = ["--min-visible", "13", "--methods", "aepnp", "--out", str(tmp_path / "run")]
+    assert main(["evaluate", "keypointnet", str(annotated), "--workers", "0", *options]) == 1
+
+
+@pytest.mark.parametrize("content", [None, '{"experiment": "simulate"}'])
+def test_show_refuses_what_is_no_evaluation(
+    tmp_path: Path, content: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / "run.json").write_text(content)
+    assert main(["evaluate", "show", str(tmp_path)]) == 1
+    assert "not the folder of an evaluation" in capsys.readouterr().err
+
+
+def outcome(method: str, error: float | None, *, category: str = "chair") -> Outcome:
+    labels = {"category": category, "model_id": "m", "view": 0, "method": method}
+    if error is None:
+        return Outcome.of_failure("why", **labels)
+    blank = Outcome.of_failure("", **labels)
+    numbers = dict.fromkeys(("rotation_error_deg", "sym_rotation_error_deg"), error)
+    small = {"sym_translation_error": 0.06, "scale_y_error": 0.01, "scale_z_error": 0.01}
+    other = {"translation_error": 0.06, "keypoints": 7}
+    return Outcome(**{**vars(blank), "status": OK, **numbers, **small, **other})
+
+
+def test_failed_rows_count_against_success_and_not_in_medians() -> None:
+    rows = [outcome("optimal", error) for error in (1.0, 4.0, 9.0, 30.0, None)]
+    rows += [outcome("limit", 2.0)]
+    optimal, limit = summarize(rows)
+    assert (optimal.instances, optimal.failed) == (5, 1)
+    assert optimal.rotation_error_deg == 6.5
+    assert optimal.success_5deg_5pct == 0.0  # the translation is 6 % off
+    assert optimal.success_10deg_10pct == pytest.approx(3 / 5)
+    assert optimal.over_limit == pytest.approx(3.25)
+    assert limit.over_limit == 1.0
+    assert np.isnan(optimal.box_iou)
+
+
+def test_a_category_where_all_failed_has_empty_cells() -> None:
+    summaries = summarize([outcome("optimal", None)])
+    assert summaries[0].cells() == ["-"] * 6
+    assert summary_csv(summaries).splitlines()[1].startswith("chair,optimal,1,1,,,")
+
+
+@pytest.mark.slow
+def test_the_optimum_beats_the_published_solver_and_is_at_the_limit(real_data: Path) -> None:
+    table = evaluate(
+        real_data / "keypointnet",
+        methods=["optimal", "aepnp-paper", "limit"],
+        visibility="hull",
+        categories=["chair", "bottle", "airplane", "mug", "bathtub", "guitar"],
+    )
+    solved = table[table.status == OK]
+    medians = solved.groupby(["category", "method"])[[*METRICS]].median()
+    for category in solved.category.unique():
+        optimal, paper, limit = (
+            medians.loc[category, name] for name in ("optimal", "aepnp-paper", "limit")
+        )
+        assert (optimal < paper).all(), category
+        assert optimal.rotation_error_deg < 1.15 * limit.rotation_error_deg, category

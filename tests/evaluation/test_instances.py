@@ -1,0 +1,162 @@
+"""Instances without a mesh, methods by name, and the limit as a method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign import Alignment, fit
+from cadalign.arrays import FloatArray
+from cadalign.errors import DegenerateError, InputError
+from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, limit_estimate
+from cadalign.evaluation.accuracy.methods import LIMIT, check_methods, fit_with, method_names
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, make_hull_instance
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.metrics import rotation_error
+
+CUBE = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) / 4
+
+
+def cloud(seed: int = 0, count: int = 14) -> FloatArray:
+    return np.random.default_rng(seed).uniform(-0.3, 0.3, (count, 3)) + [0.05, -0.1, 0.1]
+
+
+def test_only_the_far_corner_of_a_cube_is_hidden_from_a_corner() -> None:
+    visible = KeypointHull(CUBE).visible_from(np.array([4.0, 4.0, 4.0]))
+    assert visible.tolist() == [False] + [True] * 7
+
+
+def test_the_far_face_of_a_cube_is_hidden_from_the_front() -> None:
+    visible = KeypointHull(CUBE).visible_from(np.array([0.0, 0.0, 9.0]))
+    assert visible.tolist() == (CUBE[:, 2] > 0).tolist()
+
+
+@pytest.mark.parametrize("points", [CUBE[:3], CUBE[CUBE[:, 0] > 0]])
+def test_keypoints_without_a_hull_are_all_visible(points: FloatArray) -> None:
+    assert KeypointHull(points).visible_from(np.array([0.0, 3.0, 0.0])).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_views_fill_the_image_and_stay_inside(seed: int) -> None:
+    hull = KeypointHull(cloud(seed))
+    rng = np.random.default_rng(seed)
+    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=6)
+    low, high = hull.bounds
+    corners = (low + high) / 2 + hull.corners
+    offset = np.abs(KEYPOINT_CAMERA.project(pose.apply(corners)) - [319.5, 239.5])
+    share = (2 * offset / [640, 480]).max()
+    assert 0.7 - 1e-9 <= share <= 0.95 + 1e-9
+    assert visible.sum() >= 6
+    up = pose.rotation[:, 1]
+    assert up[1] < 0
+    assert abs(up[0]) < 1e-12
+    assert np.linalg.det(pose.rotation) == pytest.approx(1.0)
+
+
+def test_a_view_off_the_principal_point_fills_as_much() -> None:
+    camera = Camera(640, 480, 900.0, 800.0, 250.0, 300.0)
+    hull = KeypointHull(cloud(3))
+    pose, _ = sample_hull_view(hull, camera, rng=np.random.default_rng(1), min_visible=6)
+    corners = hull.bounds.mean(axis=0) + hull.corners
+    offset = np.abs(camera.project(pose.apply(corners)) - [319.5, 239.5])
+    assert 0.7 - 1e-9 <= (2 * offset / [640, 480]).max() <= 0.95 + 1e-9
+
+
+def test_too_few_keypoints_are_an_error_that_says_how_many() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(DegenerateError, match="there are only 5"):
+        sample_hull_view(KeypointHull(cloud(count=5)), KEYPOINT_CAMERA, rng=rng, min_visible=6)
+    with pytest.raises(DegenerateError, match="the best of 100 views shows"):
+        sample_hull_view(KeypointHull(CUBE), KEYPOINT_CAMERA, rng=rng, min_visible=8)
+
+
+def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
+    instance = make_hull_instance(
+        KeypointHull(cloud()), np.arange(14), names=("chair", "a"), noise_px=0.0
+    )
+    projected = instance.camera.project(instance.gt.apply(instance.points_3d))
+    assert np.allclose(projected, instance.points_2d)
+    result = fit(instance.points_3d, instance.points_2d, instance.camera)
+    assert np.allclose(result.alignment.scale, instance.gt.scale, rtol=1e-6)
+    assert instance.visibility == "hull"
+    assert (instance.gt.scale[1:] >= 0.5).all()
+    assert (instance.gt.scale[1:] <= 2).all()
+
+
+def test_instances_follow_from_seed_and_names_alone() -> None:
+    def points(seed: int, model: str, view: int) -> FloatArray:
+        instance = make_hull_instance(
+            KeypointHull(cloud()), np.arange(14), names=("chair", model), seed=seed, view_index=view
+        )
+        return instance.points_2d
+
+    first = points(0, "a", 0)
+    assert np.array_equal(first, points(0, "a", 0))
+    for other in (points(1, "a", 0), points(0, "b", 0), points(0, "a", 1)):
+        assert first.shape != other.shape or not np.array_equal(first, other)
+
+
+def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> None:
+    rng = np.random.default_rng(0)
+    problem = simulate_problem(rng, points=12, noise_px=0.0)
+    gt = problem.alignment
+    steps = []
+    for _ in range(4000):
+        noisy = problem.points_2d + 0.01 * rng.standard_normal(problem.points_2d.shape)
+        est = limit_estimate(problem.points_3d, noisy, problem.camera, gt)
+        turn = est.rotation @ gt.rotation.T
+        vector = np.array(
+            [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        )
+        steps.append(
+            [*vector / 2, *(est.translation - gt.translation), *np.log(est.scale / gt.scale)[1:]]
+        )
+    bound = cramer_rao_bound(problem.points_3d, problem.camera, gt, sigma=0.01)
+    spread = np.sqrt(np.diag(bound))
+    assert np.allclose(np.std(steps, axis=0) / spread, 1.0, atol=0.05)
+    correlation = np.cov(np.transpose(steps)) / np.outer(spread, spread)
+    assert np.allclose(correlation, bound / np.outer(spread, spread), atol=0.08)
+
+
+def test_at_little_noise_the_optimum_is_the_limits_estimate() -> None:
+    problem = simulate_problem(np.random.default_rng(2), points=15, noise_px=0.01)
+    arguments = (problem.points_3d, problem.points_2d, problem.camera)
+    limit = limit_estimate(*arguments, problem.alignment)
+    found = fit(*arguments).alignment
+    error = rotation_error(est=found, gt=problem.alignment)
+    assert rotation_error(est=found, gt=limit) < 0.01 * error
+
+
+def test_without_noise_the_limit_is_the_truth() -> None:
+    problem = simulate_problem(np.random.default_rng(3), points=8, noise_px=0.0)
+    est = limit_estimate(problem.points_3d, problem.points_2d, problem.camera, problem.alignment)
+    assert np.allclose(est.rotation, problem.alignment.rotation)
+    assert np.allclose(est.scale, problem.alignment.scale)
+
+
+def test_the_limit_refuses_keypoints_in_one_plane() -> None:
+    points = cloud()
+    points[:, 2] = 0.0
+    gt = Alignment(np.eye(3), [0, 0, 3], [1, 1, 1])
+    camera = Camera.from_fov(640, 480, fov_x=60.0)
+    with pytest.raises(DegenerateError, match="do not determine"):
+        limit_estimate(points, camera.project(gt.apply(points)), camera, gt)
+
+
+@pytest.mark.parametrize("name", [name for name in method_names() if name != LIMIT])
+def test_every_method_solves_an_easy_problem(name: str) -> None:
+    problem = simulate_problem(
+        np.random.default_rng(4), points=30, noise_px=0.0, stretch=(1.0, 1.0)
+    )
+    result = fit_with(name, problem.points_3d, problem.points_2d, problem.camera)
+    assert rotation_error(est=result.alignment, gt=problem.alignment) < 1e-3
+
+
+def test_an_unknown_method_is_named_with_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean 'optimal'"):
+        check_methods(["optimum"])
+    with pytest.raises(InputError, match="none is given"):
+        check_methods([])
+    assert check_methods(["aepnp", "aepnp"]) == ("aepnp",)

@@ -1,0 +1,398 @@
+"""`cadalign evaluate retrieval`: queries, protocols, rows, summaries, runs, refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Box, Library
+from cadalign.cli import main
+from cadalign.errors import DataError, DegenerateError, InputError
+from cadalign.evaluation.retrieval import figures as retrieval_report
+from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, run_retrieval, same_shapes
+from cadalign.evaluation.retrieval.figures import summarize_retrieval, write_retrieval_report
+from cadalign.evaluation.retrieval.tasks import (
+    RetrievalEvaluation,
+    RetrievalTask,
+    observe_model,
+    retrieval_tasks,
+)
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_table
+from cadalign.geometry.metrics import box_iou
+from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.shape import distances
+
+QUICK = RetrievalEvaluation(noises_px=(1.0,), keypoints=(6, 8))
+
+
+def make_model(number: int, *, keypoints: int = 12, category: str = "box") -> LibraryModel:
+    """Models about 15 % of their extent apart."""
+    base = np.random.default_rng(0).uniform(-0.3, 0.3, (keypoints, 3))
+    xyz = base + 0.05 * np.random.default_rng(1 + number).standard_normal((keypoints, 3))
+    bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+    return LibraryModel(category, f"{number:03d}", xyz, np.arange(keypoints), bounds)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """30 models, the last of which is the first one, stretched."""
+    models = [make_model(number) for number in range(29)]
+    models.append(replace(models[0], model_id="029", xyz=models[0].xyz * [1, 1.3, 0.8]))
+    path = tmp_path_factory.mktemp("library") / "boxes.cadalign"
+    Library.from_models(models).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(library: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
+    run_retrieval(library, QUICK, folder, workers=0)
+    return folder
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the writing of figures, which takes seconds and has a test of its own."""
+    monkeypatch.setattr(retrieval_report, "save_figure", lambda figure, path: [])
+
+
+def rows_of(folder: RunFolder, **wanted: Any) -> list[dict[str, Any]]:
+    rows = read_table(folder.results).to_pylist()
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+class TestQueries:
+    def test_keypoints_are_those_of_the_stretched_model_with_noise(self) -> None:
+        model = make_model(3)
+        errors = []
+        for seed in range(40):
+            task = RetrievalTask("box", "003", 2.0, 7)
+            query = observe_model(model, task, seed=seed)
+            assert len(query.points_2d) == 7
+            assert len(set(query.semantic_ids.tolist())) == 7
+            projected = query.camera.project(query.gt.apply(model.xyz[query.semantic_ids]))
+            errors.append(query.points_2d - projected)
+            assert query.gt.scale[0] == 1
+            assert ((query.gt.scale[1:] > 0.5) & (query.gt.scale[1:] < 2)).all()
+        assert np.std(errors) == pytest.approx(2.0, rel=0.1)
+
+    def test_they_depend_on_seed_and_task_alone(self) -> None:
+        model, task = make_model(3), RetrievalTask("box", "003", 1.0, 7)
+        one = observe_model(model, task, seed=0)
+        np.testing.assert_array_equal(one.points_2d, observe_model(model, task, seed=0).points_2d)
+        for other, seed in ((task, 1), (replace(task, noise_px=2.0), 0)):
+            assert (observe_model(model, other, seed=seed).points_2d != one.points_2d).all()
+
+    def test_a_model_that_shows_too_few_keypoints_is_refused(self) -> None:
+        with pytest.raises(DegenerateError, match="13 keypoints should be visible, but"):
+            observe_model(make_model(3), RetrievalTask("box", "003", 1.0, 13), seed=0)
+
+    def test_tasks_are_the_models_with_enough_keypoints(self) -> None:
+        models = [make_model(1), make_model(2, keypoints=7), make_model(3, category="can")]
+        library = Library.from_models(models)
+        options = RetrievalEvaluation(noises_px=(5, 1), keypoints=(9, 6))
+        found = [(t.model_id, t.noise_px, t.keypoints) for t in retrieval_tasks(library, options)]
+        cases = [(1, 6), (1, 9), (5, 6), (5, 9)]
+        expected = [("001", *case) for case in cases] + [("002", 1, 6), ("002", 5, 6)]
+        assert found == expected + [("003", *case) for case in cases]
+        some = replace(options, categories=("can",))
+        assert {task.category for task in retrieval_tasks(library, some)} == {"can"}
+        few = replace(options, max_models=1)
+        assert {task.model_id for task in retrieval_tasks(library, few)} == {"001", "003"}
+
+    def test_models_that_differ_by_stretch_count_as_one(self, library: Path) -> None:
+        assert same_shapes(str(library), ("box", "000")) == {("box", "000"), ("box", "029")}
+        assert same_shapes(str(library), ("box", "005")) == {("box", "005")}
+
+
+class TestRows:
+    def test_there_is_one_for_each_query_protocol_and_method(self, finished: RunFolder) -> None:
+        rows = rows_of(finished)
+        assert len(rows) == 30 * 2 * 2 * 2
+        assert {row["status"] for row in rows} == {"ok"}
+        keys = [(r["model_id"], r["keypoints"], r["protocol"], r["method"]) for r in rows]
+        assert len(set(keys)) == len(rows)
+        assert keys[:4] == [
+            ("000", 6, protocol, method)
+            for protocol in ("leave-in", "leave-out")
+            for method in ("optimal", "epnp")
+        ]
+
+    def test_the_true_model_comes_first_with_stretch_and_less_often_without(self, finished) -> None:
+        with_stretch = rows_of(finished, protocol="leave-in", method="optimal", keypoints=8)
+        without = rows_of(finished, protocol="leave-in", method="epnp", keypoints=8)
+        assert np.mean([row["rank"] == 1 for row in with_stretch]) > 0.95
+        assert np.mean([row["rank"] == 1 for row in without]) < 0.85
+        assert np.median([row["box_iou"] for row in with_stretch]) > 0.7
+
+    def test_what_counts_as_the_true_model_has_its_rank(self, finished) -> None:
+        for model_id in ("000", "029"):
+            rows = rows_of(finished, protocol="leave-in", method="optimal", model_id=model_id)
+            assert {row["alike"] for row in rows} == {2}
+            for row in rows:
+                if row["matched_id"] in ("000", "029"):
+                    assert row["rank"] == 1
+                    assert row["shape_distance"] < 1e-9
+
+    def test_left_out_models_and_those_that_count_as_them_are_gone(self, finished) -> None:
+        for row in rows_of(finished, protocol="leave-out"):
+            assert row["rank"] is None
+            assert row["matched_id"] != row["model_id"]
+            assert {row["matched_id"], row["model_id"]} != {"000", "029"}
+            assert row["shape_distance"] > 0.01
+
+    def test_numbers_are_those_of_the_best_match(self, finished, library: Path) -> None:
+        opened = Library.open(library)
+        row = rows_of(finished, model_id="007", protocol="leave-out", method="optimal")[1]
+        task = RetrievalTask("box", "007", 1.0, 8)
+        model = opened["box", "007"]
+        query = observe_model(model, task, seed=0)
+        best = opened.retrieve(
+            query.points_2d,
+            query.semantic_ids,
+            query.camera,
+            shape_sigma=QUICK.shape_sigma,
+            exclude=[("box", "007")],
+            top=50,
+        )[0]
+        assert row["matched_id"] == best.model_id
+        assert row["score"] == pytest.approx(best.score)
+        assert row["rms_px"] == pytest.approx(best.rms)
+        truth = Box.from_model(model.bounds, query.gt)
+        assert row["box_iou"] == pytest.approx(box_iou(est=best.box, gt=truth))
+
+    def test_without_a_view_there_was_nothing_to_ask(self, tmp_path: Path) -> None:
+        """Keypoints inside the hull are never all visible."""
+        xyz = np.vstack(
+            [make_model(1).xyz[:8], np.random.default_rng(5).uniform(-0.01, 0.01, (6, 3))]
+        )
+        model = replace(make_model(1, keypoints=12), xyz=xyz, semantic_ids=np.arange(14))
+        other = replace(model, model_id="2", xyz=xyz * [1.1, 1, 1])
+        path = tmp_path / "lib"
+        Library.from_models([model, other]).save(path)
+        options = replace(QUICK, keypoints=(14,), methods=("optimal",))
+        rows = (
+            RetrievalExperiment(str(path), options)
+            .evaluate([RetrievalTask("box", "001", 1.0, 14)])
+            .rows
+        )
+        assert [row["status"] for row in rows] == ["no view", "no view"]
+        assert "14 keypoints should be visible" in rows[0]["reason"]
+
+    def test_flat_models_have_no_box_overlap(self, tmp_path: Path) -> None:
+        models = [make_model(number) for number in range(5)]
+        flat = [replace(m, bounds=m.bounds * [1, 1, 0]) for m in models]
+        path = tmp_path / "lib"
+        Library.from_models(flat).save(path)
+        experiment = RetrievalExperiment(str(path), replace(QUICK, methods=("optimal",)))
+        (row, _) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)]).rows
+        assert row["status"] == "ok"
+        assert row["box_iou"] is None
+
+
+class TestRuns:
+    def test_bytes_are_the_same_with_workers_and_after_a_crash(
+        self, finished: RunFolder, library: Path, tmp_path: Path
+    ) -> None:
+        folder = RunFolder(tmp_path / "run")
+
+        def stop(progress: Any) -> None:
+            if progress.done:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run_retrieval(library, QUICK, folder, workers=0, on_progress=stop)
+        assert not folder.is_finished
+        run_retrieval(library, QUICK, folder, workers=2)
+        assert folder.results.read_bytes() == finished.results.read_bytes()
+
+    def test_another_library_or_configuration_is_refused(
+        self, finished: RunFolder, library: Path, tmp_path: Path
+    ) -> None:
+        with pytest.raises(DataError, match="another configuration: seed is 0 there and 1 now"):
+            run_retrieval(library, replace(QUICK, seed=1), finished)
+        other = tmp_path / "other"
+        Library.from_models([make_model(number) for number in range(10)]).save(other)
+        before = (finished.path / "library.cadalign").read_bytes()
+        with pytest.raises(DataError, match="another configuration: library is"):
+            run_retrieval(other, QUICK, finished)
+        assert (finished.path / "library.cadalign").read_bytes() == before
+
+    def test_a_library_left_by_a_run_that_never_began_is_not_evaluated(
+        self, library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        other = tmp_path / "other"
+        Library.from_models([make_model(number) for number in range(40, 60)]).save(other)
+        folder = RunFolder(tmp_path / "run")
+
+        def die(self: RunFolder, config: dict[str, Any]) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(RunFolder, "claim", die)
+            with pytest.raises(KeyboardInterrupt):
+                run_retrieval(other, QUICK, folder, workers=0)
+        options = replace(QUICK, max_models=2, methods=("epnp",), keypoints=(8,))
+        run_retrieval(library, options, folder, workers=0)
+        evaluated = Library.open(folder.path / "library.cadalign")
+        assert evaluated.fingerprint == Library.open(library).fingerprint
+        config = folder.read_config()
+        assert config is not None
+        assert evaluated.fingerprint.startswith(config["library"])
+        assert {int(row["matched_id"]) for row in rows_of(folder)} <= set(range(30))
+
+    def test_the_whole_library_can_be_searched(self, sample_root: Path, tmp_path: Path) -> None:
+        options = replace(
+            QUICK, categories=("chair",), whole_library=True, keypoints=(8,), methods=("optimal",)
+        )
+        folder = RunFolder(tmp_path / "run")
+        run_retrieval(sample_root, options, folder, workers=0)
+        assert len(Library.open(folder.path / "library.cadalign").categories) == 4
+        inside, outside = rows_of(folder)
+        assert inside["rank"] == 1
+        # The only chair is out, so something else is best, with no keypoints in common.
+        assert outside["status"] == "failed" or outside["matched_category"] != "chair"
+        assert outside["shape_distance"] is None
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"methods": ("aepnp",)}, "methods: unknown: 'aepnp'; known are optimal, optimal-unst"),
+            ({"methods": ()}, "methods: none is given"),
+            (
+                {"protocols": ("leave",)},
+                "protocols: unknown: 'leave'; known are leave-in, leave-out",
+            ),
+            ({"noises_px": (-1.0,)}, "noises_px: -1 is less than 0"),
+            ({"noises_px": ()}, "noises_px: none is given"),
+            ({"keypoints": (3, 9)}, "keypoints: 3 is less than 4"),
+            ({"max_models": 0}, "max_models: 0 is less than 1"),
+            ({"seed": -1}, "seed: -1 is less than 0"),
+            ({"shape_sigma": -0.1}, "shape_sigma: -0.1 is less than 0"),
+        ],
+    )
+    def test_invalid_options_are_refused(self, change: dict[str, Any], message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            replace(QUICK, **change)
+
+    def test_unknown_categories_and_too_many_keypoints_are_refused(
+        self, library: Path, tmp_path: Path
+    ) -> None:
+        for change, message in (
+            ({"categories": ("boxx",)}, "categories: unknown category 'boxx', did you mean 'box'"),
+            ({"keypoints": (13,)}, "keypoints: no model has 13 keypoints"),
+        ):
+            with pytest.raises(InputError, match=message):
+                run_retrieval(library, replace(QUICK, **change), RunFolder(tmp_path / "run"))
+        assert not (tmp_path / "run").exists()
+
+
+class TestSummaries:
+    def test_rates_and_medians_are_those_of_the_rows(self, finished: RunFolder) -> None:
+        summaries = summarize_retrieval(finished)
+        assert len(summaries) == 2 * 2 * 2
+        for summary in summaries:
+            rows = rows_of(
+                finished,
+                protocol=summary.protocol,
+                method=summary.method,
+                keypoints=summary.keypoints,
+            )
+            assert (summary.queries, summary.failed) == (30, 0)
+            ious = [row["box_iou"] for row in rows]
+            assert summary.box_iou == pytest.approx(np.median(ious))
+            assert summary.mean_box_iou == pytest.approx(np.mean(ious))
+            assert summary.score == pytest.approx(np.mean([row["score"] for row in rows]))
+            ranks = [row["rank"] for row in rows]
+            if summary.protocol == "leave-out":
+                assert np.isnan([summary.rank_1, summary.rank_5, summary.reciprocal_rank]).all()
+                continue
+            assert summary.rank_1 == pytest.approx(np.mean([rank == 1 for rank in ranks]))
+            assert summary.rank_5 == pytest.approx(
+                np.mean([rank is not None and rank <= 5 for rank in ranks])
+            )
+            assert summary.reciprocal_rank == pytest.approx(
+                np.mean([0.0 if rank is None else 1 / rank for rank in ranks])
+            )
+
+    def test_table_and_figures_are_written(self, finished: RunFolder) -> None:
+        summaries = write_retrieval_report(finished)
+        with finished.summary.open() as file:
+            lines = list(csv.DictReader(file))
+        assert len(lines) == len(summaries)
+        assert float(lines[0]["rank_1"]) == summaries[0].rank_1
+        assert [line["rank_1"] for line in lines if line["protocol"] == "leave-out"] == [""] * 4
+        names = {
+            "leave_in_rank_1",
+            "leave_in_rank_5",
+            "leave_out_box_iou",
+            "leave_out_shape_distance",
+        }
+        assert {path.stem for path in finished.figures.iterdir()} == names
+        assert {path.suffix for path in finished.figures.iterdir()} == {".png", ".pdf"}
+
+
+@pytest.mark.usefixtures("no_figures")
+class TestCommand:
+    def test_a_run_is_made_and_shown_again(
+        self, library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = tmp_path / "run"
+        options = ["--keypoints", "8", "--noises-px", "1", "--max-models", "3", "--workers", "0"]
+        assert main(["evaluate", "retrieval", str(library), *options, "--out", str(out)]) == 0
+        captured = capsys.readouterr()
+        assert "first%" in captured.out
+        assert captured.out.count("leave-in") == captured.out.count("leave-out") == 2
+        assert f"Run: {out} (0 of 12 rows failed)" in captured.err
+        assert main(["evaluate", "show", str(out)]) == 0
+        assert capsys.readouterr().out == captured.out
+        assert main(["evaluate", "show", str(out), "--json"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        assert (shown["rows"], shown["failed"]) == (12, 0)
+        first = shown["summary"][0]
+        assert (first["method"], first["rank_1"], first["queries"]) == ("optimal", 1.0, 3)
+        assert shown["summary"][-1]["rank_1"] is None
+
+    def test_refusals_are_one_line(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = ["--out", str(tmp_path / "run")]
+        assert main(["evaluate", "retrieval", str(tmp_path / "none"), *out]) == 1
+        assert capsys.readouterr().err.lstrip() == (
+            f"cadalign: {tmp_path / 'none'}: no such folder; give KeypointNet's root\n"
+        )
+
+
+@pytest.mark.slow
+def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path: Path) -> None:
+    options = RetrievalEvaluation(
+        categories=("chair",),
+        noises_px=(1.0,),
+        keypoints=(8,),
+        methods=("optimal", "epnp"),
+        max_models=60,
+    )
+    folder = RunFolder(tmp_path / "run")
+    run_retrieval(real_data / "keypointnet", options, folder)
+    found = {(s.protocol, s.method): s for s in summarize_retrieval(folder)}
+    assert found["leave-in", "optimal"].rank_1 > 0.93
+    assert found["leave-in", "epnp"].rank_1 < 0.4
+    stretched, rigid = found["leave-out", "optimal"], found["leave-out", "epnp"]
+    assert stretched.mean_box_iou > rigid.mean_box_iou + 0.05
+    assert stretched.shape_distance < rigid.shape_distance
+
+
+def test_distances_of_mirrored_and_flat_models_are_numbers() -> None:
+    xyz = make_model(1).xyz
+    mirrored, flat = xyz * [1, -1, 1], xyz * [1, 0, 1]
+    far = distances(np.array([xyz, mirrored, flat]), xyz)
+    assert far[0] < 1e-12
+    assert far[1] > 0.1
+    assert far[1] == pytest.approx(far[2])  # a negative stretch is none

@@ -1,0 +1,368 @@
+"""Runs: killed, restarted, in parallel; with tasks that fail, crash or take a worker with them."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.parallel import KILLED_REASON, InProcess, LocalProcesses
+from cadalign.evaluation.runs.run import Progress, execute, workers_of
+from cadalign.evaluation.runs.tables import ROW_GROUP, read_table, write_tables
+from cadalign.evaluation.runs.work import AbortError, Columns, Result, evaluate_chunk
+from cadalign.io import files
+
+MAIN = "import sys; from cadalign.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+@dataclass(frozen=True)
+class Squares:
+    """An experiment that is quick and can be told to fail."""
+
+    raises: tuple[int, ...] = ()
+    kills: tuple[int, ...] = ()
+    kills_once: tuple[int, ...] = ()
+    full_disk: bool = False
+    dead_on_arrival: bool = False
+    scratch: Path | None = None
+
+    @property
+    def columns(self) -> Columns:
+        return (("task", int), ("square", float), ("reason", str))
+
+    @property
+    def timing_columns(self) -> Columns:
+        return (("task", int), ("process", int))
+
+    def warm_up(self) -> None:
+        if self.dead_on_arrival:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def evaluate(self, tasks: Sequence[int]) -> Result:
+        rows = []
+        for task in tasks:
+            if self.full_disk:
+                raise AbortError("no room")
+            if task in self.raises:
+                raise ValueError(f"cannot square {task}")
+            if task in self.kills:
+                os.kill(os.getpid(), signal.SIGKILL)
+            if task in self.kills_once and self.scratch is not None:
+                flag = self.scratch / f"killed_{task}"
+                if not flag.exists():
+                    flag.touch()
+                    os.kill(os.getpid(), signal.SIGKILL)
+            rows.append({"task": task, "square": float(task) ** 2, "reason": ""})
+        return Result(rows, [{"task": task, "process": os.getpid()} for task in tasks])
+
+    def failure(self, task: int, reason: str) -> Result:
+        rows = [{"task": task, "square": None, "reason": reason}]
+        return Result(rows, [{"task": task, "process": 0}])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _by_value() -> Iterator[None]:
+    """Worker processes cannot import test modules."""
+    module = sys.modules[__name__]
+    cloudpickle.register_pickle_by_value(module)
+    yield
+    cloudpickle.unregister_pickle_by_value(module)
+
+
+def run_squares(
+    path: Path, experiment: Squares, *, count: int = 100, workers: int = 0, config: int = 1
+) -> list[dict[str, object]]:
+    folder = RunFolder(path)
+    execute(
+        experiment,
+        range(count),
+        folder,
+        config={"value": config},
+        chunk_size=7,
+        workers=workers_of(workers),
+    )
+    return read_table(folder.results).to_pylist()
+
+
+def test_results_are_in_the_order_of_the_tasks_whatever_the_workers(tmp_path: Path) -> None:
+    rows = run_squares(tmp_path / "none", Squares())
+    assert [row["task"] for row in rows] == list(range(100))
+    run_squares(tmp_path / "two", Squares(), workers=2)
+    files = [tmp_path / name / "results.parquet" for name in ("none", "two")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    timings = read_table(tmp_path / "two" / "timings.parquet")
+    assert set(timings["process"].to_pylist()).isdisjoint({0, os.getpid()})
+
+
+def test_tasks_that_raise_become_failed_rows_and_spare_the_others(tmp_path: Path) -> None:
+    rows = run_squares(tmp_path, Squares(raises=(3, 50)))
+    failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
+    assert failed == {3: "ValueError: cannot square 3", 50: "ValueError: cannot square 50"}
+    assert len(rows) == 100
+
+
+@pytest.mark.slow
+def test_a_task_that_kills_its_workers_becomes_a_failed_row(tmp_path: Path) -> None:
+    rows = run_squares(tmp_path, Squares(kills=(5, 60)), workers=2)
+    failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
+    assert failed == {5: KILLED_REASON, 60: KILLED_REASON}
+    assert [row["task"] for row in rows] == list(range(100))
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_once_costs_nothing_but_a_retry(tmp_path: Path) -> None:
+    run_squares(tmp_path / "calm", Squares())
+    run_squares(tmp_path / "hit", Squares(kills_once=(20, 71), scratch=tmp_path), workers=2)
+    assert (tmp_path / "killed_20").exists()
+    assert (tmp_path / "killed_71").exists()
+    calm, hit = (tmp_path / name / "results.parquet" for name in ("calm", "hit"))
+    assert calm.read_bytes() == hit.read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_that_cannot_live_end_the_run_with_a_reason(tmp_path: Path) -> None:
+    with pytest.raises(CadalignError, match="die before they are given any task"):
+        run_squares(tmp_path, Squares(dead_on_arrival=True), workers=1)
+
+
+def test_what_no_task_survives_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(AbortError, match="no room"):
+        run_squares(tmp_path, Squares(full_disk=True))
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
+    done: list[int] = []
+
+    class InterruptedError_(Exception):
+        pass
+
+    def interrupt(progress: Progress) -> None:
+        done.append(progress.done)
+        if progress.done >= 35:
+            raise InterruptedError_
+
+    folder = RunFolder(tmp_path / "cut")
+    arguments = {"config": {"value": 1}, "chunk_size": 7, "workers": InProcess()}
+    with pytest.raises(InterruptedError_):
+        execute(Squares(), range(100), folder, on_progress=interrupt, **arguments)
+    assert not folder.is_finished
+    seen: list[int] = []
+    execute(Squares(), range(100), folder, on_progress=lambda p: seen.append(p.done), **arguments)
+    assert seen[0] == 35
+    run_squares(tmp_path / "whole", Squares())
+    assert folder.results.read_bytes() == (tmp_path / "whole" / "results.parquet").read_bytes()
+    assert not folder.parts.exists()
+
+
+def test_a_finished_run_is_not_done_again(tmp_path: Path) -> None:
+    run_squares(tmp_path, Squares())
+    before = (tmp_path / "results.parquet").stat().st_mtime_ns
+    run_squares(tmp_path, Squares(full_disk=True))
+    assert (tmp_path / "results.parquet").stat().st_mtime_ns == before
+
+
+def test_another_configuration_is_refused_with_the_difference(tmp_path: Path) -> None:
+    run_squares(tmp_path, Squares())
+    with pytest.raises(DataError, match="value is 1 there and 2 now") as caught:
+        run_squares(tmp_path, Squares(), config=2)
+    assert caught.value.fix is not None
+    with pytest.raises(DataError, match="tasks is 100 there and 99 now"):
+        run_squares(tmp_path, Squares(), count=99)
+
+
+def test_a_run_of_another_version_is_refused(tmp_path: Path) -> None:
+    run_squares(tmp_path, Squares())
+    file = tmp_path / "run.json"
+    config = json.loads(file.read_text())
+    config["versions"]["cadalign"] = "0.0.1"
+    file.write_text(json.dumps(config))
+    with pytest.raises(DataError, match=r'versions.cadalign is "0.0.1" there'):
+        run_squares(tmp_path, Squares())
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]"])
+def test_a_damaged_run_file_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "run.json").write_text(content)
+    with pytest.raises(DataError, match=r"run\.json"):
+        run_squares(tmp_path, Squares())
+
+
+def test_results_without_a_run_file_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "results.parquet").touch()
+    with pytest.raises(DataError, match="holds results, but no run"):
+        run_squares(tmp_path, Squares())
+
+
+def test_two_processes_cannot_share_a_run(tmp_path: Path) -> None:
+    with (tmp_path / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(DataError, match="another process"):
+            run_squares(tmp_path, Squares())
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot be written"):
+        run_squares(tmp_path / "file" / "run", Squares())
+
+
+def test_a_full_disk_leaves_no_half_files_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.replace
+    writes = iter(range(100))
+
+    def replace(source: Path, target: Path) -> None:
+        if next(writes) >= 6:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "replace", replace)
+        with pytest.raises(DataError, match="No space left"):
+            run_squares(tmp_path / "full", Squares())
+    assert not list((tmp_path / "full").rglob(".unfinished-*"))
+    run_squares(tmp_path / "full", Squares())
+    run_squares(tmp_path / "calm", Squares())
+    full, calm = (tmp_path / name / "results.parquet" for name in ("full", "calm"))
+    assert full.read_bytes() == calm.read_bytes()
+
+
+def test_a_tables_bytes_do_not_show_its_pieces(tmp_path: Path) -> None:
+    import pyarrow as pa
+
+    columns: Columns = (("name", str), ("value", float))
+    count = ROW_GROUP + 1000
+    whole = pa.table({"name": [str(i) for i in range(count)], "value": np.arange(count) / 7})
+    pieces = [whole.slice(first, 777) for first in range(0, count, 777)]
+    write_tables(tmp_path / "whole.parquet", columns, [whole])
+    write_tables(tmp_path / "pieces.parquet", columns, pieces)
+    assert (tmp_path / "whole.parquet").read_bytes() == (tmp_path / "pieces.parquet").read_bytes()
+    assert pq.read_metadata(tmp_path / "whole.parquet").num_row_groups == 2
+
+
+@pytest.mark.parametrize("count", [-2, -10])
+def test_a_wrong_number_of_workers_is_an_error(count: int) -> None:
+    with pytest.raises(InputError, match="not a number of processes"):
+        workers_of(count)
+    assert workers_of(-1) == LocalProcesses(-1)
+
+
+def test_a_chunk_with_a_failing_task_keeps_its_order() -> None:
+    result = evaluate_chunk(Squares(raises=(2,)), [1, 2, 3])
+    assert [row["task"] for row in result.rows] == [1, 2, 3]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs Linux's /proc")
+def test_workers_end_soon_after_their_run_is_killed(tmp_path: Path) -> None:
+    write_annotations(tmp_path / "data", models=120)
+    tag = f"CADALIGN_TEST={tmp_path}".encode()
+    for _ in range(2):
+        process = subprocess.Popen(
+            command(tmp_path, tmp_path / "run", workers=2),
+            stdout=subprocess.DEVNULL,
+            env={**os.environ, "CADALIGN_TEST": str(tmp_path)},
+        )
+        wait_for_part(tmp_path / "run", process, more=True)
+        assert len(processes_with(tag)) >= 3
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        end = time.monotonic() + 10
+        while processes_with(tag) and time.monotonic() < end:
+            time.sleep(0.2)
+        assert not processes_with(tag)
+
+
+def processes_with(tag: bytes) -> list[str]:
+    """The processes that have this among their environment variables."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if tag in file.read_bytes().split(b"\0"):
+                found.append(file.parent.name)
+        except OSError:  # gone, or not ours
+            continue
+    return found
+
+
+@pytest.mark.slow
+def test_a_real_run_killed_ten_times_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    write_annotations(tmp_path / "data", models=120)
+    calm, killed = tmp_path / "calm", tmp_path / "killed"
+    assert subprocess.run(command(tmp_path, calm, workers=2), check=False).returncode == 3
+    rng = random.Random(0)
+    kills = 0
+    while kills < 10:
+        process = subprocess.Popen(
+            command(tmp_path, killed, workers=rng.choice((0, 1, 2))), stdout=subprocess.DEVNULL
+        )
+        # Some in the middle of starting up, most while results come in.
+        wait_for_part(killed, process, more=rng.random() < 0.8)
+        time.sleep(rng.uniform(0, 0.15))
+        if process.poll() is not None:
+            break
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        kills += 1
+    assert subprocess.run(command(tmp_path, killed, workers=2), check=False).returncode == 3
+    assert kills == 10
+    for name in ("results.parquet", "exhibits.parquet", "summary.csv", "run.json"):
+        assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
+    pictures = sorted(path.name for path in (calm / "figures").iterdir())
+    assert pictures
+    for name in pictures:
+        assert (killed / "figures" / name).read_bytes() == (calm / "figures" / name).read_bytes()
+
+
+def wait_for_part(run: Path, process: subprocess.Popen[bytes], *, more: bool) -> None:
+    """Wait for one more finished chunk, or only for a moment."""
+    before = len(list((run / "parts").glob("*")))
+    end = time.monotonic() + (30 if more else 0.7)
+    while time.monotonic() < end and process.poll() is None:
+        if len(list((run / "parts").glob("*"))) > before and more:
+            return
+        time.sleep(0.005)
+
+
+def command(root: Path, out: Path, *, workers: int) -> list[str]:
+    options = ["--views-per-model", "20", "--methods", "optimal", "limit"]
+    places = [str(root / "data"), "--out", str(out), "--workers", str(workers)]
+    return [sys.executable, "-c", MAIN, "evaluate", "keypointnet", *places, *options, "--json"]
+
+
+def write_annotations(root: Path, *, models: int) -> None:
+    """Annotations of random models without meshes; one has too few keypoints."""
+    rng = np.random.default_rng(0)
+    entries = []
+    for number in range(models):
+        points = rng.uniform(-0.3, 0.3, (5 if number == 7 else 12, 3))
+        keypoints = [
+            {
+                "xyz": point,
+                "semantic_id": row,
+                "mesh_info": {"face_index": 0, "face_uv": [1.0, 0.0, 0.0]},
+            }
+            for row, point in enumerate(points.tolist())
+        ]
+        entries.append(
+            {"class_id": "03001627", "model_id": f"model{number:04d}", "keypoints": keypoints}
+        )
+    (root / "annotations").mkdir(parents=True)
+    (root / "annotations" / "chair.json").write_text(json.dumps(entries))

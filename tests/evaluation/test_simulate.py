@@ -1,0 +1,148 @@
+"""The paper's simulation: problems, tables, figures, the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cadalign
+from cadalign.cli import main
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.api import sweep_of
+from cadalign.evaluation.simulation.experiment import SWEEPS, SweepExperiment, SweepTask, SweepTasks
+from cadalign.evaluation.simulation.problems import simulate_problem
+
+
+def simulate(sweep: str, **options: Any) -> Any:
+    return cadalign.simulate(sweep, workers=0, **options)
+
+
+def test_the_sweeps_are_the_papers() -> None:
+    for kind in SWEEPS.values():
+        assert kind.noise_px == 2.0
+        assert "limit" in kind.methods or kind.is_timed
+    assert (SWEEPS["noise"].points, SWEEPS["noise"].runs) == (1024, 2000)
+    assert SWEEPS["points"].values[-1] == 1024
+    assert SWEEPS["points"].runs == 2000
+
+
+def test_outliers_are_as_many_as_said_and_anywhere_in_the_image() -> None:
+    rng = np.random.default_rng(0)
+    problem = simulate_problem(rng, points=200, noise_px=0.0, outlier_share=0.3)
+    assert problem.outliers is not None
+    assert problem.outliers.sum() == 60
+    projected = problem.camera.project(problem.alignment.apply(problem.points_3d))
+    moved = np.linalg.norm(projected - problem.points_2d, axis=1) > 1e-9
+    assert (moved == problem.outliers).all()
+    assert problem.camera.contains(problem.points_2d[problem.outliers]).all()
+    assert np.ptp(problem.points_2d[problem.outliers], axis=0) == pytest.approx([640, 480], rel=0.1)
+
+
+def test_without_outliers_a_problem_is_as_it_was() -> None:
+    first = simulate_problem(np.random.default_rng(5), points=9, noise_px=1.0)
+    second = simulate_problem(np.random.default_rng(5), points=9, noise_px=1.0, outlier_share=0.0)
+    assert np.array_equal(first.points_2d, second.points_2d)
+    assert first.outliers is None
+
+
+def test_a_problem_does_not_depend_on_its_neighbours() -> None:
+    kind = sweep_of("noise", values=[1, 3], runs=4, points=12, methods=["optimal", "limit"])
+    experiment = SweepExperiment(kind, seed=3)
+    tasks = SweepTasks(kind.values, kind.runs)[:]
+    together = experiment.evaluate(tasks).rows
+    alone = [row for task in tasks for row in experiment.evaluate([task]).rows]
+    assert together == alone
+    assert [row["noise_px"] for row in together[::2]] == [1.0] * 4 + [3.0] * 4
+
+
+def test_another_seed_gives_other_problems() -> None:
+    kind = sweep_of("points", values=[8])
+    first = SweepExperiment(kind, 0).problem(SweepTask(8.0, 0))
+    other = SweepExperiment(kind, 1).problem(SweepTask(8.0, 0))
+    assert not np.array_equal(first.points_2d, other.points_2d)
+
+
+def test_the_optimum_is_at_the_limit_and_the_published_solver_above() -> None:
+    table = simulate("noise", values=[2], runs=60, methods=["optimal", "aepnp-paper", "limit"])
+    medians = table.groupby("method").rotation_error_deg.median()
+    assert medians["optimal"] == pytest.approx(medians["limit"], rel=0.1)
+    assert medians["aepnp-paper"] > 3 * medians["optimal"]
+
+
+def test_robust_methods_stand_outliers_that_break_the_others() -> None:
+    table = simulate(
+        "outliers", values=[0, 0.4], runs=12, methods=["optimal", "ransac-optimal", "limit"]
+    )
+    medians = table.groupby(["outlier_share", "method"]).rotation_error_deg.median()
+    assert medians[0.4, "ransac-optimal"] < 2 * medians[0.4, "limit"]
+    assert medians[0.4, "optimal"] > 10
+
+
+def test_failures_are_rows_with_reasons() -> None:
+    table = simulate("points", values=[4, 8], runs=3, methods=["aepnp", "optimal"])
+    few = table[(table.points == 4) & (table.method == "aepnp")]
+    assert (few.status == "failed").all()
+    assert few.reason.str.contains("at least 6").all()
+    assert (table[table.points == 8].status == "ok").all()
+
+
+def test_running_times_are_positive_and_not_in_the_results(tmp_path: Path) -> None:
+    table = simulate("runtime", values=[10], runs=3, methods=["aepnp"], out=tmp_path)
+    assert (table.seconds > 0).all()
+    import pandas as pd
+
+    assert "seconds" not in pd.read_parquet(tmp_path / "results.parquet").columns
+
+
+@pytest.mark.parametrize(
+    ("sweep", "options", "message"),
+    [
+        ("noises", {}, "known are noise, points"),
+        ("noise", {"methods": ["optimus"]}, "unknown method"),
+        ("noise", {"values": [-1]}, "not a noise level"),
+        ("noise", {"values": []}, "none is given"),
+        ("points", {"values": [3]}, "not a number of points"),
+        ("points", {"values": [8.5]}, "not a number of points"),
+        ("outliers", {"values": [1.0]}, "not a share"),
+        ("points", {"runs": 0}, "not positive"),
+        ("noise", {"points": 3}, "not a number of points"),
+        ("points", {"noise_px": float("nan")}, "not a noise level"),
+    ],
+)
+def test_bad_options_are_named(sweep: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        sweep_of(sweep, **options)
+
+
+@pytest.mark.parametrize("sweep", list(SWEEPS))
+def test_the_command_writes_a_table_and_a_figure_for_each_metric(
+    sweep: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    values = {"noise": "1", "points": "10", "outliers": "0.2", "runtime": "10"}[sweep]
+    options = ["--runs", "4", "--workers", "0", "--out", str(out), "--json"]
+    if sweep in ("noise", "outliers"):
+        options += ["--points", "20"]
+    code = main(["simulate", sweep, "--values", values, *options])
+    printed = json.loads(capsys.readouterr().out)
+    assert code in (0, 3)
+    assert (code == 3) == (printed["failed"] > 0)
+    with (out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    metrics = {row["metric"] for row in rows}
+    assert "rotation_error_deg" in metrics
+    assert len(rows) == len(SWEEPS[sweep].methods) * len(metrics) == len(printed["summary"])
+    for metric in metrics:
+        for ending in ("png", "pdf"):
+            assert (out / "figures" / f"{sweep}_{metric}.{ending}").stat().st_size > 1000
+
+
+def test_the_same_folder_refuses_another_sweep(tmp_path: Path) -> None:
+    simulate("points", values=[8], runs=2, methods=["aepnp"], out=tmp_path)
+    with pytest.raises(DataError, match=r"sweep\.runs is 2 there and 3 now"):
+        simulate("points", values=[8], runs=3, methods=["aepnp"], out=tmp_path)

@@ -1,0 +1,304 @@
+"""`fit`: what it finds, with all unknowns or fewer, and the other explanations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from support import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
+
+from cadalign import Alignment, Camera, fit
+from cadalign.errors import DegenerateError
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
+from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
+
+# --- what it finds ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
+@pytest.mark.parametrize("points", [6, 7, 10, 50, 300])
+def test_noise_free_keypoints_give_the_truth(method: str, points: int) -> None:
+    for seed in range(5):
+        problem = problem_of(seed, points=points, noise_px=0.0)
+        result = fit_problem(problem, method=method)
+        assert_same(result.alignment, problem.alignment, 1e-7)
+        assert result.rms < 1e-6
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper"])
+def test_noise_free_keypoints_give_the_truth_through_a_lens(method: str) -> None:
+    problem = problem_of(0, points=12, noise_px=0.0, camera=LENS)
+    assert_same(fit_problem(problem, method=method).alignment, problem.alignment, 1e-7)
+
+
+def test_epnp_knows_no_stretch() -> None:
+    plain = problem_of(0, points=12, noise_px=0.0, stretch=(1.0, 1.0))
+    result = fit_problem(plain, method="epnp")
+    assert_same(result.alignment, plain.alignment, 1e-5)
+    stretched = problem_of(1, points=12, noise_px=0.0, stretch=(1.5, 1.6))
+    assert fit_problem(stretched, method="epnp").alignment.scale.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_optimal_is_the_default() -> None:
+    problem = problem_of(0)
+    assert fit_problem(problem).method == "optimal"
+    assert fit_problem(problem).alignment == fit_problem(problem, method="optimal").alignment
+
+
+@pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LENS])
+@pytest.mark.parametrize("points", [8, 30, 100])
+def test_optimum_agrees_with_an_independent_least_squares_fit(camera: Camera, points: int) -> None:
+    problem = problem_of(4, points=points, noise_px=1.0, camera=camera)
+
+    def errors(step: np.ndarray) -> np.ndarray:
+        return residuals_at(problem, moved(problem.alignment, step)).ravel()
+
+    found = least_squares(errors, np.zeros(8), x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    result = fit_problem(problem)
+    # Errors behind a lens are taken to first order, which moves the optimum a little.
+    exact = camera is SIMULATION_CAMERA
+    assert np.sum(result.residuals**2) <= 2 * found.cost * (1 + (1e-10 if exact else 1e-5))
+    expected = moved(problem.alignment, found.x)
+    deviation = result.std.rotation_deg
+    off = rotation_error(est=result.alignment, gt=expected)
+    assert off < (1e-5 if exact else 0.01) * deviation
+    np.testing.assert_allclose(result.alignment.scale, expected.scale, rtol=1e-6 if exact else 1e-3)
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper", "epnp"])
+@pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LENS])
+def test_residuals_are_projected_minus_observed(method: str, camera: Camera) -> None:
+    problem = problem_of(2, camera=camera)
+    result = fit_problem(problem, method=method)
+    expected = residuals_at(problem, result.alignment)
+    np.testing.assert_allclose(result.residuals, expected, rtol=0, atol=1e-9)
+    assert result.rms == pytest.approx(np.sqrt((expected**2).sum(axis=1).mean()))
+    assert result.inliers.tolist() == [True] * 12
+
+
+def test_optimum_explains_the_keypoints_better_than_the_linear_solvers() -> None:
+    for seed in range(10):
+        problem = problem_of(seed, noise_px=2.0)
+        best = fit_problem(problem).rms
+        assert best <= fit_problem(problem, method="aepnp").rms + 1e-9
+        assert best <= fit_problem(problem, method="aepnp-paper").rms + 1e-9
+
+
+def test_input_is_neither_changed_nor_kept() -> None:
+    problem = problem_of(0)
+    points_3d, points_2d = problem.points_3d.copy(), problem.points_2d.copy()
+    result = fit(points_3d, points_2d, problem.camera)
+    assert (points_3d == problem.points_3d).all()
+    assert (points_2d == problem.points_2d).all()
+    text = result.to_json()
+    points_3d[:] = 99.0
+    points_2d[:] = 99.0
+    assert result.to_json() == text
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("kind", [np.float32, np.float64, list])
+def test_array_layout_and_type_do_not_matter(order: str, kind: Any) -> None:
+    problem = problem_of(0)
+    rounded = [a.astype(np.float32) for a in (problem.points_3d, problem.points_2d)]
+    expected = fit(*(a.astype(float) for a in rounded), problem.camera)
+    given = [a.tolist() if kind is list else np.array(a, dtype=kind, order=order) for a in rounded]
+    for array in given:
+        if kind is not list:
+            array.flags.writeable = False
+    assert fit(*given, problem.camera).alignment == expected.alignment
+
+
+# --- fewer unknowns ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stretch", "held"), [("y", [0, 2]), ("z", [0, 1]), ("none", [0, 1, 2])])
+def test_scales_that_do_not_stretch_stay_exactly_one(stretch: str, held: list[int]) -> None:
+    result = fit_problem(problem_of(2), stretch=stretch)
+    assert (result.alignment.scale[held] == 1.0).all()
+    assert result.stretched_axes == stretch.replace("none", "")
+    covariance = result.covariance
+    assert covariance is not None
+    fixed = [5 + axis for axis in held if axis]
+    assert (covariance[fixed] == 0).all()
+    assert (covariance[:, fixed] == 0).all()
+    assert np.linalg.matrix_rank(covariance) == 8 - len(fixed)
+    assert result.std is not None
+    assert [s == 0.0 for s in result.std.scale] == [axis in held for axis in range(3)]
+
+
+@pytest.mark.parametrize(("stretch", "points"), [("y", 4), ("z", 4), ("none", 3)])
+def test_fewer_unknowns_need_fewer_points(stretch: str, points: int) -> None:
+    scale = {"y": (1.0, 1.4, 1.0), "z": (1.0, 1.0, 1.4), "none": (1.0, 1.0, 1.0)}[stretch]
+    simulated = problem_of(11, points=points, noise_px=0.0, stretch=(1.0, 1.0))
+    gt = simulated.alignment
+    alignment = Alignment(gt.rotation, gt.translation, scale)
+    points_3d = simulated.points_3d / scale
+    result = fit(points_3d, simulated.points_2d, simulated.camera, stretch=stretch)
+    explanations = [result.alignment, *(other.alignment for other in result.alternatives)]
+    assert result.rms < 1e-5
+    assert min(rotation_error(est=each, gt=alignment) for each in explanations) < 1e-3
+    with pytest.raises(DegenerateError, match="are too few for"):
+        fit(points_3d[:-1], simulated.points_2d[:-1], simulated.camera, stretch=stretch)
+
+
+def test_true_scale_may_be_held() -> None:
+    problem = problem_of(2, points=8, noise_px=0.0, stretch=(1.0, 1.0))
+    for stretch in ("yz", "y", "z", "none"):
+        assert_same(fit_problem(problem, stretch=stretch).alignment, problem.alignment, 1e-6)
+
+
+def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
+    problem = problem_of(2, points=20)
+    free = fit_problem(problem)
+    weak = fit_problem(problem, scale_prior_sigma=1e4)
+    assert_same(weak.alignment, free.alignment, 1e-5)
+    strong = fit_problem(problem, scale_prior_sigma=1e-6)
+    held = fit_problem(problem, stretch="none")
+    assert_same(strong.alignment, held.alignment, 1e-3)
+    np.testing.assert_allclose(strong.alignment.scale, 1.0, atol=1e-5)
+
+
+def test_prior_adds_its_information() -> None:
+    problem = problem_of(2, points=20, noise_px=0.0, stretch=(1.0, 1.0))
+    free, prior = fit_problem(problem), fit_problem(problem, scale_prior_sigma=0.02)
+    added = np.linalg.inv(prior.covariance) - np.linalg.inv(free.covariance)
+    expected = np.diag([0.0] * 6 + [2500.0] * 2)
+    information = np.linalg.inv(prior.covariance).diagonal()
+    assert (np.abs(added - expected) < 1e-5 * np.sqrt(np.outer(information, information))).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("axis", [1, 2])
+def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> None:
+    rng = np.random.default_rng(seed)
+    problem = problem_of(seed, points=10, noise_px=0.0)
+    points_3d = problem.points_3d.copy()
+    points_3d[:, axis] = 0.1
+    points_2d = problem.camera.project(problem.alignment.apply(points_3d))
+    points_2d += 0.2 * rng.standard_normal(points_2d.shape)
+    result = fit(points_3d, points_2d, problem.camera, scale_prior_sigma=0.5)
+    assert result.rms < 1.0
+    assert result.std is not None
+    # Nothing but the prior knows this scale.
+    assert result.std.scale[axis] == pytest.approx(0.5, rel=0.25)
+    assert any(f"in the plane {'xyz'[axis]} = 0.1" in text for text in result.warnings)
+
+
+# --- which axis is known ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("known_axis", "order"), [("y", [2, 0, 1]), ("z", [1, 2, 0])])
+def test_renaming_the_models_axes_renames_the_result(known_axis: str, order: list[int]) -> None:
+    problem = problem_of(8, points=14)
+    base = fit_problem(problem)
+    other = fit(
+        problem.points_3d[:, order], problem.points_2d, problem.camera, known_axis=known_axis
+    )
+    np.testing.assert_allclose(
+        other.alignment.rotation, base.alignment.rotation[:, order], rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(other.alignment.scale, base.alignment.scale[order], rtol=1e-12)
+    np.testing.assert_allclose(other.alignment.translation, base.alignment.translation)
+    # The two unknown scales come in the order of the axes: z, y of the base for known y.
+    scales = [7, 6] if known_axis == "y" else [6, 7]
+    place = [0, 1, 2, 3, 4, 5, *scales]
+    np.testing.assert_allclose(other.covariance, base.covariance[np.ix_(place, place)])
+    assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in order])
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp"])
+@pytest.mark.parametrize("known_axis", ["x", "y", "z"])
+def test_known_axis_keeps_its_length(method: str, known_axis: str) -> None:
+    problem = problem_of(8, points=14, noise_px=0.0)
+    result = fit_problem(problem, known_axis=known_axis, method=method)
+    size = problem.alignment.scale["xyz".index(known_axis)]
+    assert result.alignment.scale["xyz".index(known_axis)] == 1.0
+    np.testing.assert_allclose(result.alignment.scale, problem.alignment.scale / size, rtol=1e-6)
+    np.testing.assert_allclose(
+        result.alignment.translation, problem.alignment.translation / size, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("known_axis", ["y", "z"])
+def test_which_axis_is_known_only_sets_the_overall_size(known_axis: str) -> None:
+    problem = problem_of(8, points=14, noise_px=1.0)
+    base, other = fit_problem(problem), fit_problem(problem, known_axis=known_axis)
+    size = base.alignment.scale["xyz".index(known_axis)]
+    np.testing.assert_allclose(other.alignment.scale, base.alignment.scale / size, rtol=1e-5)
+    assert rotation_error(est=other.alignment, gt=base.alignment) < 1e-4
+    np.testing.assert_allclose(other.residuals, base.residuals, rtol=0, atol=1e-4)
+
+
+# --- other explanations -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_four_points_give_every_exact_solution_least_stretch_first(seed: int) -> None:
+    problem = problem_of(seed, points=4, noise_px=0.0)
+    result = fit_problem(problem)
+    found = [result.alignment, *(other.alignment for other in result.alternatives)]
+    for alignment in found:
+        assert np.abs(residuals_at(problem, alignment)).max() < 1e-5
+    stretch = [float((np.log(alignment.scale) ** 2).sum()) for alignment in found]
+    assert stretch == sorted(stretch)
+    assert min(rotation_error(est=each, gt=problem.alignment) for each in found) < 1e-3
+    assert all(other.relative_likelihood > 0.99 for other in result.alternatives)
+
+
+@pytest.mark.parametrize("points", [5, 6])
+def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> None:
+    seen = 0
+    for seed in range(60):
+        problem = problem_of(seed, points=points, noise_px=1.0)
+        try:
+            result = fit_problem(problem)
+        except DegenerateError:  # happens once in hundreds: noise on so few points leaves nothing
+            continue
+        best = np.sum(result.residuals**2)
+        likelihoods = [other.relative_likelihood for other in result.alternatives]
+        assert likelihoods == sorted(likelihoods, reverse=True)
+        for other in result.alternatives:
+            seen += 1
+            excess = np.sum(residuals_at(problem, other.alignment) ** 2) - best
+            assert other.relative_likelihood == pytest.approx(np.exp(-excess / 2), rel=1e-4)
+            assert 1e-3 <= other.relative_likelihood <= 1.0
+            turn = rotation_error(est=other.alignment, gt=result.alignment)
+            stretch = np.abs(np.log(other.alignment.scale / result.alignment.scale)).max()
+            assert turn > 0.01 or stretch > 1e-4
+    assert seen >= 3
+
+
+def test_many_good_keypoints_leave_no_alternative() -> None:
+    assert fit_problem(problem_of(0, points=100)).alternatives == ()
+
+
+# --- real keypoints ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp"])
+def test_real_keypoints_without_noise_are_exact(real_data: Any, method: str) -> None:
+    from cadalign.datasets import KeypointNet
+
+    dataset = KeypointNet(real_data / "keypointnet")
+    camera = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+    rng = np.random.default_rng(0)
+    tried = 0
+    for category in ("chair", "airplane", "bottle", "mug", "bathtub"):
+        for key in dataset.ids(category)[:20]:
+            points_3d = dataset[key].keypoints.xyz
+            spread = np.linalg.svd(points_3d - points_3d.mean(axis=0), compute_uv=False)
+            if len(points_3d) < 7 or spread[2] < 0.05 * spread[0]:
+                continue
+            scale = [1.0, *rng.uniform(0.5, 2, 2)]
+            rotation = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+            gt = Alignment(rotation, [0.1, -0.1, 3.5], scale)
+            result = fit(points_3d, camera.project(gt.apply(points_3d)), camera, method=method)
+            tried += 1
+            assert rotation_error(est=result.alignment, gt=gt) < 1e-6 * 180
+            assert translation_error(est=result.alignment, gt=gt) < 1e-6
+            assert scale_error(est=result.alignment, gt=gt).max() < 1e-6
+    assert tried > 40

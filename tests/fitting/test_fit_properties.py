@@ -1,0 +1,328 @@
+"""Properties of `fit` that hold for every problem: recovery, equivariance, valid results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cadalign import Alignment, Camera, FitResult, fit
+from cadalign.errors import DegenerateError
+from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
+from cadalign.geometry.metrics import rotation_error
+
+SEEDS = st.integers(0, 2**32 - 1)
+COUNTS = st.integers(7, 60)
+METHODS = pytest.mark.parametrize("method", ["optimal", "aepnp"])
+UNITS = st.sampled_from([1e-6, 1e-3, 1e3, 1e6])
+
+
+def problem_of(seed: int, points: int, noise_px: float = 0.0, **options: Any) -> Problem:
+    rng = np.random.default_rng(seed)
+    return simulate_problem(rng, points=points, noise_px=noise_px, **options)
+
+
+def assert_aligned(result: FitResult, expected: Alignment, tolerance: float = 1e-6) -> None:
+    """Rotation [rad], translation over the distance and relative scale within the tolerance."""
+    est = result.alignment
+    assert np.radians(rotation_error(est=est, gt=expected)) < tolerance
+    distance = np.linalg.norm(expected.translation)
+    assert np.linalg.norm(est.translation - expected.translation) < tolerance * distance
+    assert np.abs(est.scale / expected.scale - 1).max() < tolerance
+
+
+def assert_explains(result: FitResult, problem: Problem, tolerance_px: float = 1e-5) -> None:
+    """No residual is larger than that: where several alignments fit, each is as good."""
+    assert np.abs(result.residuals).max() < tolerance_px
+    assert (result.alignment.apply(problem.points_3d)[:, 2] > 0).all()
+
+
+# --- noise-free recovery ---------------------------------------------------------------------
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_recovery_without_noise(method: str, seed: int, points: int) -> None:
+    problem = problem_of(seed, points)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    assert_aligned(result, problem.alignment)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_recovery_of_a_far_object_through_a_long_lens(method: str, seed: int, points: int) -> None:
+    camera = Camera(640, 480, 6000.0, 6000.0, 319.5, 239.5)
+    problem = problem_of(seed, points, camera=camera, depth=(60.0, 100.0))
+    result = fit(problem.points_3d, problem.points_2d, camera, method=method)
+    assert_explains(result, problem, 1e-6)
+    assert_aligned(result, problem.alignment, 1e-5)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_recovery_of_an_object_so_far_that_perspective_is_lost(
+    method: str, seed: int, points: int
+) -> None:
+    # A thousand sizes away: depths differ by a thousandth, and pixels are exact to 1e-13.
+    camera = Camera(640, 480, 1e5, 1e5, 319.5, 239.5)
+    problem = problem_of(seed, points, camera=camera, depth=(900.0, 1100.0))
+    result = fit(problem.points_3d, problem.points_2d, camera, method=method)
+    assert_explains(result, problem, 1e-5)
+    assert_aligned(result, problem.alignment, 1e-4)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_recovery_of_a_near_object_seen_at_a_wide_angle(
+    method: str, seed: int, points: int
+) -> None:
+    camera = Camera.from_fov(640, 480, fov_x=120.0)
+    problem = problem_of(seed, points, camera=camera, depth=(2.0, 3.0))
+    result = fit(problem.points_3d, problem.points_2d, camera, method=method)
+    assert_aligned(result, problem.alignment)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, axis=st.integers(0, 2), thickness=st.sampled_from([0.1, 0.01]))
+def test_recovery_of_keypoints_near_a_plane(
+    method: str, seed: int, points: int, axis: int, thickness: float
+) -> None:
+    problem = problem_of(seed, points)
+    factor = np.ones(3)
+    factor[axis] = thickness
+    points_3d = problem.points_3d * factor
+    points_2d = problem.camera.project(problem.alignment.apply(points_3d))
+    result = fit(points_3d, points_2d, problem.camera, method=method)
+    assert_aligned(result, problem.alignment, 1e-6 / thickness)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, repeated=st.integers(1, 5))
+def test_recovery_in_spite_of_duplicated_points(
+    method: str, seed: int, points: int, repeated: int
+) -> None:
+    problem = problem_of(seed, points)
+    rows = np.concatenate([np.arange(points), np.zeros(repeated, dtype=int)])
+    result = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera, method=method)
+    assert_aligned(result, problem.alignment)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, unit=UNITS)
+def test_recovery_in_huge_and_tiny_units(method: str, seed: int, points: int, unit: float) -> None:
+    problem = problem_of(seed, points)
+    result = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
+    gt = problem.alignment
+    assert_aligned(result, Alignment(gt.rotation, unit * gt.translation, gt.scale))
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, size=st.sampled_from([10.0, 1e3]))
+def test_recovery_of_a_model_far_from_its_own_origin(
+    method: str, seed: int, points: int, size: float
+) -> None:
+    problem = problem_of(seed, points)
+    shift = size * np.array([1.0, -0.5, 0.7])
+    result = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
+    gt = problem.alignment
+    expected = Alignment(gt.rotation, gt.translation - gt.linear @ shift, gt.scale)
+    assert_aligned(result, expected, 1e-6 * size)
+
+
+# --- equivariance ----------------------------------------------------------------------------
+
+
+def in_front(alignment: Alignment, points_3d: np.ndarray) -> bool:
+    return bool((alignment.apply(points_3d)[:, 2] > 0.5).all())
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_equivariance_under_camera_motion(method: str, seed: int, points: int) -> None:
+    problem = problem_of(seed, points)
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3)).as_matrix()
+    motion = Alignment(turn, rng.uniform(-0.5, 0.5, 3), np.ones(3))
+    moved = motion @ problem.alignment
+    if not in_front(moved, problem.points_3d):
+        return
+    points_2d = problem.camera.project(moved.apply(problem.points_3d))
+    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    after = fit(problem.points_3d, points_2d, problem.camera, method=method)
+    assert_aligned(after, motion @ before.alignment)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, angle=st.floats(-np.pi, np.pi))
+def test_equivariance_under_turning_the_image(
+    method: str, seed: int, points: int, angle: float
+) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+    center = np.array([problem.camera.cx, problem.camera.cy])
+    points_2d = (problem.points_2d - center) @ turn[:2, :2].T + center
+    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    after = fit(problem.points_3d, points_2d, problem.camera, method=method)
+    motion = Alignment(turn, np.zeros(3), np.ones(3))
+    assert_aligned(after, motion @ before.alignment, 1e-4)
+
+
+@given(seed=SEEDS, points=COUNTS)
+def test_optimum_is_equivariant_under_stretching_the_model(seed: int, points: int) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    factor = np.array([1.0, *np.random.default_rng(seed).uniform(0.3, 3, 2)])
+    before = fit(problem.points_3d, problem.points_2d, problem.camera)
+    after = fit(problem.points_3d * factor, problem.points_2d, problem.camera)
+    old = before.alignment
+    assert_aligned(after, Alignment(old.rotation, old.translation, old.scale / factor), 1e-4)
+    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-2, atol=1e-6)
+
+
+@given(seed=SEEDS, points=COUNTS)
+def test_linear_solver_is_equivariant_under_stretching_without_noise(
+    seed: int, points: int
+) -> None:
+    problem = problem_of(seed, points)
+    factor = np.array([1.0, *np.random.default_rng(seed).uniform(0.3, 3, 2)])
+    result = fit(problem.points_3d * factor, problem.points_2d, problem.camera, method="aepnp")
+    gt = problem.alignment
+    assert_aligned(result, Alignment(gt.rotation, gt.translation, gt.scale / factor))
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_equivariance_under_shifting_the_model(method: str, seed: int, points: int) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    shift = np.random.default_rng(seed).uniform(-5, 5, 3)
+    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method).alignment
+    after = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
+    expected = Alignment(before.rotation, before.translation - before.linear @ shift, before.scale)
+    assert_aligned(after, expected, 1e-4)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, unit=UNITS)
+def test_equivariance_under_a_change_of_the_models_unit(
+    method: str, seed: int, points: int, unit: float
+) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    after = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
+    old = before.alignment
+    assert_aligned(after, Alignment(old.rotation, unit * old.translation, old.scale), 1e-5)
+    if before.covariance is not None:
+        factor = np.array([1, 1, 1, unit, unit, unit, 1, 1])
+        deviation = np.sqrt(before.covariance.diagonal())
+        difference = after.covariance / np.outer(factor, factor) - before.covariance
+        assert (np.abs(difference) < 1e-4 * np.outer(deviation, deviation)).all()
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS, resolution=st.sampled_from([0.1, 3.0, 100.0]))
+def test_invariance_to_the_images_resolution(
+    method: str, seed: int, points: int, resolution: float
+) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    camera = problem.camera
+    scaled = Camera(
+        6400,
+        4800,
+        resolution * camera.fx,
+        resolution * camera.fy,
+        resolution * camera.cx,
+        resolution * camera.cy,
+    )
+    before = fit(problem.points_3d, problem.points_2d, camera, method=method)
+    after = fit(
+        problem.points_3d, resolution * problem.points_2d, scaled, method=method, sigma=resolution
+    )
+    assert_aligned(after, before.alignment, 1e-5)
+
+
+@METHODS
+@given(seed=SEEDS, points=COUNTS)
+def test_invariance_to_the_points_order(method: str, seed: int, points: int) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    order = np.random.default_rng(seed).permutation(points)
+    before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    after = fit(problem.points_3d[order], problem.points_2d[order], problem.camera, method=method)
+    assert_aligned(after, before.alignment, 1e-4)
+    np.testing.assert_allclose(after.residuals, before.residuals[order], rtol=0, atol=1e-3)
+
+
+@given(seed=SEEDS, points=COUNTS)
+def test_duplicating_every_point_halves_the_variance(seed: int, points: int) -> None:
+    problem = problem_of(seed, points, noise_px=0.5)
+    once = fit(problem.points_3d, problem.points_2d, problem.camera)
+    rows = np.tile(np.arange(points), 2)
+    twice = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera)
+    assert_aligned(twice, once.alignment, 1e-4)
+    deviation = np.sqrt(once.covariance.diagonal())
+    difference = np.abs(2 * twice.covariance - once.covariance)
+    assert (difference < 1e-3 * np.outer(deviation, deviation)).all()
+
+
+# --- valid results ---------------------------------------------------------------------------
+
+
+def assert_valid(alignment: Alignment, points_3d: np.ndarray) -> None:
+    rotation = alignment.rotation
+    assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
+    assert abs(np.linalg.det(rotation) - 1) < 1e-12
+    assert (alignment.scale > 0).all()
+    assert alignment.scale[0] == 1.0
+    assert np.isfinite(alignment.translation).all()
+    assert (alignment.apply(points_3d)[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper", "epnp"])
+@given(seed=SEEDS, points=st.integers(6, 30), noise=st.sampled_from([0.0, 1.0, 10.0, 100.0]))
+def test_every_result_is_a_valid_alignment(
+    method: str, seed: int, points: int, noise: float
+) -> None:
+    problem = problem_of(seed, points, noise_px=noise)
+    try:
+        result = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    except DegenerateError:
+        assert noise > 0  # keypoints that contradict each other may leave no alignment
+        return
+    assert_valid(result.alignment, problem.points_3d)
+    for other in result.alternatives:
+        assert_valid(other.alignment, problem.points_3d)
+    assert np.isfinite(result.residuals).all()
+    if result.covariance is not None:
+        assert (np.linalg.eigvalsh(result.covariance) > 0).all()
+        assert (result.covariance == result.covariance.T).all() or np.allclose(
+            result.covariance, result.covariance.T, rtol=1e-6
+        )
+
+
+@example(seed=0, points=4)
+@given(seed=SEEDS, points=st.integers(4, 5))
+def test_every_result_of_few_points_is_a_valid_alignment(seed: int, points: int) -> None:
+    problem = problem_of(seed, points)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    assert_explains(result, problem)
+    for alignment in [result.alignment, *(other.alignment for other in result.alternatives)]:
+        assert_valid(alignment, problem.points_3d)
+
+
+@METHODS
+@given(seed=SEEDS, points=st.integers(10, 20))
+def test_fit_of_the_same_input_is_the_same(method: str, seed: int, points: int) -> None:
+    problem = problem_of(seed, points, noise_px=2.0)
+    first = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    second = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
+    assert first.alignment == second.alignment
+    assert (first.residuals == second.residuals).all()
+
+
+@given(seed=SEEDS)
+def test_random_rotations_are_rotations(seed: int) -> None:
+    rotation = random_rotation(np.random.default_rng(seed))
+    assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14
+    assert np.linalg.det(rotation) > 0

@@ -1,0 +1,291 @@
+"""What `fit` refuses, word for word."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Camera, fit
+from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+
+
+def problem_of(seed: int, *, points: int, noise_px: float) -> Problem:
+    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
+
+
+GOOD = problem_of(3, points=8, noise_px=0.0)
+METHODS = ["optimal", "aepnp", "aepnp-paper", "epnp"]
+SIGMA_FIX = (
+    "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
+)
+SPAN_FIX = "a linear solver needs keypoints that span a volume"
+
+
+def refusal(points_3d: Any, points_2d: Any, camera: Any, **options: Any) -> CadalignError:
+    with pytest.raises(CadalignError) as caught:
+        fit(points_3d, points_2d, camera, **options)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("method", "count", "text"),
+    [
+        (
+            "optimal",
+            3,
+            "points_3d: 3 keypoints are too few for 8 unknowns; "
+            "give at least 4, fewer unknowns by stretch=, or a prior",
+        ),
+        (
+            "optimal",
+            0,
+            "points_3d: 0 keypoints are too few for 8 unknowns; "
+            "give at least 4, fewer unknowns by stretch=, or a prior",
+        ),
+        (
+            "aepnp",
+            5,
+            "points_3d: 5 keypoints are too few for the method 'aepnp'; give at least 6",
+        ),
+        (
+            "aepnp",
+            0,
+            "points_3d: 0 keypoints are too few for the method 'aepnp'; give at least 6",
+        ),
+        (
+            "aepnp-paper",
+            5,
+            "points_3d: 5 points are too few for a linear solver; give at least 6",
+        ),
+        ("epnp", 3, "points_3d: 3 points are too few for EPnP; give at least 4"),
+    ],
+)
+def test_too_few_points_are_refused(method: str, count: int, text: str) -> None:
+    error = refusal(GOOD.points_3d[:count], GOOD.points_2d[:count], GOOD.camera, method=method)
+    assert isinstance(error, DegenerateError)
+    assert str(error) == text
+
+
+def with_value(array: np.ndarray, row: int, value: float) -> np.ndarray:
+    changed = array.copy()
+    changed[row, 1] = value
+    return changed
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("points_3d", "points_2d", "text"),
+    [
+        (
+            GOOD.points_3d,
+            GOOD.points_2d[:5],
+            "points_2d: 8 model points but 5 image points; row i of both must be the same keypoint",
+        ),
+        (GOOD.points_3d[:, :2], GOOD.points_2d, "points_3d: shape (8, 2), expected (n, 3)"),
+        (GOOD.points_3d, GOOD.points_3d, "points_2d: shape (8, 3), expected (n, 2)"),
+        (GOOD.points_3d[0], GOOD.points_2d, "points_3d: shape (3,), expected (n, 3)"),
+        (
+            with_value(GOOD.points_3d, 6, np.nan),
+            GOOD.points_2d,
+            "points_3d: NaN or infinite values in row 6; remove or repair these",
+        ),
+        (
+            GOOD.points_3d,
+            with_value(GOOD.points_2d, 2, -np.inf),
+            "points_2d: NaN or infinite values in row 2; remove or repair these",
+        ),
+        (
+            [["a", 0, 0]] * 8,
+            GOOD.points_2d,
+            "points_3d: not an array of numbers (could not convert string to float: 'a')",
+        ),
+    ],
+)
+def test_points_that_are_none_are_refused(
+    method: str, points_3d: Any, points_2d: Any, text: str
+) -> None:
+    error = refusal(points_3d, points_2d, GOOD.camera, method=method)
+    assert isinstance(error, InputError)
+    assert str(error) == text
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_something_else_than_a_camera_is_refused(method: str) -> None:
+    error = refusal(GOOD.points_3d, GOOD.points_2d, np.eye(3), method=method)
+    assert str(error) == "camera: expected a cadalign.Camera, got ndarray"
+
+
+OPTIMAL_FIX = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+
+
+def in_plane(axis: int) -> tuple[np.ndarray, np.ndarray]:
+    points_3d = GOOD.points_3d.copy()
+    points_3d[:, axis] = 0.1
+    return points_3d, GOOD.camera.project(GOOD.alignment.apply(points_3d))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_linear_solver_refuses_points_in_a_plane_along_the_axes(axis: int) -> None:
+    error = refusal(*in_plane(axis), GOOD.camera, method="aepnp")
+    assert isinstance(error, DegenerateError)
+    assert str(error) == f"points_3d: the points lie in the plane {'xyz'[axis]} = 0.1; {SPAN_FIX}"
+
+
+def test_linear_solver_names_the_normal_of_an_oblique_plane() -> None:
+    points_3d = GOOD.points_3d.copy()
+    points_3d[:, 2] = points_3d[:, 1]
+    error = refusal(points_3d, GOOD.points_2d, GOOD.camera, method="aepnp")
+    normals = ["(0, -0.707, 0.707)", "(0, 0.707, -0.707)"]
+    normals += [text.replace("(0,", "(-0,") for text in normals]
+    assert str(error) in [
+        f"points_3d: the points lie in one plane, with the normal {normal}; {SPAN_FIX}"
+        for normal in normals
+    ]
+
+
+@pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
+def test_linear_solvers_refuse_points_in_a_plane(method: str) -> None:
+    error = refusal(*in_plane(2), GOOD.camera, method=method)
+    assert isinstance(error, DegenerateError)
+    assert str(error) == f"points_3d: the points lie in the plane z = 0.1; {SPAN_FIX}"
+
+
+@pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
+def test_linear_solvers_refuse_points_on_a_line(method: str) -> None:
+    points_3d = GOOD.points_3d * [1, 0, 0]
+    error = refusal(points_3d, GOOD.points_2d, GOOD.camera, method=method)
+    assert str(error) == f"points_3d: the points lie on one line; {SPAN_FIX}"
+
+
+@pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
+def test_linear_solvers_refuse_points_that_are_all_one(method: str) -> None:
+    error = refusal(np.full((8, 3), 0.3), GOOD.points_2d, GOOD.camera, method=method)
+    assert str(error) == f"points_3d: all points are the same; {SPAN_FIX}"
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_optimum_says_which_stretch_a_plane_leaves_open(axis: int) -> None:
+    for seed in range(10):
+        problem = problem_of(seed, points=8, noise_px=0.0)
+        points_3d = problem.points_3d.copy()
+        points_3d[:, axis] = 0.1
+        points_2d = problem.camera.project(problem.alignment.apply(points_3d))
+        error = refusal(points_3d, points_2d, problem.camera)
+        assert isinstance(error, DegenerateError)
+        assert str(error) == (
+            f"points_3d: the scale s_{'xyz'[axis]} is not determined: "
+            f"the points lie in the plane {'xyz'[axis]} = 0.1; {OPTIMAL_FIX}"
+        )
+
+
+@pytest.mark.parametrize(
+    ("points_3d", "reason"),
+    [
+        (GOOD.points_3d * [1, 0, 0], "the points lie on one line"),
+        (np.full((8, 3), 0.3), "all points are the same"),
+    ],
+)
+def test_optimum_says_why_nothing_is_determined(points_3d: np.ndarray, reason: str) -> None:
+    points_2d = GOOD.camera.project(GOOD.alignment.apply(points_3d))
+    error = refusal(points_3d, points_2d, GOOD.camera)
+    assert isinstance(error, DegenerateError)
+    assert reason in str(error)
+    assert error.fix == OPTIMAL_FIX
+
+
+def test_linear_solver_never_puts_keypoints_behind_the_camera() -> None:
+    rng = np.random.default_rng(0)
+    refusals = []
+    for _ in range(20):
+        points_2d = rng.uniform(0, 480, GOOD.points_2d.shape)
+        try:
+            result = fit(GOOD.points_3d, points_2d, GOOD.camera, method="aepnp")
+        except DegenerateError as error:
+            refusals.append(str(error))
+        else:
+            assert (result.alignment.apply(GOOD.points_3d)[:, 2] > 0).all()
+    assert set(refusals) == {
+        "points_2d: no alignment with all keypoints in front of the camera was found; "
+        "check that points_3d and points_2d correspond, row by row, and the camera"
+    }
+
+
+def test_pixels_beyond_the_lens_are_refused() -> None:
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.4, 0.0, 0.0, 0.0))
+    points_2d = GOOD.points_2d.copy()
+    points_2d[5] = [5000, 240]
+    assert str(refusal(GOOD.points_3d, points_2d, camera)) == (
+        "points_2d: the lens distortion cannot be undone at 1 of 8 pixels, the first is point 5; "
+        "these lie outside the area in which the lens model is valid; drop them"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sigma": 0}, f"sigma: 0 is not a standard deviation; {SIGMA_FIX}"),
+        ({"sigma": -1.0}, f"sigma: -1.0 is not a standard deviation; {SIGMA_FIX}"),
+        ({"sigma": np.nan}, f"sigma: nan is not a standard deviation; {SIGMA_FIX}"),
+        ({"sigma": np.ones(5)}, "sigma: shape (5,), expected (8)"),
+        ({"sigma": np.zeros(8)}, f"sigma: has values that are not positive; {SIGMA_FIX}"),
+        (
+            {"sigma": with_value(np.ones((8, 2)), 0, np.nan)[:, 1]},
+            "sigma: NaN or infinite values in row 0; remove or repair these",
+        ),
+        (
+            {"sigma": np.array([np.eye(2)] * 7 + [np.diag([1.0, -1.0])])},
+            "sigma: the covariance of keypoint 7 is not symmetric and positive definite; "
+            + SIGMA_FIX,
+        ),
+        (
+            {"sigma": np.array([np.eye(2)] * 6 + [[[1, 0.5], [0, 1]]] + [np.eye(2)])},
+            "sigma: the covariance of keypoint 6 is not symmetric and positive definite; "
+            + SIGMA_FIX,
+        ),
+        ({"loss": "l1"}, "loss: unknown loss 'l1'; known are linear, huber, cauchy"),
+        ({"loss_scale": 0}, "loss_scale: 0 is not positive"),
+        ({"loss_scale": np.nan}, "loss_scale: nan is not positive"),
+        ({"scale_prior_sigma": -0.1}, "scale_prior_sigma: -0.1 is not positive"),
+        (
+            {"stretch": "x"},
+            "stretch: 'x' are not axes that can stretch where x is known; "
+            "give one of yz, y, z, none",
+        ),
+        (
+            {"stretch": "yz", "known_axis": "z"},
+            "stretch: 'yz' are not axes that can stretch where z is known; "
+            "give one of xy, x, y, none",
+        ),
+        ({"known_axis": "w"}, "known_axis: 'w' is not an axis; give x, y or z"),
+        (
+            {"method": "best"},
+            "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp",
+        ),
+        (
+            {"method": "aepnp", "loss": "huber"},
+            "method: the method 'aepnp' knows neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options alone",
+        ),
+        (
+            {"method": "epnp", "stretch": "none"},
+            "method: the method 'epnp' knows neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options alone",
+        ),
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, Any], text: str) -> None:
+    error = refusal(GOOD.points_3d, GOOD.points_2d, GOOD.camera, **options)
+    assert isinstance(error, InputError)
+    assert str(error) == text
+
+
+def test_noise_of_keypoints_that_always_fit_cannot_be_estimated() -> None:
+    error = refusal(GOOD.points_3d[:4], GOOD.points_2d[:4], GOOD.camera, sigma=None)
+    assert isinstance(error, DegenerateError)
+    assert str(error) == (
+        "sigma: 4 keypoints fit exactly, so their noise cannot be estimated; "
+        "give sigma, or more keypoints"
+    )

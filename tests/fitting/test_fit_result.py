@@ -1,0 +1,131 @@
+"""What a fit returns, as text and as JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cadalign import Alignment, FitResult, FocalPrior, fit
+from cadalign.errors import InputError
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.fitting.result import Alternative, FitStats
+
+
+def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5) -> Problem:
+    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
+
+
+def fit_problem(problem: Problem, **options: object) -> FitResult:
+    return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
+
+
+MADE = FitResult(
+    alignment=Alignment(
+        Rotation.from_rotvec([0, np.pi / 3, 0]).as_matrix(), [0.5, -0.25, 6], [1, 0.75, 1.25]
+    ),
+    points_3d=np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]]),
+    residuals=np.array([[3.0, 4.0]] + [[0.0, 0.0]] * 5),
+    inliers=np.array([False, True, True, True, True, True]),
+    method="optimal",
+    camera=SIMULATION_CAMERA,
+    sigma=1.0,
+    covariance=np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0.0001, 0.0225]),
+    alternatives=(
+        Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125, SIMULATION_CAMERA),
+    ),
+    stats=FitStats(12, 34, 0.5),
+)
+
+
+def test_text_of_a_result() -> None:
+    assert str(MADE) == (
+        "optimal: 5 of 6 keypoints, rms 0 px\n"
+        "  rotation     60 deg from the camera's axes, +- 0.99 deg\n"
+        "  translation  (0.5, -0.25, 6) +- (0.02, 0.03, 0.1)\n"
+        "  scale        (1, 0.75 +- 1 %, 1.25 +- 15 %)\n"
+        "  also likely  (0.12 x): scale (1, 2, 0.5)\n"
+        "  warning      s_z is known only to +-15 %: there are few keypoints for their noise"
+    )
+
+
+def test_text_of_a_result_without_statistics() -> None:
+    plain = FitResult(
+        alignment=MADE.alignment,
+        points_3d=MADE.points_3d,
+        residuals=MADE.residuals,
+        inliers=np.ones(6, dtype=bool),
+        method="aepnp",
+        camera=SIMULATION_CAMERA,
+    )
+    assert str(plain) == (
+        "aepnp: 6 keypoints, rms 2.04 px\n"
+        "  rotation     60 deg from the camera's axes\n"
+        "  translation  (0.5, -0.25, 6)\n"
+        "  scale        (1, 0.75, 1.25)"
+    )
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        MADE,
+        fit_problem(problem_of(0, points=5, noise_px=1.0), sigma=np.full(5, 1.5)),
+        fit_problem(problem_of(0), method="aepnp"),
+        fit_problem(problem_of(0), known_axis="y", stretch="x"),
+        fit_problem(problem_of(0), focal="estimate", focal_prior=FocalPrior(140.0, 0.1)),
+    ],
+    ids=["made", "alternatives", "linear", "known axis", "unknown focal length"],
+)
+def test_json_brings_back_the_same_result(result: FitResult) -> None:
+    text = result.to_json()
+    again = FitResult.from_json(text)
+    assert again.to_json() == text
+    assert str(again) == str(result)
+    assert again.alignment == result.alignment
+    assert again.camera == result.camera
+    assert again.stats == result.stats
+    assert again.inliers.dtype == bool
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{", "fit result: not valid JSON: "),
+        ("[]", "fit result: malformed ("),
+        ("{}", "fit result: missing 'covariance'"),
+        (
+            json.dumps(MADE.to_dict() | {"alignment": {"scale": [1, 1, 1]}}),
+            "alignment: missing rotation, translation",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"residuals": [[1, 2, 3]]}),
+            "residuals: shape (1, 3), expected (n, 2)",
+        ),
+        (json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}), "fit result: malformed ("),
+    ],
+)
+def test_malformed_json_is_refused(text: str, expected: str) -> None:
+    with pytest.raises(InputError) as caught:
+        FitResult.from_json(text)
+    assert str(caught.value).startswith(expected)
+
+
+def test_warnings_look_at_the_inliers_alone() -> None:
+    in_plane = MADE.points_3d * [1, 1, 0] + [0, 0, 0.25]
+    points_3d = np.concatenate([in_plane, [[0.5, 0.5, 3.0]]])
+    result = FitResult(
+        alignment=MADE.alignment,
+        points_3d=points_3d,
+        residuals=np.zeros((7, 2)),
+        inliers=np.array([True] * 6 + [False]),
+        method="optimal",
+        camera=SIMULATION_CAMERA,
+        covariance=MADE.covariance,
+    )
+    assert result.warnings == (
+        "s_z is known only to +-15 %: the keypoints lie nearly in the plane z = 0.25",
+    )

@@ -1,0 +1,282 @@
+"""Robust fitting finds the keypoints that agree, and says so where none do."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cadalign
+from cadalign import Alignment, Camera, RansacOptions, fit, fit_batch
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.geometry.metrics import rotation_error, scale_error
+
+CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
+
+
+def spoiled(seed: int, *, points: int, outliers: int, noise_px: float = 1.0) -> tuple[Any, ...]:
+    """A problem of which some image points were moved by 15 px or more, and which these are."""
+    rng = np.random.default_rng(seed)
+    problem = simulate_problem(
+        rng, points=points, noise_px=noise_px, camera=CAMERA, depth=(6.0, 9.0)
+    )
+    wrong = rng.choice(points, outliers, replace=False)
+    points_2d = problem.points_2d.copy()
+    low, high = points_2d.min(axis=0), points_2d.max(axis=0)
+    for i in wrong:
+        while np.linalg.norm(points_2d[i] - problem.points_2d[i]) < 15:
+            points_2d[i] = rng.uniform(low, high)
+    mask = np.zeros(points, dtype=bool)
+    mask[wrong] = True
+    return problem, points_2d, mask
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.8])
+def test_outliers_are_found_and_the_rest_is_fitted(share: float) -> None:
+    problem, points_2d, wrong = spoiled(1, points=200, outliers=round(200 * share))
+    result = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions())
+    assert not result.inliers[wrong].any()
+    assert result.inliers[~wrong].mean() > 0.98
+    alone = fit(problem.points_3d[result.inliers], points_2d[result.inliers], CAMERA)
+    assert result.alignment == alone.alignment
+    assert rotation_error(est=result.alignment, gt=problem.alignment) < 1.0
+    assert result.rms < 2.0
+    assert result.stats.inlier_ratio == pytest.approx(result.inliers.mean())
+    assert result.stats.score is not None
+    assert result.stats.score > 0
+
+
+def test_wrong_ones_among_eight_keypoints_are_found() -> None:
+    found = refused = 0
+    for seed in range(100):
+        problem, points_2d, wrong = spoiled(seed, points=8, outliers=2)
+        try:
+            result = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions())
+        except NoConsensusError:
+            refused += 1
+            continue
+        found += bool((result.inliers == ~wrong).all())
+    assert found >= 90
+    assert found + refused >= 96
+
+
+def test_few_keypoints_are_searched_exhaustively() -> None:
+    problem, points_2d, _ = spoiled(0, points=8, outliers=2)
+    result = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions())
+    assert result.stats.iterations == 70
+    other = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=9))
+    assert other.alignment == result.alignment
+
+
+def test_the_same_seed_gives_the_same_result() -> None:
+    problem, points_2d, _ = spoiled(2, points=100, outliers=60)
+    results = [
+        fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=seed))
+        for seed in (5, 5, 6)
+    ]
+    assert results[0].alignment == results[1].alignment
+    assert results[0].stats.iterations == results[1].stats.iterations
+    assert results[0].stats.hypotheses == results[1].stats.hypotheses
+    assert results[0].stats.hypotheses != results[2].stats.hypotheses
+
+
+def test_confidences_shorten_the_search() -> None:
+    problem, points_2d, wrong = spoiled(3, points=300, outliers=255)
+    options = RansacOptions(min_iterations=1, max_iterations=50_000)
+    rng = np.random.default_rng(0)
+    confidences = np.where(wrong, 0.3, 0.7) + rng.uniform(0, 0.3, 300)
+    guided = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=confidences)
+    blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
+    assert not guided.inliers[wrong].any()
+    assert not blind.inliers[wrong].any()
+    np.testing.assert_allclose(guided.alignment.scale, blind.alignment.scale, rtol=0.05)
+
+
+def test_linear_minimal_set_is_the_papers() -> None:
+    problem, points_2d, wrong = spoiled(4, points=200, outliers=60, noise_px=0.3)
+    options = RansacOptions(minimal="aepnp", refine=False)
+    result = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
+    assert result.method == "ransac-aepnp"
+    assert result.covariance is None
+    refined = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(minimal="aepnp"))
+    assert not refined.inliers[wrong].any()
+    assert rotation_error(est=refined.alignment, gt=problem.alignment) < rotation_error(
+        est=result.alignment, gt=problem.alignment
+    )
+
+
+def test_known_axis_and_stretch_are_honoured() -> None:
+    problem, points_2d, wrong = spoiled(5, points=100, outliers=30)
+    result = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(), known_axis="y")
+    assert result.alignment.scale[1] == 1.0
+    assert not result.inliers[wrong].any()
+    free = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions())
+    ratio = free.alignment.scale / result.alignment.scale
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-3)
+
+
+def test_batch_equals_single_fits_and_keeps_errors() -> None:
+    cases = [spoiled(seed, points=n, outliers=n // 4) for seed, n in ((0, 12), (1, 40), (2, 9))]
+    points_3d = [problem.points_3d for problem, _, _ in cases]
+    points_2d = [pixels for _, pixels, _ in cases]
+    rng = np.random.default_rng(0)
+    points_3d.append(rng.uniform(-1, 1, (8, 3)))
+    points_2d.append(rng.uniform(0, 400, (8, 2)))
+    for workers in (1, 2):
+        batch = fit_batch(points_3d, points_2d, CAMERA, ransac=RansacOptions(), workers=workers)
+        for b in range(3):
+            alone = fit(points_3d[b], points_2d[b], CAMERA, ransac=RansacOptions())
+            assert batch.alignment(b) == alone.alignment
+            rows = slice(batch.offsets[b], batch.offsets[b + 1])
+            assert (batch.inliers[rows] == alone.inliers).all()
+        assert isinstance(batch.errors[3], NoConsensusError)
+        assert np.isnan(batch.rotation[3]).all()
+
+
+@pytest.mark.parametrize("points", [8, 30, 300])
+def test_random_correspondences_are_refused_with_the_best_score(points: int) -> None:
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        points_3d = rng.uniform(-1, 1, (points, 3))
+        points_2d = rng.uniform([0, 0], [640, 480], (points, 2))
+        with pytest.raises(NoConsensusError, match="no alignment is supported") as refusal:
+            fit(points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=seed))
+        assert refusal.value.score > 0
+        assert refusal.value.inliers < points
+        copy = pickle.loads(pickle.dumps(refusal.value))
+        assert (copy.score, str(copy)) == (refusal.value.score, str(refusal.value))
+
+
+def test_identical_points_are_refused() -> None:
+    with pytest.raises(NoConsensusError):
+        fit(np.ones((20, 3)), np.full((20, 2), 100.0), CAMERA, ransac=RansacOptions())
+
+
+def good() -> Problem:
+    return simulate_problem(np.random.default_rng(0), points=10, noise_px=1.0, camera=CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"confidences": -np.ones(10)}, "confidences: keypoint 0 has the confidence -1; "),
+        ({"confidences": np.full(10, np.nan)}, "confidences: NaN or infinite values in rows 0, 1"),
+        ({"confidences": np.ones(9)}, "confidences: shape (9,), expected (10)"),
+        ({"method": "aepnp"}, "method: the method 'aepnp' does not go with ransac; "),
+    ],
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+    problem = good()
+    with pytest.raises(InputError) as refusal:
+        fit(problem.points_3d, problem.points_2d, CAMERA, ransac=RansacOptions(), **arguments)
+    assert str(refusal.value).startswith(message)
+
+
+def test_too_few_keypoints_are_refused() -> None:
+    problem = good()
+    with pytest.raises(InputError, match="3 keypoints are too few; give at least 4"):
+        fit(problem.points_3d[:3], problem.points_2d[:3], CAMERA, ransac=RansacOptions())
+
+
+def test_confidences_without_ransac_are_refused() -> None:
+    problem = good()
+    with pytest.raises(InputError, match="confidences: given without ransac"):
+        fit(problem.points_3d, problem.points_2d, CAMERA, confidences=np.ones(10))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"max_reproj_error": 0.0}, "max_reproj_error: 0.0 is not positive"),
+        ({"max_iterations": 0}, "max_iterations: 0 is not a number of at least 1"),
+        ({"min_iterations": -1}, "min_iterations: -1 is not a number of at least 0"),
+        ({"seed": 1.5}, "seed: 1.5 is not a number of at least 0"),
+        ({"success_prob": 1.0}, "success_prob: 1.0 is not between 0 and 1"),
+        ({"minimal": "p3p"}, "minimal: unknown minimal solver 'p3p'; known are ap4p, aepnp"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as refusal:
+        RansacOptions(**options)
+    assert str(refusal.value) == message
+
+
+def sfm_images(real_data: Path) -> list[Any]:
+    from cadalign.datasets import Bundler, Colmap
+
+    return [
+        *Colmap(real_data / "sfm/maupertuis_colmap"),
+        *Bundler(real_data / "sfm/balbianello"),
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("share", "draws", "wanted", "max_iterations"),
+    [(0.0, 20, 0.995, 10_000), (0.25, 20, 0.995, 10_000), (0.5, 20, 0.995, 10_000)]
+    + [(0.8, 20, 0.98, 10_000), (0.9, 4, 0.9, 200_000)],
+)
+def test_real_correspondences(share: float, draws: int, wanted: float, max_iterations: int) -> None:
+    folder = os.environ.get("CADALIGN_DATA")
+    if not folder:
+        pytest.skip("CADALIGN_DATA is not set")
+    rng = np.random.default_rng(1)
+    succeeded = []
+    for draw in range(draws):
+        for image in sfm_images(Path(folder)):
+            scale = np.array([1.0, *rng.uniform(0.5, 2.0, 2)])
+            gt = Alignment(image.cam_from_world.rotation, image.cam_from_world.translation, scale)
+            points_2d = image.points_2d.copy()
+            count = len(points_2d)
+            wrong = rng.choice(count, round(share * count), replace=False)
+            size = [image.camera.width - 1, image.camera.height - 1]
+            points_2d[wrong] = rng.uniform([0, 0], size, (len(wrong), 2))
+            options = RansacOptions(seed=draw, max_iterations=max_iterations)
+            try:
+                est = fit(
+                    image.points_3d / scale, points_2d, image.camera, ransac=options
+                ).alignment
+            except cadalign.CadalignError:
+                succeeded.append(False)
+                continue
+            succeeded.append(
+                rotation_error(est=est, gt=gt) < 0.5 and scale_error(est=est, gt=gt).max() < 0.01
+            )
+    assert np.mean(succeeded) >= wanted
+
+
+def test_confidences_that_are_all_alike_guide_nothing() -> None:
+    problem, points_2d, _ = spoiled(3, points=60, outliers=20)
+    options = RansacOptions()
+    alike = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=np.full(60, 0.7))
+    blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
+    assert alike.alignment == blind.alignment
+    assert alike.stats.iterations == blind.stats.iterations
+
+
+@pytest.mark.parametrize("focal", ["known", "estimate"])
+def test_keypoints_in_one_plane_are_refused_in_those_words(focal: str) -> None:
+    problem, _, _ = spoiled(0, points=30, outliers=0)
+    flat = problem.points_3d * [1, 1, 0]
+    points_2d = CAMERA.project(problem.alignment.apply(flat))
+    with pytest.raises(DegenerateError, match=r"all keypoints lie in one plane.*loss='cauchy'"):
+        fit(flat, points_2d, CAMERA, focal=focal, ransac=RansacOptions(max_iterations=200))
+    alone = fit(flat, points_2d, CAMERA, stretch="y", loss="cauchy")
+    assert alone.rms < 1e3
+
+
+def test_minimal_solver_that_wants_the_focal_length_is_refused_without() -> None:
+    problem, points_2d, _ = spoiled(0, points=30, outliers=0)
+    with pytest.raises(InputError, match="minimal: 'aepnp' does not estimate the focal length"):
+        fit(
+            problem.points_3d,
+            points_2d,
+            CAMERA,
+            focal="estimate",
+            ransac=RansacOptions(minimal="aepnp"),
+        )

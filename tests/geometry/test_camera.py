@@ -1,0 +1,498 @@
+"""The camera: projection, lens, COLMAP's form, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from cadalign import Camera
+from cadalign.errors import InputError
+from cadalign.geometry.camera import COLMAP_PARAMS
+
+PLAIN = Camera(width=640, height=480, fx=500.0, fy=520.0, cx=310.5, cy=245.25)
+# Mild, and strong enough that forgetting a term would show; all of them invertible in the image.
+LENSES = {
+    "none": (),
+    "radial": (-0.2, 0.05, 0.0, 0.0),
+    "tangential": (0.0, 0.0, 0.01, -0.02),
+    "opencv4": (-0.28, 0.09, 0.003, -0.002),
+    "opencv5": (-0.28, 0.09, 0.003, -0.002, -0.01),
+    "rational": (0.3, -0.1, 0.001, 0.002, 0.02, 0.4, -0.05, 0.01),
+}
+
+
+def camera_with(distortion: tuple[float, ...]) -> Camera:
+    return Camera(640, 480, 500.0, 520.0, 310.5, 245.25, distortion)
+
+
+def points_in_view(seed: int, count: int = 40) -> np.ndarray:
+    """Camera-frame points whose undistorted projections lie in or near the image."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.5, 20.0, (count, 1))
+    return np.hstack([rng.uniform(-0.65, 0.65, (count, 2)) * [1.0, 0.75] * depth, depth])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_project_agrees_with_opencv(lens: str, seed: int) -> None:
+    camera = camera_with(LENSES[lens])
+    points = points_in_view(seed)
+    coefficients = np.array(camera.distortion) if camera.distortion else None
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, coefficients)
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_normalize_undoes_project(lens: str, seed: int) -> None:
+    camera = camera_with(LENSES[lens])
+    points = points_in_view(seed)
+    rays = camera.normalize(camera.project(points))
+    np.testing.assert_allclose(rays, points[:, :2] / points[:, 2:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_project_undoes_normalize(lens: str, seed: int) -> None:
+    camera = camera_with(LENSES[lens])
+    pixels = np.random.default_rng(seed).uniform([20, 20], [620, 460], (40, 2))
+    rays = camera.normalize(pixels)
+    again = camera.project(np.column_stack([rays, np.ones(len(rays))]))
+    np.testing.assert_allclose(again, pixels, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_normalize_agrees_with_opencv(lens: str) -> None:
+    camera = camera_with(LENSES[lens])
+    pixels = np.random.default_rng(0).uniform([100, 100], [540, 380], (40, 2))
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    coefficients = np.array(camera.distortion) if camera.distortion else np.zeros(4)
+    expected = cv2.undistortPoints(
+        pixels[:, None], camera.matrix, coefficients, R=np.eye(3), P=np.eye(3), criteria=criteria
+    )
+    np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_distortion_jacobian_is_the_derivative_of_the_lens(lens: str) -> None:
+    camera = camera_with(LENSES[lens])
+    rays = np.random.default_rng(1).uniform(-0.6, 0.6, (30, 2))
+    step = 1e-6
+    columns = []
+    for axis in np.eye(2):
+        ahead = camera.pixels_from_normalized(rays + step * axis)
+        behind = camera.pixels_from_normalized(rays - step * axis)
+        columns.append((ahead - behind) / (2 * step) / [camera.fx, camera.fy])
+    expected = np.stack(columns, axis=2)
+    np.testing.assert_allclose(camera.distortion_jacobian(rays), expected, rtol=0, atol=1e-8)
+
+
+def test_optical_axis_meets_the_principal_point() -> None:
+    assert PLAIN.project([[0.0, 0.0, 3.0]]).tolist() == [[PLAIN.cx, PLAIN.cy]]
+
+
+def test_x_goes_right_and_y_goes_down() -> None:
+    right, down = PLAIN.project([[1.0, 0.0, 5.0], [0.0, 1.0, 5.0]])
+    assert right.tolist() == [PLAIN.cx + 100.0, PLAIN.cy]
+    assert down.tolist() == [PLAIN.cx, PLAIN.cy + 104.0]
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_projection_ignores_the_unit_of_length(lens: str) -> None:
+    camera = camera_with(LENSES[lens])
+    points = points_in_view(3)
+    for unit in (1e-6, 1e6):
+        np.testing.assert_allclose(
+            camera.project(unit * points), camera.project(points), rtol=0, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    ("pixel", "inside"),
+    [
+        ((-0.5, -0.5), True),
+        ((639.5, 479.5), True),
+        ((-0.51, 0.0), False),
+        ((0.0, -0.51), False),
+        ((639.51, 0.0), False),
+        ((0.0, 479.51), False),
+    ],
+)
+def test_image_reaches_half_a_pixel_beyond_the_outer_centres(
+    pixel: tuple[float, float], inside: bool
+) -> None:
+    assert PLAIN.contains(np.array([pixel])).tolist() == [inside]
+
+
+def test_contains_keeps_a_margin() -> None:
+    pixels = np.array([[9.6, 240.0], [9.4, 240.0], [629.4, 240.0], [629.6, 240.0]])
+    assert PLAIN.contains(pixels, margin=10.0).tolist() == [True, False, True, False]
+
+
+@given(
+    width=st.integers(1, 8000),
+    height=st.integers(1, 8000),
+    fov=st.floats(1.0, 175.0, allow_nan=False),
+)
+def test_from_fov_sees_exactly_the_field_of_view(width: int, height: int, fov: float) -> None:
+    camera = Camera.from_fov(width, height, fov_x=fov)
+    edges = camera.normalize([[-0.5, camera.cy], [width - 0.5, camera.cy]])
+    angle = np.degrees(np.arctan(edges[1, 0]) - np.arctan(edges[0, 0]))
+    assert angle == pytest.approx(fov, abs=1e-8)
+    assert camera.fx == camera.fy
+    np.testing.assert_allclose(edges[0, 0], -edges[1, 0], rtol=1e-9)
+    assert camera.cy == (height - 1) / 2
+
+
+@pytest.mark.parametrize("fov", [0.0, 180.0, -10.0, np.nan, np.inf, "60"])
+def test_from_fov_refuses_what_is_no_angle(fov: Any) -> None:
+    with pytest.raises(InputError, match=r"fov_x: .* is not between 0 and 180 degrees"):
+        Camera.from_fov(640, 480, fov_x=fov)
+
+
+# --- COLMAP's form ---------------------------------------------------------------------------
+
+PARAMS = {
+    "SIMPLE_PINHOLE": [500.0, 320.0, 240.0],
+    "PINHOLE": [500.0, 520.0, 320.0, 240.0],
+    "SIMPLE_RADIAL": [500.0, 320.0, 240.0, 0.1],
+    "RADIAL": [500.0, 320.0, 240.0, 0.1, -0.05],
+    "OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
+    "FULL_OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6],
+}
+EXPECTED = {
+    "SIMPLE_PINHOLE": Camera(640, 480, 500.0, 500.0, 319.5, 239.5),
+    "PINHOLE": Camera(640, 480, 500.0, 520.0, 319.5, 239.5),
+    "SIMPLE_RADIAL": Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, 0, 0, 0)),
+    "RADIAL": Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.1, -0.05, 0, 0)),
+    "OPENCV": Camera(640, 480, 500.0, 520.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02)),
+    "FULL_OPENCV": Camera(
+        640, 480, 500.0, 520.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6)
+    ),
+}
+
+
+def test_every_colmap_model_that_is_known_is_tested() -> None:
+    assert set(PARAMS) == set(COLMAP_PARAMS)
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_from_dict_reads_colmaps_order_and_takes_off_half_a_pixel(model: str) -> None:
+    data = {"model": model, "width": 640, "height": 480, "params": PARAMS[model]}
+    assert Camera.from_dict(data) == EXPECTED[model]
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_from_dict_undoes_to_dict(model: str) -> None:
+    camera = EXPECTED[model]
+    assert Camera.from_dict(camera.to_dict()) == camera
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(
+    values=st.tuples(
+        st.floats(1.0, 1e5), st.floats(1.0, 1e5), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)
+    )
+)
+def test_round_trip_through_colmaps_form_keeps_every_pixel(
+    lens: str, values: tuple[float, float, float, float]
+) -> None:
+    camera = Camera(640, 480, *values, LENSES[lens])
+    again = Camera.from_dict(camera.to_dict())
+    points = points_in_view(0, 5)
+    np.testing.assert_allclose(again.project(points), camera.project(points), rtol=1e-12, atol=1e-9)
+    assert again.to_dict() == camera.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("model", "written"),
+    [
+        ("SIMPLE_PINHOLE", "PINHOLE"),
+        ("PINHOLE", "PINHOLE"),
+        ("SIMPLE_RADIAL", "OPENCV"),
+        ("RADIAL", "OPENCV"),
+        ("OPENCV", "OPENCV"),
+        ("FULL_OPENCV", "FULL_OPENCV"),
+    ],
+)
+def test_to_dict_writes_the_smallest_of_three_models(model: str, written: str) -> None:
+    data = EXPECTED[model].to_dict()
+    assert data["model"] == written
+    assert len(data["params"]) == len(COLMAP_PARAMS[written])
+
+
+# --- values ----------------------------------------------------------------------------------
+
+
+def test_camera_is_a_value() -> None:
+    same = Camera(640, 480, 500, 520, 310.5, 245.25, (0, 0, 0, 0))
+    assert same == PLAIN
+    assert hash(same) == hash(PLAIN)
+    with pytest.raises(AttributeError):
+        PLAIN.fx = 1.0  # type: ignore[misc]
+
+
+def test_camera_takes_numpy_numbers_and_keeps_python_ones() -> None:
+    camera = Camera(np.int64(640), np.float32(480), np.float32(500), np.int32(500), 1, 2)
+    kinds = [type(getattr(camera, name)) for name in ("width", "height", "fx", "fy", "cx", "cy")]
+    assert kinds == [int, int, float, float, float, float]
+
+
+@example(seed=0)
+@given(seed=st.integers(0, 1000))
+def test_matrix_is_the_calibration_matrix(seed: int) -> None:
+    points = points_in_view(seed, 5)
+    homogeneous = points @ PLAIN.matrix.T
+    np.testing.assert_allclose(PLAIN.project(points), homogeneous[:, :2] / homogeneous[:, 2:])
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+GOOD: dict[str, Any] = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
+LENGTH_FIX = "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6"
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            {"fx": 0},
+            "camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+        ),
+        (
+            {"fy": -500},
+            "camera.fy: the focal length is -500; give the calibrated focal length in pixels",
+        ),
+        ({"fx": None}, "camera.fx: None is not a finite number"),
+        ({"fx": np.nan}, "camera.fx: nan is not a finite number"),
+        ({"cx": np.inf}, "camera.cx: inf is not a finite number"),
+        ({"cy": "240"}, "camera.cy: '240' is not a finite number"),
+        ({"fx": True}, "camera.fx: True is not a finite number"),
+        ({"width": 0}, "camera.width: 0 is not a size; give the image size in whole pixels"),
+        ({"height": -1}, "camera.height: -1 is not a size; give the image size in whole pixels"),
+        (
+            {"width": 640.5},
+            "camera.width: 640.5 is not a size; give the image size in whole pixels",
+        ),
+        (
+            {"width": np.nan},
+            "camera.width: nan is not a size; give the image size in whole pixels",
+        ),
+        (
+            {"distortion": (0.1, 0.2)},
+            "camera.distortion: (0.1, 0.2) are not distortion coefficients; " + LENGTH_FIX,
+        ),
+        (
+            {"distortion": (0.1, 0, 0, np.nan)},
+            "camera.distortion: (0.1, 0.0, 0.0, nan) are not distortion coefficients; "
+            + LENGTH_FIX,
+        ),
+        ({"distortion": 0.1}, "camera.distortion: not a sequence of numbers"),
+        ({"distortion": ("a",) * 4}, "camera.distortion: not a sequence of numbers"),
+    ],
+)
+def test_camera_refuses_wrong_values(change: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera(**GOOD | change)
+    assert str(caught.value) == text
+
+
+COLMAP_DATA: dict[str, Any] = {
+    "model": "PINHOLE",
+    "width": 640,
+    "height": 480,
+    "params": [500, 500, 320, 240],
+}
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        ([1, 2], "camera: expected an object, got list"),
+        (
+            {"model": "PINHOLE", "params": []},
+            'camera: missing width, height; give {"model", "width", "height", "params"} '
+            "as COLMAP does",
+        ),
+        (
+            COLMAP_DATA | {"model": "FISHEYE"},
+            "camera.model: unknown model 'FISHEYE'; known are SIMPLE_PINHOLE, PINHOLE, "
+            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV",
+        ),
+        (
+            COLMAP_DATA | {"params": [500, 320, 240]},
+            "camera.params: [500, 320, 240] are not the parameters of PINHOLE; give fx, fy, cx, cy",
+        ),
+        (
+            COLMAP_DATA | {"params": "500 500 320 240"},
+            "camera.params: '500 500 320 240' are not the parameters of PINHOLE; "
+            "give fx, fy, cx, cy",
+        ),
+        (
+            COLMAP_DATA | {"params": [500, None, 320, 240]},
+            "camera.params: fy is None, not a finite number",
+        ),
+        (
+            COLMAP_DATA | {"params": [0, 500, 320, 240]},
+            "camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+        ),
+        (
+            COLMAP_DATA | {"width": "640"},
+            "camera.width: '640' is not a size; give the image size in whole pixels",
+        ),
+    ],
+)
+def test_from_dict_refuses_malformed_cameras(data: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.from_dict(data)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize("model", [["PINHOLE"], {"a": 1}, None, 3])
+def test_from_dict_refuses_a_model_that_is_no_name(model: Any) -> None:
+    with pytest.raises(InputError, match=r"camera\.model: unknown model"):
+        Camera.from_dict(COLMAP_DATA | {"model": model})
+
+
+def test_points_behind_the_camera_are_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        PLAIN.project([[0, 0, 1], [0, 0, -2], [0, 0, 0]])
+    assert str(caught.value) == (
+        "points_cam: 2 of 3 points lie behind the camera, the first is point 1 with z = -2; "
+        "only points with z > 0 have a projection"
+    )
+
+
+def test_pixels_beyond_the_lens_are_refused() -> None:
+    camera = camera_with((-0.4, 0.0, 0.0, 0.0))
+    pixels = [[310.0, 245.0], [5000.0, 245.0]]
+    with pytest.raises(InputError) as caught:
+        camera.normalize(pixels)
+    assert str(caught.value) == (
+        "points_2d: the lens distortion cannot be undone at 1 of 2 pixels, the first is point 1; "
+        "these lie outside the area in which the lens model is valid; drop them"
+    )
+    rays, valid = camera.normalize_where_valid(pixels)
+    assert valid.tolist() == [True, False]
+    assert np.isfinite(rays).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "text"),
+    [
+        ([[0, 0]], "points_cam: shape (1, 2), expected (n, 3)"),
+        ([0, 0, 1], "points_cam: shape (3,), expected (n, 3)"),
+        (
+            [[0, 0, 1], [np.nan, 0, 1], [0, np.inf, 1]],
+            "points_cam: NaN or infinite values in rows 1, 2; remove or repair these",
+        ),
+    ],
+)
+def test_project_refuses_what_are_no_points(points: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        PLAIN.project(points)
+    assert str(caught.value) == text
+
+
+def test_no_points_have_no_projections() -> None:
+    assert PLAIN.project(np.empty((0, 3))).shape == (0, 2)
+    assert camera_with(LENSES["opencv4"]).normalize(np.empty((0, 2))).shape == (0, 2)
+
+
+# --- without focal length ---------------------------------------------------------------------
+
+
+def test_camera_without_focal_length_has_its_principal_point_in_the_centre() -> None:
+    camera = Camera.without_focal(641, 480)
+    assert (camera.cx, camera.cy) == (320.0, 239.5)
+    assert not camera.focal_known
+    assert camera.fx == camera.fy
+    given = Camera.without_focal(640, 480, cx=300.0, cy=200.0, distortion=(0.1, 0, 0, 0))
+    assert (given.cx, given.cy, given.distortion) == (300.0, 200.0, (0.1, 0.0, 0.0, 0.0))
+
+
+def test_focal_length_once_given_is_known() -> None:
+    camera = Camera.without_focal(640, 480).with_focal(700)
+    assert camera == Camera(640, 480, 700, 700, 319.5, 239.5)
+    assert camera != Camera.without_focal(640, 480)
+    stretched = Camera(640, 480, 500, 550, 320, 240).with_focal(1000)
+    assert (stretched.fx, stretched.fy) == (1000.0, 1100.0)
+
+
+@pytest.mark.parametrize("use", ["project", "normalize"])
+def test_camera_without_focal_length_is_not_used_as_if_it_had_one(use: str) -> None:
+    camera = Camera.without_focal(640, 480)
+    points = [[0.0, 0.0, 2.0]] if use == "project" else [[3.0, 4.0]]
+    with pytest.raises(InputError) as caught:
+        getattr(camera, use)(points)
+    assert str(caught.value) == (
+        'camera: the focal length is unknown; estimate it with focal="estimate", '
+        "or give it: camera.with_focal(...)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [
+        ((0, 480), "camera.width: 0 x 480 is not a size; give the image size in whole pixels"),
+        ((640, "high"), "camera.width: 640 x 'high' is not a size; "),
+        ((640.5, 480), "camera.width: 640.5 is not a size; "),
+    ],
+)
+def test_sizes_that_are_none_are_refused_without_a_focal_length_too(size: Any, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.without_focal(*size)
+    assert str(caught.value).startswith(text)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"width": 640, "height": 480},
+        {
+            "model": "SIMPLE_PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [None, 320.0, 240.0],
+        },
+        {
+            "model": "PINHOLE",
+            "width": 640,
+            "height": 480,
+            "params": [None, None, 320.0, 240.0],
+        },
+    ],
+)
+def test_unknown_focal_length_is_null_in_files(data: dict[str, Any]) -> None:
+    camera = Camera.from_dict(data)
+    assert camera == Camera.without_focal(640, 480)
+    assert camera.to_dict() == {
+        "model": "PINHOLE",
+        "width": 640,
+        "height": 480,
+        "params": [None, None, 320.0, 240.0],
+    }
+    assert Camera.from_dict(camera.to_dict()) == camera
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ([500.0, None, 320, 240], "camera.params: fy is None, not a finite number"),
+        ([None, None, None, 240], "camera.params: cx is None, not a finite number"),
+    ],
+)
+def test_half_a_focal_length_is_refused(params: list[Any], text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Camera.from_dict({"model": "PINHOLE", "width": 640, "height": 480, "params": params})
+    assert str(caught.value) == text
+
+
+def test_whole_numbers_beyond_all_floats_are_refused() -> None:
+    with pytest.raises(InputError, match="not a finite number"):
+        Camera(640, 480, 10**400, 500.0, 320.0, 240.0)

@@ -1,0 +1,328 @@
+"""The metrics: perfect scores, closed forms, and independent ways to the same number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, HalfspaceIntersection
+from scipy.spatial.transform import Rotation
+
+from cadalign import Alignment, Box, Camera
+from cadalign.errors import InputError
+from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.geometry.metrics import (
+    alignment_box_iou,
+    box_iou,
+    reprojection_error,
+    rotation_error,
+    scale_error,
+    translation_error,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+BOUNDS = np.array([[-0.5, -0.3, -0.2], [0.4, 0.3, 0.35]])
+
+
+def random_alignment(seed: int) -> Alignment:
+    rng = np.random.default_rng(seed)
+    translation = [*rng.uniform(-1, 1, 2), rng.uniform(4, 8)]
+    return Alignment(random_rotation(rng), translation, [1.0, *rng.uniform(0.5, 2, 2)])
+
+
+def turned(angle_deg: float, axis: Any = (0, 0, 1)) -> np.ndarray:
+    axis = np.asarray(axis, dtype=float)
+    vector = np.radians(angle_deg) * axis / np.linalg.norm(axis)
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+# --- pose and scale --------------------------------------------------------------------------
+
+
+@given(seed=SEEDS)
+def test_perfect_estimate_scores_perfectly(seed: int) -> None:
+    gt = random_alignment(seed)
+    est = Alignment.from_dict(gt.to_dict())
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (9, 3))
+    pixels = CAMERA.project(gt.apply(points))
+    # Rounding in the truth's own matrix is all that a perfect estimate may be charged with.
+    assert rotation_error(est=est, gt=gt) < 1e-12
+    assert translation_error(est=est, gt=gt) == 0.0
+    assert scale_error(est=est, gt=gt).tolist() == [0.0, 0.0, 0.0]
+    assert reprojection_error(est=est, points_3d=points, points_2d=pixels, camera=CAMERA) == 0.0
+    assert alignment_box_iou(est=est, gt=gt, bounds=BOUNDS) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, -2, 3)])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-13, 1e-9, 1e-5, 0.1, 45.0, 90.0, 135.0, 179.0, 180 - 1e-5, 180.0]
+)
+def test_rotation_error_is_the_angle_from_tiny_to_half_a_turn(
+    axis: tuple[int, ...], angle: float
+) -> None:
+    base = turned(77, (3, 1, 2))
+    est = Alignment(turned(angle, axis) @ base, np.zeros(3), np.ones(3))
+    gt = Alignment(base, np.zeros(3), np.ones(3))
+    # Entries of a matrix carry 1e-16, which is 1e-14 degrees; near half a turn its square root.
+    tolerance = 3e-14 if angle < 170 else 2e-6
+    assert rotation_error(est=est, gt=gt) == pytest.approx(angle, rel=1e-9, abs=tolerance)
+
+
+@given(first=SEEDS, second=SEEDS)
+def test_pose_errors_are_symmetric(first: int, second: int) -> None:
+    a, b = random_alignment(first), random_alignment(second)
+    assert rotation_error(est=a, gt=b) == pytest.approx(rotation_error(est=b, gt=a), abs=1e-12)
+    assert translation_error(est=a, gt=b) == translation_error(est=b, gt=a)
+
+
+@given(first=SEEDS, second=SEEDS, third=SEEDS)
+def test_rotation_error_obeys_the_triangle_inequality(first: int, second: int, third: int) -> None:
+    a, b, c = (random_alignment(seed) for seed in (first, second, third))
+    direct = rotation_error(est=a, gt=c)
+    assert direct <= rotation_error(est=a, gt=b) + rotation_error(est=b, gt=c) + 1e-9
+
+
+@given(first=SEEDS, second=SEEDS, frame=SEEDS)
+def test_rotation_error_does_not_depend_on_the_frame(first: int, second: int, frame: int) -> None:
+    a, b, f = (random_alignment(seed) for seed in (first, second, frame))
+    ones = np.ones(3)
+    moved = [Alignment(f.rotation @ x.rotation, x.translation, ones) for x in (a, b)]
+    expected = rotation_error(est=a, gt=b)
+    assert rotation_error(est=moved[0], gt=moved[1]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_translation_error_is_the_distance() -> None:
+    est = Alignment(np.eye(3), [1, 2, 2], np.ones(3))
+    assert translation_error(est=est, gt=Alignment.identity()) == 3.0
+
+
+def test_scale_error_is_relative_to_the_truth_and_keeps_the_axes_apart() -> None:
+    est = Alignment(np.eye(3), np.zeros(3), [1.0, 1.5, 1.0])
+    gt = Alignment(np.eye(3), np.zeros(3), [1.0, 1.0, 2.0])
+    assert scale_error(est=est, gt=gt).tolist() == [0.0, 0.5, 0.5]
+    assert scale_error(est=gt, gt=est) == pytest.approx([0.0, 1 / 3, 1.0])
+
+
+# --- reprojection ----------------------------------------------------------------------------
+
+
+def test_reprojection_error_is_the_root_mean_square_distance() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    est = Alignment(np.eye(3), [0, 0, 5], np.ones(3))
+    pixels = CAMERA.project(est.apply(points)) + [[3.0, 4.0], [0.0, 0.0]]
+    error = reprojection_error(est=est, points_3d=points, points_2d=pixels, camera=CAMERA)
+    assert error == pytest.approx(np.sqrt(25 / 2))
+
+
+@pytest.mark.parametrize(
+    ("points_3d", "points_2d", "text"),
+    [
+        (np.zeros((2, 3)), np.zeros((3, 2)), "points_2d: 2 model points, 3 observations"),
+        (np.zeros((0, 3)), np.zeros((0, 2)), "points_2d: 0 model points, 0 observations"),
+        (
+            np.zeros((2, 3)),
+            [[0, 0], [np.nan, 0]],
+            "points_2d: NaN or infinite values in row 1; remove or repair these",
+        ),
+        (
+            [[0, 0, 0], [0, np.inf, 0]],
+            np.zeros((2, 2)),
+            "points: NaN or infinite values in row 1; remove or repair these",
+        ),
+        (
+            [[0, 0, 0], [0, 0, -9]],
+            np.zeros((2, 2)),
+            "points_cam: 1 of 2 points lie behind the camera, the first is point 1 with z = -4; "
+            "only points with z > 0 have a projection",
+        ),
+    ],
+)
+def test_reprojection_error_refuses(points_3d: Any, points_2d: Any, text: str) -> None:
+    est = Alignment(np.eye(3), [0, 0, 5], np.ones(3))
+    with pytest.raises(InputError) as caught:
+        reprojection_error(est=est, points_3d=points_3d, points_2d=points_2d, camera=CAMERA)
+    assert str(caught.value) == text
+
+
+# --- boxes -----------------------------------------------------------------------------------
+
+CUBE = Box([0, 0, 0], np.eye(3), [1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("est", "expected"),
+    [
+        (Box([0.5, 0, 0], np.eye(3), [1, 1, 1]), 1 / 3),  # half of it
+        (Box([0.5, 0.5, 0], np.eye(3), [1, 1, 1]), 1 / 7),
+        (Box([0.5, 0.5, 0.5], np.eye(3), [1, 1, 1]), 1 / 15),
+        (Box([0.3, -0.2, 0.1], np.eye(3), [1, 1, 1]), 0.504 / 1.496),
+        (Box([0, 0, 0], np.eye(3), [0.5, 0.5, 0.5]), 1 / 8),  # contained
+        (Box([0.2, 0.1, 0], turned(30, (1, 1, 0)), [0.2, 0.3, 0.1]), 0.006),
+        (Box([0, 0, 0], np.eye(3), [3, 0.5, 0.5]), 0.25 / 1.5),  # runs through
+        (Box([0, 0, 0], turned(90), [1, 1, 1]), 1.0),  # the same, named differently
+        (Box([0, 0, 0], turned(120, (1, 1, 1)), [1, 1, 1]), 1.0),
+        (Box([1, 0, 0], np.eye(3), [1, 1, 1]), 0.0),  # touches in a face
+        (Box([1, 1, 0], np.eye(3), [1, 1, 1]), 0.0),  # in an edge
+        (Box([1, 1, 1], np.eye(3), [1, 1, 1]), 0.0),  # in a corner
+        (Box([0.5 + np.sqrt(0.5), 0, 0], turned(45), [1, 1, 1]), 0.0),  # its edge in a face
+        (Box([1.001, 0, 0], np.eye(3), [1, 1, 1]), 0.0),  # apart
+        (Box([50, 60, 70], turned(30, (1, 2, 3)), [1, 1, 1]), 0.0),
+    ],
+)
+def test_box_iou_of_known_pairs(est: Box, expected: float) -> None:
+    assert box_iou(est=est, gt=CUBE) == pytest.approx(expected, abs=1e-12)
+    assert box_iou(est=CUBE, gt=est) == pytest.approx(expected, abs=1e-12)
+
+
+def octagon_iou(angle_deg: float) -> float:
+    """IoU of a unit square and itself turned by 0 to 90 degrees: an equilateral octagon.
+
+    Each side cuts a right triangle off every corner; with legs a and b on one side of length 1,
+    a + b + sqrt(a^2 + b^2) = 1 and b / a = tan(angle).
+    """
+    angle = np.radians(angle_deg)
+    hypotenuse = 1 / (1 + np.cos(angle) + np.sin(angle))
+    area = 1 - 4 * 0.5 * hypotenuse**2 * np.cos(angle) * np.sin(angle)
+    return area / (2 - area)
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.01, 5, 30, 45, 60, 89.99])
+@pytest.mark.parametrize("length", [1.0, 1e-3, 1e3])
+def test_box_iou_of_a_square_prism_turned_about_its_axis(angle: float, length: float) -> None:
+    gt = Box([0, 0, 0], np.eye(3), [1, 1, length])
+    est = Box([0, 0, 0], turned(angle), [1, 1, length])
+    assert box_iou(est=est, gt=gt) == pytest.approx(octagon_iou(angle), abs=1e-10)
+
+
+def test_box_iou_at_45_degrees_is_that_of_the_regular_octagon() -> None:
+    area = 2 * (np.sqrt(2) - 1)
+    assert octagon_iou(45) == pytest.approx(area / (2 - area), abs=1e-15)
+
+
+def overlapping_boxes(seed: int) -> tuple[Box, Box]:
+    rng = np.random.default_rng(seed)
+    first = Box(rng.uniform(-1, 1, 3), random_rotation(rng), rng.uniform(0.3, 2, 3))
+    shift = rng.uniform(-0.8, 0.8, 3)
+    return first, Box(first.center + shift, random_rotation(rng), rng.uniform(0.3, 2, 3))
+
+
+def halfspaces(box: Box) -> np.ndarray:
+    """Rows (n, d) with n x + d <= 0 inside the box."""
+    normals = np.vstack([box.rotation.T, -box.rotation.T])
+    half = np.concatenate([box.extents, box.extents]) / 2
+    return np.column_stack([normals, -half - normals @ box.center])
+
+
+def volume_by_duality(first: Box, second: Box) -> float:
+    """Volume of the intersection from half-spaces, about its Chebyshev centre."""
+    planes = np.vstack([halfspaces(first), halfspaces(second)])
+    bound = np.column_stack([planes[:, :3], np.ones(len(planes))])
+    found = linprog([0, 0, 0, -1], bound, -planes[:, 3], bounds=[(None, None)] * 3 + [(0, None)])
+    if not found.success or found.x[3] < 1e-9:
+        return 0.0
+    corners = HalfspaceIntersection(planes, found.x[:3]).intersections
+    return float(ConvexHull(corners).volume)
+
+
+@given(seed=SEEDS)
+def test_box_iou_agrees_with_the_intersection_of_half_spaces(seed: int) -> None:
+    est, gt = overlapping_boxes(seed)
+    intersection = volume_by_duality(est, gt)
+    expected = intersection / (est.volume + gt.volume - intersection)
+    assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_box_iou_agrees_with_counting_random_points(seed: int) -> None:
+    est, gt = overlapping_boxes(seed)
+    rng = np.random.default_rng(seed)
+    points = est.center + (rng.uniform(-0.5, 0.5, (400_000, 3)) * est.extents) @ est.rotation.T
+    inside = (np.abs((points - gt.center) @ gt.rotation) <= gt.extents / 2).all(axis=1).mean()
+    intersection = inside * est.volume
+    expected = intersection / (est.volume + gt.volume - intersection)
+    assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=0.005)
+
+
+@given(seed=SEEDS, frame=SEEDS)
+def test_box_iou_is_symmetric_and_does_not_depend_on_frame_or_unit(seed: int, frame: int) -> None:
+    est, gt = overlapping_boxes(seed)
+    expected = box_iou(est=est, gt=gt)
+    assert 0.0 <= expected <= 1.0
+    assert box_iou(est=gt, gt=est) == pytest.approx(expected, abs=1e-12)
+    rng = np.random.default_rng(frame)
+    rotation, shift, unit = random_rotation(rng), rng.uniform(-5, 5, 3), 10 ** rng.uniform(-6, 6)
+    moved = [
+        Box(unit * (rotation @ b.center + shift), rotation @ b.rotation, unit * b.extents)
+        for b in (est, gt)
+    ]
+    assert box_iou(est=moved[0], gt=moved[1]) == pytest.approx(expected, abs=1e-9)
+
+
+@given(seed=SEEDS)
+def test_box_iou_of_a_box_with_itself_is_one(seed: int) -> None:
+    box, _ = overlapping_boxes(seed)
+    assert box_iou(est=box, gt=box) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(seed=SEEDS, angle=st.sampled_from([1e-12, 1e-10, 1e-8, 1e-6, 1e-4]))
+def test_box_iou_is_continuous_at_a_perfect_estimate(seed: int, angle: float) -> None:
+    gt, _ = overlapping_boxes(seed)
+    axis = np.random.default_rng(seed).standard_normal(3)
+    est = Box(gt.center, turned(np.degrees(angle), axis) @ gt.rotation, gt.extents)
+    # A turn by an angle moves a face by at most half a diagonal times the angle.
+    largest = 4 * angle * np.linalg.norm(gt.extents) / gt.extents.min()
+    assert 1 - box_iou(est=est, gt=gt) <= largest + 1e-11
+
+
+@pytest.mark.parametrize(("name", "flat_first"), [("est", True), ("gt", False)])
+def test_box_iou_refuses_flat_boxes(name: str, flat_first: bool) -> None:
+    flat = Box([0, 0, 0], np.eye(3), [1, 0, 1])
+    est, gt = (flat, CUBE) if flat_first else (CUBE, flat)
+    with pytest.raises(InputError) as caught:
+        box_iou(est=est, gt=gt)
+    assert str(caught.value) == (
+        f"{name}: the box [1.0, 0.0, 1.0] has no volume; leave flat models out of volume metrics"
+    )
+
+
+def test_box_iou_refuses_boxes_without_any_extent() -> None:
+    with pytest.raises(InputError, match="has no volume"):
+        box_iou(est=CUBE, gt=Box([0, 0, 0], np.eye(3), [0, 0, 0]))
+
+
+@given(first=SEEDS, second=SEEDS)
+def test_alignment_box_iou_is_that_of_the_models_boxes(first: int, second: int) -> None:
+    a, b = random_alignment(first), random_alignment(second)
+    expected = box_iou(est=Box.from_model(BOUNDS, a), gt=Box.from_model(BOUNDS, b))
+    assert alignment_box_iou(est=a, gt=b, bounds=BOUNDS) == expected
+
+
+# --- NaN and infinity ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("part", ["rotation", "translation", "scale"])
+def test_no_metric_can_be_handed_a_pose_that_is_not_finite(part: str, bad: float) -> None:
+    parts = {"rotation": np.eye(3), "translation": np.zeros(3), "scale": np.ones(3)}
+    parts[part] = parts[part].copy()
+    parts[part].flat[0] = bad
+    with pytest.raises(InputError, match=f"{part}: NaN or infinite"):
+        Alignment(**parts)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_no_metric_can_be_handed_bounds_that_are_not_finite(bad: float) -> None:
+    identity = Alignment.identity()
+    with pytest.raises(InputError, match="bounds: NaN or infinite values in row 1"):
+        alignment_box_iou(est=identity, gt=identity, bounds=[[0, 0, 0], [1, bad, 1]])
+
+
+@pytest.mark.parametrize("metric", [rotation_error, translation_error, scale_error, box_iou])
+def test_est_and_gt_go_by_name(metric: Any) -> None:
+    with pytest.raises(TypeError):
+        metric(Alignment.identity(), Alignment.identity())

@@ -1,0 +1,266 @@
+"""Observation files: a round trip, and every way in which one can be wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support import replaced
+
+from cadalign import Camera
+from cadalign.errors import DataError, InputError
+from cadalign.io.observation import Observation
+
+CAMERA = Camera(640, 480, 500.0, 510.0, 319.5, 239.5, (-0.1, 0.02, 0.001, 0.0))
+POINTS_3D = np.random.default_rng(0).uniform(-1, 1, (7, 3))
+POINTS_2D = np.random.default_rng(1).uniform(0, 480, (7, 2))
+
+DATA: dict[str, Any] = {
+    "camera": {"model": "PINHOLE", "width": 640, "height": 480, "params": [500, 500, 320, 240]},
+    "keypoints": [
+        {"xyz": [0.1 * i, 0.2, -0.3 * i], "uv": [10.0 * i, 20], "sigma": 1 + i, "semantic_id": i}
+        for i in range(6)
+    ],
+    "image": "photo.png",
+    "model": "models/chair.obj",
+}
+
+
+def changed(path: str, value: Any) -> dict[str, Any]:
+    """The data with the entry at a dotted path replaced; removed where the value is `...`."""
+    return replaced(DATA, path, value)
+
+
+def write(path: Path, data: Any) -> Path:
+    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
+    return path
+
+
+def test_fields_arrive() -> None:
+    observation = Observation.from_dict(DATA)
+    assert observation.points_3d.tolist() == [k["xyz"] for k in DATA["keypoints"]]
+    assert observation.points_2d.tolist() == [k["uv"] for k in DATA["keypoints"]]
+    assert observation.camera == Camera(640, 480, 500, 500, 319.5, 239.5)
+    assert observation.sigma is not None
+    assert observation.semantic_ids is not None
+    assert observation.sigma.tolist() == [1, 2, 3, 4, 5, 6]
+    assert observation.semantic_ids.tolist() == [0, 1, 2, 3, 4, 5]
+    assert observation.image == Path("photo.png")
+    assert observation.model == Path("models/chair.obj")
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    observation = Observation.load(write(tmp_path / "chair.json", DATA))
+    assert observation.image == tmp_path / "photo.png"
+    assert observation.model == tmp_path / "models" / "chair.obj"
+    absolute = write(tmp_path / "chair.json", DATA | {"image": "/elsewhere/photo.png"})
+    assert Observation.load(absolute).image == Path("/elsewhere/photo.png")
+
+
+@pytest.mark.parametrize("extras", [True, False])
+def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
+    written = Observation(
+        POINTS_3D,
+        POINTS_2D,
+        CAMERA,
+        sigma=np.linspace(0.5, 2, 7) if extras else None,
+        semantic_ids=np.arange(7) if extras else None,
+    )
+    written.save(tmp_path / "observation.json")
+    read = Observation.load(tmp_path / "observation.json")
+    assert (read.points_3d == POINTS_3D).all()
+    assert (read.points_2d == POINTS_2D).all()
+    assert read.camera == CAMERA
+    if extras:
+        assert (read.sigma == written.sigma).all()
+        assert (read.semantic_ids == written.semantic_ids).all()
+    else:
+        assert read.sigma is None
+        assert read.semantic_ids is None
+    assert read.to_dict() == written.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        ([1], "{path}: expected an object, got list"),
+        (changed("camera", ...), "{path}: camera: missing"),
+        (changed("keypoints", ...), "{path}: keypoints: missing"),
+        (changed("keypoints", []), "{path}: keypoints: expected a list of at least one keypoint"),
+        (changed("keypoints", {}), "{path}: keypoints: expected a list of at least one keypoint"),
+        (
+            DATA | {"cameras": 3},
+            "{path}: top level: unknown field 'cameras'; known are camera, image, keypoints, model",
+        ),
+        (changed("keypoints.2", 7), "{path}: keypoints[2]: expected an object, got int"),
+        (changed("keypoints.2.xyz", ...), "{path}: keypoints[2].xyz: missing"),
+        (changed("keypoints.3.uv", ...), "{path}: keypoints[3].uv: missing"),
+        (
+            changed("keypoints.2.uvw", 3),
+            "{path}: keypoints[2]: unknown field 'uvw'; "
+            "known are confidence, name, semantic_id, sigma, uv, xyz",
+        ),
+        (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: shape (2,), expected (3)"),
+        (
+            changed("keypoints.2.uv", "here"),
+            "{path}: keypoints[2].uv: not an array of numbers "
+            "(could not convert string to float: 'here')",
+        ),
+        (
+            changed("keypoints.2.uv", [1, None]),
+            "{path}: keypoints[2].uv: NaN or infinite values in row 1; remove or repair these",
+        ),
+        (
+            changed("keypoints.4.xyz", [1, float("nan"), 2]),
+            "{path}: keypoints[4].xyz: NaN or infinite values in row 1; remove or repair these",
+        ),
+        (changed("keypoints.1.sigma", 0), "{path}: keypoints[1].sigma: is not positive"),
+        (changed("keypoints.1.sigma", -2), "{path}: keypoints[1].sigma: is not positive"),
+        (
+            changed("keypoints.1.sigma", ...),
+            "{path}: keypoints[1].sigma: missing, though other keypoints have it; "
+            "give it for all keypoints or for none",
+        ),
+        (
+            changed("keypoints.5.semantic_id", ...),
+            "{path}: keypoints[5].semantic_id: missing, though other keypoints have it; "
+            "give it for all keypoints or for none",
+        ),
+        (
+            changed("keypoints.5.semantic_id", 1.5),
+            "{path}: keypoints[5].semantic_id: 1.5 is not a whole number",
+        ),
+        (
+            changed("keypoints.5.semantic_id", True),
+            "{path}: keypoints[5].semantic_id: True is not a whole number",
+        ),
+        (changed("image", 5), "{path}: image: 5 is not a path"),
+        (
+            changed("camera.params.0", 0),
+            "{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels",
+        ),
+        (
+            changed("camera.params", ...),
+            '{path}: camera: missing params; give {{"model", "width", "height", "params"}} '
+            "as COLMAP does",
+        ),
+        (changed("camera", "phone"), "{path}: camera: expected an object, got str"),
+        (changed("camera", None), "{path}: camera: expected an object, got NoneType"),
+        ("", "{path}, line 1: not valid JSON: Expecting value"),
+        ("null", "{path}: expected an object, got NoneType"),
+    ],
+)
+def test_malformed_files_are_refused_by_file_and_field(
+    tmp_path: Path, data: Any, text: str
+) -> None:
+    path = write(tmp_path / "observation.json", data)
+    with pytest.raises(DataError) as caught:
+        Observation.load(path)
+    assert str(caught.value) == text.format(path=path)
+
+
+def test_file_cut_short_is_refused_with_its_line(tmp_path: Path) -> None:
+    whole = json.dumps(DATA, indent=1)
+    path = write(tmp_path / "observation.json", whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"observation\.json, line \d+: not valid JSON: "):
+        Observation.load(path)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        Observation.load(tmp_path / "nothing.json")
+    assert str(caught.value) == f"{tmp_path / 'nothing.json'}: no such file"
+
+
+def test_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be read"):
+        Observation.load(tmp_path)
+    (tmp_path / "photo.png").write_bytes(b"\x89PNG\xff\xfe\x00")
+    with pytest.raises(DataError, match=r"photo\.png: cannot be read"):
+        Observation.load(tmp_path / "photo.png")
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"points_2d": POINTS_2D[:5]}, "points_2d: shape (5, 2), expected (7, 2)"),
+        ({"points_3d": POINTS_3D[:, :2]}, "points_3d: shape (7, 2), expected (n, 3)"),
+        ({"sigma": np.ones(3)}, "sigma: shape (3,), expected (7)"),
+        (
+            {"points_3d": np.full((7, 3), np.nan)},
+            "points_3d: NaN or infinite values in rows 0, 1, 2, 3, 4, ...; remove or repair these",
+        ),
+    ],
+)
+def test_arrays_that_do_not_match_are_refused(change: dict[str, Any], text: str) -> None:
+    arguments = {"points_3d": POINTS_3D, "points_2d": POINTS_2D, "camera": CAMERA} | change
+    with pytest.raises(InputError) as caught:
+        Observation(**arguments)
+    assert str(caught.value) == text
+
+
+def test_saved_paths_still_name_the_same_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("photos").mkdir()
+    write(Path("photos/first.json"), DATA)
+    loaded = Observation.load("photos/first.json")
+    for again in ("photos/second.json", "third.json"):
+        loaded.save(again)
+        image = Observation.load(again).image
+        assert image is not None
+        assert image.resolve() == tmp_path / "photos" / "photo.png"
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("file", ["photos/p.json", "deep/er/p.json", "p.json", "linked/p.json"])
+def test_saved_paths_outside_the_files_folder_name_the_same_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, absolute: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("photos", "deep/er", "models/b", "elsewhere/far/off"):
+        Path(folder).mkdir(parents=True)
+    Path("linked").symlink_to("elsewhere/far/off")
+    model, image = Path("models/b/model.obj"), Path("photos/p.jpg")
+    given = (tmp_path / model, tmp_path / image) if absolute else (model, image)
+    Observation(POINTS_3D, POINTS_2D, CAMERA, model=given[0], image=given[1]).save(file)
+    loaded = Observation.load(file)
+    assert loaded.model is not None
+    assert loaded.image is not None
+    assert loaded.model.resolve() == tmp_path / model
+    assert loaded.image.resolve() == tmp_path / image
+    written = json.loads(Path(file).read_text())
+    assert not Path(written["model"]).is_absolute()
+    assert not Path(written["image"]).is_absolute()
+
+
+def test_path_that_cannot_be_relative_is_written_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other_drive(*_: object) -> str:
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr("os.path.relpath", other_drive)
+    model = tmp_path / "models" / "model.obj"
+    observation = Observation(POINTS_3D, POINTS_2D, CAMERA, model=model)
+    assert observation.to_dict(folder=tmp_path / "photos")["model"] == model.as_posix()
+
+
+def test_save_cut_short_leaves_the_file_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = write(tmp_path / "p.json", DATA)
+    before = path.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr("os.replace", full)
+        with pytest.raises(DataError, match="cannot be written"):
+            Observation(POINTS_3D, POINTS_2D, CAMERA).save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

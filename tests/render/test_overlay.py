@@ -1,0 +1,305 @@
+"""Overlays: what is drawn where, in which colour, on which background."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from cadalign import Alignment, Box, Camera, Mesh
+from cadalign.errors import InputError, RenderError
+from cadalign.render import (
+    Geometry,
+    RaycastRenderer,
+    Scene,
+    draw_overlay,
+    feature_lines,
+    look_at,
+)
+from cadalign.render.drawing.overlay import (
+    AXIS_COLORS,
+    EST_COLOR,
+    GT_COLOR,
+    OBSERVED_COLOR,
+    REPROJECTED_COLOR,
+)
+
+CAMERA = Camera.from_fov(640, 480, fov_x=50)
+LARGE = Camera.from_fov(1600, 1200, fov_x=50)
+BENT = Camera(640, 480, 600.0, 600.0, 319.5, 239.5, (-0.25, 0.05, 0, 0))
+BACKGROUNDS = {"black": 0, "grey": 120, "white": 255}
+
+
+def _box(azimuth=30, elevation=25, distance=4.0, size=1.0):
+    pose = look_at(azimuth=azimuth, elevation=elevation, distance=distance)
+    return Box.from_model(np.array([[-1, -1, -1], [1, 1, 1]]) * size / 2, pose)
+
+
+def _blank(camera=CAMERA, value=0):
+    return np.full((camera.height, camera.width, 3), value, dtype=np.uint8)
+
+
+def _near_color(image, color, tolerance=40):
+    return (np.abs(image.astype(int) - color) <= tolerance).all(axis=2)
+
+
+def _has_color_near(image, pixel, color, *, within=2):
+    column, row = np.rint(pixel).astype(int)
+    part = image[max(row - within, 0) : row + within + 1, max(column - within, 0) :][
+        :, : 2 * within + 1
+    ]
+    return bool(_near_color(part, color).any())
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LARGE, BENT])
+@pytest.mark.parametrize("background", BACKGROUNDS.values(), ids=BACKGROUNDS)
+def test_boxes_are_drawn_along_their_near_edges(camera, background):
+    box = _box()
+    for name, color in (("gt_box", GT_COLOR), ("est_box", EST_COLOR)):
+        image = draw_overlay(
+            _blank(camera, background), camera, **{name: box}, axes=False, legend=False
+        )
+        # From this side the edges at the corner nearest to the camera are seen.
+        nearest = int(box.corners[:, 2].argmin())
+        for bit in (1, 2, 4):
+            ends = box.corners[[nearest, nearest ^ bit]]
+            for share in (0.2, 0.4, 0.6, 0.8):
+                pixel = camera.project(ends[:1] * (1 - share) + ends[1:] * share)[0]
+                assert _has_color_near(image, pixel, color)
+
+
+def test_hidden_edges_are_fainter_than_near_ones():
+    box = _box()
+    image = draw_overlay(_blank(), CAMERA, gt_box=box, axes=False, legend=False)
+    farthest = int(box.corners[:, 2].argmax())
+    share = np.linspace(0.1, 0.9, 60)[:, None]
+    brightness = {}
+    for name, corner in (("far", farthest), ("near", int(box.corners[:, 2].argmin()))):
+        ends = box.corners[[corner, corner ^ 2]]
+        columns, rows = (
+            np.rint(CAMERA.project(ends[0] * (1 - share) + ends[1] * share)).astype(int).T
+        )
+        brightness[name] = image[rows, columns, 1].mean()
+    assert 10 < brightness["far"] < 0.6 * brightness["near"]
+
+
+def test_nearer_box_is_drawn_over_the_farther_one():
+    near = Box([0, 0, 3.0], np.eye(3), [1, 1, 0])
+    far = Box([0, 0, 6.0], np.eye(3), [0.5, 4, 0])
+    # Where the far box's upright edge crosses the near box's upper one.
+    crossing = CAMERA.project([[0.125, 0.5, 3.0]])[0]
+    for color, boxes in (
+        (GT_COLOR, {"gt_box": near, "est_box": far}),
+        (EST_COLOR, {"est_box": near, "gt_box": far}),
+    ):
+        image = draw_overlay(_blank(), CAMERA, **boxes, axes=False, legend=False)
+        assert _has_color_near(image, crossing, color, within=0)
+
+
+def test_axes_reach_the_faces_of_the_stretched_box():
+    pose = look_at(azimuth=35, elevation=30, distance=5, scale=(1, 1.8, 0.6))
+    box = Box.from_model([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]], pose)
+    image = draw_overlay(_blank(), CAMERA, est_box=box, legend=False)
+    for k in range(3):
+        tip = box.center + box.rotation[:, k] * box.extents[k] / 2
+        middle, end = CAMERA.project(np.array([box.center, tip]))
+        along = (end - middle) / np.linalg.norm(end - middle)
+        for pixel in ((middle + end) / 2, end - 2 * along):
+            assert _has_color_near(image, pixel, AXIS_COLORS[k], within=1)
+        # The letter begins 5 px farther on.
+        assert not _has_color_near(image, end + 3 * along, AXIS_COLORS[k], within=0)
+    without = draw_overlay(_blank(), CAMERA, est_box=box, legend=False, axes=False)
+    assert not any(_near_color(without, color, 20).any() for color in AXIS_COLORS)
+
+
+@pytest.mark.parametrize("background", BACKGROUNDS.values(), ids=BACKGROUNDS)
+def test_keypoints_and_residuals_are_drawn(background):
+    observed = np.array([[100.3, 200.7], [320.0, 100.5], [500.25, 333.75]])
+    reprojected = observed + np.array([60.0, 0.0])
+    image = draw_overlay(
+        _blank(value=background), CAMERA, observed=observed, reprojected=reprojected, legend=False
+    )
+    for point, other in zip(observed, reprojected, strict=True):
+        assert _has_color_near(image, other, REPROJECTED_COLOR)
+        assert _has_color_near(image, (point + other) / 2, REPROJECTED_COLOR)
+        assert _has_color_near(image, point + np.array([0, 5.0]), OBSERVED_COLOR)
+
+
+def test_white_rings_show_on_white_by_their_casing():
+    image = draw_overlay(_blank(value=255), CAMERA, observed=[[100.0, 100.0]], legend=False)
+    assert image[90:111, 90:111].min() < 60
+
+
+def test_a_marker_is_drawn_about_its_point():
+    point = np.array([[200.37, 150.81]])
+    image = draw_overlay(_blank(), CAMERA, observed=point, legend=False).astype(float)
+    # The casing is nearly as black as the background: weigh by what is bright.
+    weight = image.sum(axis=2)
+    rows, columns = np.indices(weight.shape)
+    center = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+    np.testing.assert_allclose(center, point[0], atol=0.1)
+
+
+def test_background_stays_as_it_was():
+    photo = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    kept = photo.copy()
+    image = draw_overlay(photo, CAMERA, gt_box=_box(), legend=False)
+    np.testing.assert_array_equal(photo, kept)
+    assert image.shape == (480, 640, 3)
+    assert image.dtype == np.uint8
+    # A few pixels about the box, none elsewhere.
+    changed = (image != photo).any(axis=2)
+    assert changed.mean() < 0.05
+    assert not changed[:40].any()
+    np.testing.assert_array_equal(draw_overlay(photo, CAMERA), photo)
+
+
+def test_legend_names_what_is_drawn_and_avoids_it():
+    # The box sits in the top left: the legend goes elsewhere.
+    box = Box([-0.75, -0.55, 3.0], np.eye(3), [0.8, 0.5, 0.5])
+    plain = draw_overlay(_blank(value=200), CAMERA, gt_box=box, legend=False)
+    image = draw_overlay(_blank(value=200), CAMERA, gt_box=box)
+    rows, columns = np.nonzero((plain != image).any(axis=2))
+    assert columns.min() > 320 or rows.min() > 240
+    assert _near_color(
+        image[rows.min() : rows.max(), columns.min() : columns.max()], GT_COLOR
+    ).any()
+    heights = []
+    for options in ({"gt_box": box}, {"gt_box": box, "est_box": box, "observed": [[50.0, 50.0]]}):
+        plain = draw_overlay(_blank(value=200), CAMERA, **options, legend=False)
+        legend = (plain != draw_overlay(_blank(value=200), CAMERA, **options)).any(axis=2)
+        heights.append(np.ptp(np.nonzero(legend)[0]))
+    assert heights[1] > heights[0] + 20
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BENT])
+def test_edges_behind_the_camera_are_cut_off(camera):
+    # The camera is inside the first box; the second lies wholly behind it.
+    inside = Box([0.1, 0, 0.5], np.eye(3), [2, 2, 6])
+    image = draw_overlay(_blank(camera), camera, gt_box=inside, legend=False)
+    assert _near_color(image, GT_COLOR).any()
+    behind = Box([0, 0, -5], np.eye(3), [1, 1, 1])
+    image = draw_overlay(_blank(camera), camera, gt_box=behind, legend=False)
+    assert not image.any()
+
+
+def test_boxes_without_thickness_or_size_are_drawn():
+    for extents in ([1, 1, 0], [1, 0, 0], [0, 0, 0]):
+        draw_overlay(_blank(), CAMERA, gt_box=Box([0, 0, 4], np.eye(3), extents))
+
+
+def test_points_far_outside_the_image_are_harmless():
+    points = [[1e12, -1e12], [100.0, 100.0]]
+    image = draw_overlay(_blank(), CAMERA, observed=points, reprojected=points[::-1])
+    assert image.any()
+
+
+def test_tiny_images_are_drawn_on_without_a_legend():
+    camera = Camera.from_fov(24, 18, fov_x=50)
+    image = draw_overlay(_blank(camera), camera, gt_box=_box(), est_box=_box())
+    assert image.shape == (18, 24, 3)
+
+
+def test_grey_and_rgba_images_are_taken():
+    grey = np.full((480, 640), 77, dtype=np.uint8)
+    np.testing.assert_array_equal(draw_overlay(grey, CAMERA), _blank(value=77))
+    np.testing.assert_array_equal(draw_overlay(grey[:, :, None], CAMERA), _blank(value=77))
+    rgba = np.zeros((480, 640, 4), dtype=np.uint8)
+    rgba[:, :320] = (10, 20, 30, 255)
+    image = draw_overlay(rgba, CAMERA)
+    assert image[0, 0].tolist() == [10, 20, 30]
+    assert image[0, 639].min() > 200
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((480, 640, 3)), "float64, not uint8"),
+        (np.zeros((480, 640, 2), np.uint8), "not a grey, RGB or RGBA image"),
+        (np.zeros((480,), np.uint8), "not a grey, RGB or RGBA image"),
+        (np.zeros((640, 480, 3), np.uint8), "480 x 640 px, the camera's image 640 x 480"),
+        ("photo.png", "not uint8"),
+    ],
+)
+def test_other_images_are_refused(image, message):
+    with pytest.raises(InputError, match=message):
+        draw_overlay(image, CAMERA)
+
+
+def test_keypoints_that_do_not_match_are_refused():
+    with pytest.raises(InputError, match="reprojected: 1 keypoints, but 2 observed"):
+        draw_overlay(_blank(), CAMERA, observed=[[1, 1], [2, 2]], reprojected=[[1, 1]])
+    with pytest.raises(InputError, match="observed"):
+        draw_overlay(_blank(), CAMERA, observed=[[1, np.nan]])
+    with pytest.raises(InputError, match="observed"):
+        draw_overlay(_blank(), CAMERA, observed=[[1, 1, 1]])
+
+
+def test_too_large_an_image_is_refused():
+    camera = Camera.from_fov(20000, 10, fov_x=50)
+    with pytest.raises(RenderError, match="too large"):
+        draw_overlay(np.zeros((10, 20000), np.uint8), camera)
+
+
+def test_true_and_predicted_box_may_differ_in_stretch():
+    pose = look_at(azimuth=20, elevation=20, distance=5)
+    stretched = Alignment(pose.rotation, pose.translation, [1, 1.5, 0.7])
+    bounds = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
+    image = draw_overlay(
+        _blank(),
+        CAMERA,
+        gt_box=Box.from_model(bounds, pose),
+        est_box=Box.from_model(bounds, stretched),
+        axes=False,
+        legend=False,
+    )
+    assert _near_color(image, GT_COLOR).sum() > 200
+    assert _near_color(image, EST_COLOR).sum() > 200
+
+
+def _model_frames(style):
+    camera = Camera.from_fov(320, 240, fov_x=60)
+    shape = trimesh.creation.box((1.0, 1.2, 0.8))
+    scene = Scene(Mesh(np.array(shape.vertices), np.array(shape.faces)))
+    frame = RaycastRenderer().render(scene, camera, look_at(azimuth=30, elevation=20, distance=3))
+    photo = np.full((240, 320, 3), 120, np.uint8)
+    drawn = draw_overlay(photo, camera, est_frame=frame, model_style=style, legend=False)
+    return frame, photo, drawn
+
+
+def test_the_predicted_model_lies_over_the_photo_as_a_red_veil():
+    frame, photo, drawn = _model_frames("translucent")
+    inner = cv2.erode(frame.mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    tint = drawn[inner].astype(int)
+    assert (tint[:, 0] - tint[:, 1]).min() > 15
+    outside = cv2.dilate(frame.mask.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0
+    np.testing.assert_array_equal(drawn[outside], photo[outside])
+
+
+def test_lines_alone_leave_the_surfaces_as_they_are():
+    frame, photo, drawn = _model_frames("lines")
+    changed = (drawn != photo).any(axis=2)
+    lines = cv2.dilate(feature_lines(frame).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert changed.sum() > 300
+    assert not changed[~lines].any()
+    reddest = drawn.reshape(-1, 3)[drawn.reshape(-1, 3)[:, 0].argmax()].astype(int)
+    assert reddest[0] > reddest[1] + 80
+
+
+def test_geometry_alone_is_enough_for_a_veil():
+    frame, photo, _ = _model_frames("lines")
+    geometry = Geometry(depth=frame.depth, face_id=frame.face_id, normal=frame.normal)
+    camera = Camera.from_fov(320, 240, fov_x=60)
+    drawn = draw_overlay(photo, camera, est_frame=geometry, legend=False)
+    assert drawn[120, 160, 0] > int(drawn[120, 160, 1]) + 10
+
+
+def test_wrong_frames_and_styles_are_refused():
+    frame, photo, _ = _model_frames("lines")
+    camera = Camera.from_fov(320, 240, fov_x=60)
+    with pytest.raises(InputError, match="known are translucent, lines"):
+        draw_overlay(photo, camera, est_frame=frame, model_style="fog")
+    small = Geometry(frame.depth[1:], frame.face_id[1:], frame.normal[1:])
+    with pytest.raises(InputError, match="est_frame: it is 320 x 239 px, the image 320 x 240"):
+        draw_overlay(photo, camera, est_frame=small)

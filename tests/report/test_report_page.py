@@ -1,0 +1,314 @@
+"""The report's page in a real browser: all is there, nothing leaves it, texts stay texts."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from page_watch import Opened, scroll_through, watched
+from playwright.sync_api import Browser, expect
+from report_payloads import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
+
+from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.report import write_report
+from cadalign.web import asset
+
+# Contrast that WCAG 2 asks of text (AA), and of what is drawn.
+_TEXT, _DRAWN = 4.5, 3.0
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Opened]:
+    with watched(browser) as open_page:
+        yield open_page
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
+
+
+def test_everything_of_a_run_is_there(opened: Opened, plain: str) -> None:
+    page = opened(plain)
+    expect(page).to_have_title("A report of chairs")
+    expect(page.locator(".lead")).to_contain_text("24 views of chairs")
+    table = page.locator("table.headline")
+    expect(table.locator("tbody")).to_have_count(3)
+    expect(table.locator("tr.paper")).to_have_text(re.compile(PAPER + r".*1\.00"))
+    # The best is told by weight and in words, not by a tint alone.
+    assert table.locator("b.best").count() == 15
+    assert table.locator("b.best").first.inner_text().endswith("(best)")
+    assert page.locator("b.best").first.evaluate("(e) => getComputedStyle(e).fontWeight") == "700"
+    failures = page.locator(".failures")
+    failures.locator("summary").click()
+    expect(failures.locator("tbody")).to_contain_text(REASON)
+    assert [plot.get_attribute("id") for plot in page.locator(".plot").all()] == [
+        "plot-cumulative",
+        "plot-keypoints",
+        "plot-stretch-y",
+        "plot-stretch-z",
+    ]
+    expect(page.locator(".found")).to_have_text("24 instances")
+    scroll_through(page)
+    page.locator("#gallery").scroll_into_view_if_needed()
+    expect(page.locator(".card")).to_have_count(24)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "found"),
+    [
+        pytest.param(Recipe(failures=1.0), "24 instances", id="nothing-succeeds"),
+        pytest.param(Recipe(instances=1, categories=("chair",)), "1 instance", id="one-instance"),
+        pytest.param(Recipe(exhibits=False), "24 instances", id="no-poses"),
+        pytest.param(Recipe(pictures=0), "24 instances", id="no-pictures"),
+        pytest.param(Recipe(exhibits=False, pictures=0), "24 instances", id="numbers-only"),
+        pytest.param(Recipe(done=9), "24 instances", id="unfinished"),
+        pytest.param(Recipe(runs=2), "48 instances", id="two-runs"),
+    ],
+)
+def test_unlucky_runs_are_shown_too(
+    opened: Opened, tmp_path: Path, recipe: Recipe, found: str
+) -> None:
+    page = opened(write_page(tmp_path / "report.html", recipe))
+    expect(page.locator("#gallery .found")).to_have_text(found)
+    if recipe.failures == 1 or recipe.instances == 1:
+        scroll_through(page)
+    card = page.locator(".card").first
+    if recipe.failures == 1:
+        expect(card.locator(".failed")).to_have_text(["failed"] * 3)
+        expect(page.locator("table.headline tbody tr").nth(1)).to_contain_text("\N{EN DASH}")
+    if recipe.pictures == 0:
+        kept = ".overlay .box.gt" if recipe.exhibits else "text=no picture"
+        expect(card.locator(kept)).to_have_count(1)
+    if recipe.done:
+        expect(page.locator(".warning")).to_contain_text("9 of 24 instances are done")
+    card.click()
+    dialog = page.locator("dialog[open]")
+    expect(dialog.locator("table").first).to_contain_text("optimal")
+    if recipe.failures == 1:
+        expect(dialog.locator("table").first).to_contain_text(REASON)
+    if not recipe.exhibits and not recipe.pictures:
+        expect(dialog).to_contain_text("kept no picture and no poses")
+
+
+def test_a_run_without_any_results_says_so(opened: Opened, tmp_path: Path) -> None:
+    nothing = {"headline": {"columns": [], "rows": []}, "tables": None}
+    page = opened(write_page(tmp_path / "report.html", Recipe(done=0), **nothing))
+    expect(page.locator("#results")).to_contain_text("No results yet")
+    expect(page.locator("#gallery")).to_have_count(0)
+
+
+def test_a_picture_that_is_gone_leaves_a_word(opened: Opened, tmp_path: Path) -> None:
+    gone = {str(i): "gone/thumb.webp" for i in range(6)}
+    address = write_page(tmp_path / "report.html", Recipe(), thumbs=gone)
+    page = opened(address, allowed="ERR_FILE_NOT_FOUND")  # the browser's own word
+    page.locator(".card").first.scroll_into_view_if_needed()
+    expect(page.locator(".card").first).to_contain_text("no picture")
+
+
+def test_texts_from_data_stay_texts(opened: Opened, tmp_path: Path) -> None:
+    payload = payload_of(Recipe(models=[HOSTILE], runs=2, failures=0.3))
+    text = json.dumps(payload)
+    hostile = json.dumps(HOSTILE)[1:-1]
+    for word in ("chair", REASON, "optimal (ours)", "rotation error", "runs/a", PAPER, "1 px"):
+        text = text.replace(json.dumps(word), json.dumps(f"{HOSTILE} {word}"))
+    for word in ("views of chairs", "A report of", "seen end-on", "Medians."):
+        text = text.replace(word, f"{hostile} {word}")
+    page = opened(write_page(tmp_path / "report.html", Recipe(), **json.loads(text)))
+    scroll_through(page)
+    for details in page.locator("details").all():
+        details.evaluate("(details) => { details.open = true; }")
+    page.locator("input[type=search]").fill("<img")
+    expect(page.locator("#gallery .found")).to_have_text("2 instances of 48")
+    # The charts' own markup is no way in either: names are drawn letter by letter.
+    expect(page.locator("#plot-cumulative .xtitle")).to_contain_text(HOSTILE)
+    page.locator("#plot-cumulative").hover()
+    page.locator(".card").first.click()
+    dialog = page.locator("dialog[open]")
+    expect(dialog.locator("h2")).to_have_text(HOSTILE)
+    for place in ("h1", ".lead", "table.headline", ".failures", "#plots h3", ".bar", "#gallery"):
+        expect(page.locator(place).first).to_contain_text(HOSTILE)
+    expect(dialog).to_contain_text(HOSTILE)
+    assert page.locator("img[src=x], [onerror], .plot img, .plot image").count() == 0
+    assert "</script" not in asset("report.js")
+
+
+def test_plots_hold_what_the_tables_hold(opened: Opened, plain: str) -> None:
+    page = opened(plain)
+    drawn = "(id) => document.getElementById(id).data.map(({ name, x, y }) => ({ name, x, y }))"
+    assert page.locator("#plot-stretch-z").get_attribute("data-drawn") is None  # not in view yet
+    scroll_through(page)
+    payload = payload_of(Recipe())
+    rows = payload["tables"]["rows"]
+    errors = {
+        method["label"]: [
+            value
+            for value, of in zip(rows["rotation_error_deg"], rows["method"], strict=True)
+            if of == index
+        ]
+        for index, method in enumerate(payload["methods"])
+    }
+    curves = page.evaluate(drawn, "plot-cumulative")
+    assert [curve["name"] for curve in curves] == list(errors)
+    for curve in curves:
+        values = errors[curve["name"]]
+        for at, share in zip(curve["x"], curve["y"], strict=True):
+            reached = sum(value is not None and value <= at for value in values)
+            assert share == pytest.approx(100 * reached / len(values))
+    keypoints = np.array(payload["tables"]["instances"]["keypoints"])[rows["instance"]]
+    lines = page.evaluate(drawn, "plot-keypoints")
+    line = next(line for line in lines if line["name"] == "optimal (ours)")
+    for at, middle in zip(line["x"], line["y"], strict=True):
+        chosen = (keypoints == at) & (np.array(rows["method"]) == 0)
+        values = np.array(rows["rotation_error_deg"], dtype=float)[chosen]
+        assert middle == pytest.approx(np.nanmedian(values))
+
+
+def test_switches_change_all_plots_and_the_gallery(opened: Opened, plain: str) -> None:
+    page = opened(plain)
+    scroll_through(page)
+    lines = "document.getElementById('plot-stretch-y').data.filter(({ name }) => name).length"
+    assert page.evaluate(lines) == 3
+    chip = page.get_by_role("button", name="AEPnP, as published")
+    chip.click()
+    expect(chip).to_have_attribute("aria-pressed", "false")
+    page.wait_for_function(f"{lines} === 2")
+    expect(page.locator(".card").first.locator(".error")).to_have_count(2)
+    page.locator("#plots select").select_option("box_iou")
+    expect(page.locator("#plots h3").first).to_have_text("Share of instances by box IoU")
+    page.wait_for_function(
+        "document.getElementById('plot-cumulative').layout.xaxis.title.text.startsWith('box IoU')"
+    )
+    page.locator("#plots summary").first.click()
+    expect(page.locator("#plots .numbers[open] tbody tr").first).to_contain_text("optimal")
+
+
+def test_noise_is_a_plot_once_runs_differ_in_it(opened: Opened, tmp_path: Path) -> None:
+    page = opened(write_page(tmp_path / "report.html", Recipe(runs=2)))
+    scroll_through(page)
+    data = page.evaluate("document.getElementById('plot-noise').data.map(({ x }) => x)")
+    assert data
+    assert all(x == [1, 2] for x in data)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_colours_have_contrast(opened: Opened, plain: str, scheme: str) -> None:
+    page = opened(plain, color_scheme=scheme)
+    colors = page.evaluate(
+        """() => Object.fromEntries(
+            ["page", "card", "ink", "soft", "accent", "gt", "est", "warn"].map((name) => {
+                const probe = document.createElement("span");
+                probe.style.color = `var(--${name})`;
+                document.body.append(probe);
+                return [name, getComputedStyle(probe).color.match(/[0-9.]+/g).map(Number)];
+            }))"""
+    )
+    for ground in ("page", "card"):
+        for name in ("ink", "soft", "accent", "gt", "est", "warn"):
+            assert contrast(colors[name], colors[ground]) >= _TEXT, (name, ground)
+    scroll_through(page)
+    ink = page.locator("#plot-cumulative .xtitle").evaluate("(e) => getComputedStyle(e).fill")
+    assert contrast([float(v) for v in re.findall(r"[\d.]+", ink)], colors["card"]) >= _TEXT
+    curves = page.evaluate(
+        "document.getElementById('plot-cumulative').data.map((t) => t.line.color)"
+    )
+    for color in curves:
+        rgb = [int(color[place : place + 2], 16) for place in (1, 3, 5)]
+        assert contrast(rgb, colors["card"]) >= (_DRAWN if scheme == "dark" else 2), color
+
+
+def contrast(one: list[float], other: list[float]) -> float:
+    """WCAG 2's contrast of two sRGB colours."""
+
+    def luminance(color: list[float]) -> float:
+        parts = np.array(color[:3]) / 255
+        linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_whatever_can_be_used_has_a_name(opened: Opened, tmp_path: Path) -> None:
+    page = opened(write_page(tmp_path / "report.html", Recipe(runs=2)))
+    scroll_through(page)
+    page.locator(".pair").first.click()
+    expect(page.locator("dialog canvas")).to_be_visible()
+    nameless = page.evaluate(
+        """() => [...document.querySelectorAll(
+                "button, a, input, select, summary, canvas, table, dialog, section[id], "
+                + "[role=img], [role=region]")]
+            .filter((e) => !e.closest(".modebar"))
+            .filter((e) => {
+                const title = document.getElementById(e.getAttribute("aria-labelledby"));
+                const words = e.getAttribute("aria-label") ?? e.caption?.textContent
+                    ?? title?.textContent ?? e.labels?.[0]?.textContent ?? e.textContent;
+                return !words.trim();
+            }).map((e) => e.outerHTML.slice(0, 120))"""
+    )
+    assert nameless == []
+    assert page.locator("main h1, main h2, header h1").count() >= 4
+    assert page.locator("[role=status]").count() >= 2
+    assert page.evaluate("document.documentElement.lang") == "en"
+
+
+def test_a_phone_shows_all_of_it(opened: Opened, tmp_path: Path) -> None:
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    page = opened(
+        write_page(tmp_path / "report.html", Recipe(runs=2, models=[HOSTILE * 3])), **phone
+    )
+    scroll_through(page)
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    table = page.locator("#results .scroller").first
+    before = table.locator("tbody th").nth(1).bounding_box()
+    table.evaluate("(e) => e.scrollTo(200, 0)")
+    assert table.locator("tbody th").nth(1).bounding_box() == before  # the first column stays
+    page.locator(".card").first.tap()
+    dialog = page.locator("dialog[open]")
+    expect(dialog.locator("canvas")).to_be_visible()
+    assert dialog.evaluate("(e) => e.scrollWidth - e.clientWidth") == 0
+
+
+def test_paper_gets_tables_plots_and_a_few_cards(
+    opened: Opened, plain: str, tmp_path: Path
+) -> None:
+    page = opened(plain, color_scheme="dark")
+    page.pdf(path=tmp_path / "page.pdf", print_background=True)
+    assert (tmp_path / "page.pdf").read_bytes()[:5] == b"%PDF-"
+    # All plots were drawn for it, though none was scrolled to.
+    for plot in page.locator(".plot").all():
+        expect(plot).to_have_attribute("data-drawn", re.compile(r"\d"))
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    ground, ink = page.locator(".panel").first.evaluate(
+        "(e) => [getComputedStyle(e).backgroundColor, getComputedStyle(e).color]"
+    )
+    assert ground == "rgb(255, 255, 255)"
+    assert ink == "rgb(27, 29, 33)"
+    expect(page.locator(".filters").first).to_be_hidden()
+    expect(page.locator("table.headline")).to_be_visible()
+    assert sum(card.is_visible() for card in page.locator(".cards > li").all()) == 12
+
+
+@pytest.mark.slow
+def test_a_real_run_makes_a_page(opened: Opened, sample_root: Path, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    options = KeypointNetOptions(render="overlay", max_models=1, methods=("optimal", "limit"))
+    run_keypointnet(sample_root, options, folder, workers=0)
+    for assets in (False, True):
+        written = write_report([folder.path], tmp_path / "page.html", assets=assets)
+        page = opened(written.path.as_uri())
+        expect(page.locator("table.headline tbody")).not_to_have_count(0)
+        page.locator(".card").first.click()
+        dialog = page.locator("dialog[open]")
+        expect(dialog.locator(".overlay image")).to_have_count(1)
+        expect(dialog.locator(".overlay .box")).to_have_count(2)
+        dialog.get_by_label("wireframe").check()
+        expect(dialog.locator(".overlay .wire")).to_have_count(2)
+        expect(dialog.locator("canvas")).to_be_visible()
+        expect(dialog).to_contain_text("Estimate of optimal")

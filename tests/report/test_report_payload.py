@@ -1,0 +1,668 @@
+"""The report's payload: what it says of runs, finished or not, and that texts stay texts."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cadalign import Alignment, Box, Camera, Library
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.accuracy.methods import fit_with
+from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet, run_sweep, sweep_of
+from cadalign.evaluation.correspondences.experiment import (
+    CorrespondenceOptions,
+    run_correspondences,
+)
+from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.retrieval.experiment import RetrievalEvaluation, run_retrieval
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.runs.tables import read_table
+from cadalign.geometry.metrics import alignment_box_iou, rotation_error
+from cadalign.report import media, write_report
+from cadalign.report.instances import compact
+from cadalign.retrieval import LibraryModel
+
+METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
+HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
+
+
+def payload_of(page: Path) -> dict[str, Any]:
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.S)
+    assert found is not None
+    payload: dict[str, Any] = json.loads(found[1], parse_constant=refuse)
+    return payload
+
+
+def refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def evaluate(root: Path, out: Path, **options: Any) -> Path:
+    run_keypointnet(root, KeypointNetOptions(**options), RunFolder(out), workers=0)
+    return out
+
+
+def report(tmp_path: Path, *runs: Path, **options: Any) -> dict[str, Any]:
+    return payload_of(write_report(runs, tmp_path / "report.html", **options).path)
+
+
+def annotations(folder: Path, names: list[str], *, points: int = 12) -> Path:
+    """A dataset of annotations without meshes."""
+    rng = np.random.default_rng(0)
+    entries = [
+        {
+            "class_id": "03624134",
+            "model_id": name,
+            "keypoints": [
+                {
+                    "xyz": xyz,
+                    "semantic_id": row,
+                    "mesh_info": {"face_index": 0, "face_uv": [1.0, 0.0, 0.0]},
+                }
+                for row, xyz in enumerate(rng.uniform(-0.3, 0.3, (points, 3)).tolist())
+            ],
+        }
+        for name in names
+    ]
+    (folder / "annotations").mkdir(parents=True)
+    (folder / "annotations" / "knife.json").write_text(json.dumps(entries))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def drawn(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over 4 models, 2 views of each, with pictures."""
+    out = tmp_path_factory.mktemp("drawn") / "run"
+    return evaluate(sample_root, out, methods=METHODS, views_per_model=2, render="overlay")
+
+
+@pytest.fixture(scope="module")
+def payload(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return report(tmp_path_factory.mktemp("page"), drawn)
+
+
+def columns(payload: dict[str, Any]) -> tuple[list[str], dict[str, Any], dict[str, Any]]:
+    tables = payload["tables"]
+    return tables["strings"], tables["instances"], tables["rows"]
+
+
+def alignment(pose: dict[str, Any]) -> Alignment:
+    return Alignment(np.reshape(pose["rotation"], (3, 3)), pose["translation"], pose["scale"])
+
+
+# --- tables ----------------------------------------------------------------------------------
+
+
+def test_columns_hold_every_instance_and_row(drawn: Path, payload: dict[str, Any]) -> None:
+    strings, instances, rows = columns(payload)
+    results = read_table(drawn / "results.parquet").to_pylist()
+    assert {len(column) for column in instances.values()} == {8}
+    assert {len(column) for column in rows.values()} == {len(results)} == {8 * len(METHODS)}
+    for row, result in enumerate(results):
+        instance = rows["instance"][row]
+        assert strings[instances["category"][instance]] == result["category"]
+        assert strings[instances["model"][instance]] == result["model_id"]
+        assert instances["view"][instance] == result["view"]
+        assert instances["keypoints"][instance] == result["keypoints"]
+        assert instances["true_y"][instance] == pytest.approx(result["stretch_y"], rel=1e-5)
+        assert payload["methods"][rows["method"][row]]["key"] == result["method"]
+        assert rows["status"][row] == 0
+        assert rows["reason"][row] == -1
+        for metric in payload["metrics"]:
+            assert rows[metric["key"]][row] == pytest.approx(result[metric["key"]], rel=1e-5)
+    assert set(instances["noise"]) == {1.0}
+    assert instances["id"] == list(range(8))
+
+
+def test_headline_marks_the_best_method_but_never_the_limit(payload: dict[str, Any]) -> None:
+    headline = payload["headline"]
+    assert [column["key"] for column in headline["columns"]][:2] == ["instances", "failed"]
+    better = {column["key"]: column["better"] for column in headline["columns"]}
+    for category in ("bottle", "car", "chair", "vessel", "all"):
+        rows = [row for row in headline["rows"] if row["category"] == category]
+        assert [row["method"] for row in rows] == list(METHODS)
+        rivals = [row for row in rows if row["method"] != "limit"]
+        assert rows[-1]["best"] == []
+        for key, direction in better.items():
+            marked = [row["method"] for row in rivals if key in row["best"]]
+            if direction is None:
+                assert not marked
+                continue
+            values = [row["cells"][key] for row in rivals]
+            best = min(values) if direction == "low" else max(values)
+            assert marked == [row["method"] for row in rivals if row["cells"][key] == best]
+    stated = {row["category"]: row["cells"] for row in headline["paper"]}
+    assert set(stated) == {"bottle", "car", "chair", "vessel"}
+    assert stated["chair"]["rotation_error_deg"] == 0.998
+    assert stated["chair"]["scale_y_error"] == pytest.approx(0.8)
+    assert stated["chair"]["box_iou"] is None
+    assert "0.008 means 0.8 %" in headline["note"]
+
+
+def test_summary_says_what_was_run_on_what(payload: dict[str, Any], sample_root: Path) -> None:
+    assert payload["summary"].startswith(
+        "3 methods and the Cramer-Rao limit on 8 views of 4 models in 4 categories of sample, "
+        "1 px of noise, with cadalign 0.1.0 on 20"
+    )
+    assert payload["title"] == "Alignment on sample"
+    (run,) = payload["runs"]
+    assert (run["what"], run["state"], run["done"], run["total"]) == (
+        "keypointnet",
+        "finished",
+        8,
+        8,
+    )
+    assert ["noise", "1 px"] in run["settings"]
+    assert ["dataset", str(sample_root)] in run["settings"]
+    assert ["methods", ", ".join(METHODS)] in run["settings"]
+
+
+def test_numbers_that_are_not_finite_become_null() -> None:
+    assert compact([np.nan, np.inf, -np.inf, 0.123456789, None]) == [None] * 3 + [0.123457, None]
+
+
+# --- exhibits --------------------------------------------------------------------------------
+
+
+def test_exhibits_hold_what_the_errors_were_made_of(payload: dict[str, Any]) -> None:
+    _, instances, rows = columns(payload)
+    assert instances["exhibit"] == list(range(8))
+    for place in range(8):
+        exhibit = payload["exhibits"][str(place)]
+        truth = alignment(exhibit["gt"])
+        np.testing.assert_allclose(truth.scale * exhibit["stretch"], 1)
+        assert exhibit["stretch"][1:] == pytest.approx(
+            [instances["true_y"][place], instances["true_z"][place]], rel=1e-5
+        )
+        camera = Camera(**exhibit["camera"])
+        projected = camera.project(truth.apply(exhibit["points_3d"]))
+        assert np.abs(projected - exhibit["points_2d"]).max() < 6  # the noise is 1 px
+        assert len(exhibit["semantic_ids"]) == len(projected) == instances["keypoints"][place]
+        assert [estimate["method"] for estimate in exhibit["estimates"]] == list(METHODS)
+        for k, estimate in enumerate(exhibit["estimates"]):
+            found = alignment(estimate)
+            row = place * len(METHODS) + k
+            assert rotation_error(est=found, gt=truth) == pytest.approx(
+                rows["rotation_error_deg"][row], rel=1e-4
+            )
+            iou = alignment_box_iou(est=found, gt=truth, bounds=exhibit["bounds"])
+            assert iou == pytest.approx(rows["box_iou"][row], rel=1e-4)
+            assert (estimate["std"] is None) == (estimate["method"] != "optimal")
+
+
+def test_estimates_say_what_the_fit_says(payload: dict[str, Any]) -> None:
+    for exhibit in payload["exhibits"].values():
+        camera = Camera(**exhibit["camera"])
+        # The pixels are stored to 1e-4.
+        fitted = fit_with("optimal", exhibit["points_3d"], exhibit["points_2d"], camera)
+        estimate = exhibit["estimates"][0]
+        assert estimate["sigma"] == fitted.sigma == 1.0
+        assert fitted.std is not None
+        expected = asdict(fitted.std)
+        assert estimate["std"]["rotation_deg"] == pytest.approx(expected["rotation_deg"], rel=1e-3)
+        assert estimate["std"]["scale"] == pytest.approx(expected["scale"], rel=1e-3)
+        assert len(estimate["warnings"]) == len(fitted.warnings)
+        assert estimate["rms_px"] == pytest.approx(fitted.rms, abs=1e-3)
+
+
+def test_warnings_and_alternatives_are_kept(tmp_path: Path) -> None:
+    root = annotations(tmp_path / "data", [f"five_{k}" for k in range(8)], points=5)
+    run = evaluate(root, tmp_path / "run", methods=("optimal", "epnp"), min_visible=5)
+    exhibits = report(tmp_path, run)["exhibits"].values()
+    optimal = [exhibit["estimates"][0] for exhibit in exhibits]
+    assert any(estimate.get("warnings") for estimate in optimal)
+    alternatives = [other for e in optimal for other in e.get("alternatives", [])]
+    assert alternatives
+    for other in alternatives:
+        assert 0 < other["likelihood"] <= 1
+        assert alignment(other).scale[0] == 1
+
+
+def test_pictures_show_the_model_without_boxes_and_thumbs_with_them(
+    payload: dict[str, Any],
+) -> None:
+    _, instances, _ = columns(payload)
+    for place in range(8):
+        exhibit = payload["exhibits"][str(place)]
+        plain = pixels(payload["pictures"][exhibit["picture"]])
+        small = pixels(payload["thumbs"][str(instances["thumb"][place])])
+        assert plain.shape == (480, 640, 3)
+        assert small.shape == (240, 320, 3)
+        box = Box.from_model(exhibit["bounds"], alignment(exhibit["gt"]))
+        camera = Camera(**exhibit["camera"])
+        corners = camera.project(box.corners)
+        # Drawn where the scaled camera puts it: colours change along the box's edges.
+        nearest = plain[::2, ::2].astype(int)
+        changed = np.abs(small.astype(int) - nearest).max(axis=2) > 60
+        rows, cols = np.nonzero(changed)
+        assert len(rows) > 200
+        low, high = corners.min(axis=0) / 2, corners.max(axis=0) / 2
+        assert abs(cols.min() - low[0]) < 12
+        assert abs(rows.max() - high[1]) < 12
+
+
+def pixels(url: str) -> Any:
+    kind, _, data = url.partition(",")
+    assert kind == "data:image/webp;base64"
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def test_meshes_are_light_and_in_the_coordinates_of_the_dataset(
+    payload: dict[str, Any], sample_root: Path
+) -> None:
+    assert len(payload["meshes"]) == 4  # the views of a model share one
+    strings, instances, _ = columns(payload)
+    dataset = KeypointNet(sample_root)
+    for place in range(8):
+        mesh = payload["meshes"][payload["exhibits"][str(place)]["mesh"]]
+        key = strings[instances["category"][place]], strings[instances["model"][place]]
+        counts = np.frombuffer(base64.b64decode(mesh["vertices"]), "<u2").reshape(-1, 3)
+        vertices = np.array(mesh["lo"]) + counts * mesh["step"]
+        index = "<u4" if mesh["wide"] else "<u2"
+        faces = np.frombuffer(base64.b64decode(mesh["faces"]), index).reshape(-1, 3)
+        edges = np.frombuffer(base64.b64decode(mesh["edges"]), index).reshape(-1, 2)
+        assert 100 < len(faces) <= 1500
+        assert 50 < len(edges) <= 1500
+        assert max(faces.max(), edges.max()) < len(vertices)
+        full = dataset[key].load_mesh().bounds
+        size = np.linalg.norm(full[1] - full[0])
+        assert np.abs([vertices.min(axis=0), vertices.max(axis=0)] - full).max() < 0.02 * size
+
+
+def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
+    for name in ("overlays", "pictures", "thumbs", "sketches"):
+        shutil.rmtree(copy / name)
+    found = report(tmp_path, copy)
+    assert found["pictures"] == found["thumbs"] == found["meshes"] == {}
+    assert set(found["tables"]["instances"]["thumb"]) == {-1}
+    assert all(e["picture"] is None and e["mesh"] is None for e in found["exhibits"].values())
+    assert len(found["exhibits"]) == 8
+    (copy / "exhibits.parquet").unlink()  # as in a run of an older version
+    found = report(tmp_path, copy)
+    assert set(found["tables"]["instances"]["exhibit"]) == {-1}
+    assert len(found["headline"]["rows"]) == 5 * len(METHODS)
+
+
+def test_pictures_of_different_instances_have_different_names() -> None:
+    ids = ["a", "a_1", "a_2", "a_1_1", "a_10", "a_0", "a_01", "a/1", "x" * 300 + "_1"]
+    keys = [("chair", name, view) for name in ids for view in range(12)]
+    stems = {exhibit_stem(*key) for key in keys}
+    assert len(stems) == len(keys)
+    assert all(len(stem) < 250 and "/" not in stem for stem in stems)
+    usual = "1a2b3c4d5e6f708192a3b4c5d6e7f809"
+    assert exhibit_stem("chair", usual, 3) == f"chair_{usual}_3"
+    assert exhibit_stem("chair", "sample_chair_002") == "chair_sample_chair_002"
+
+
+# --- size ------------------------------------------------------------------------------------
+
+
+def test_page_is_as_small_as_promised(drawn: Path, tmp_path: Path) -> None:
+    written = write_report([drawn], tmp_path / "report.html")
+    assert written.assets is None
+    assert written.path.stat().st_size < 3e6 + 8 * 60e3
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_with_assets_everything_large_is_in_a_folder(
+    drawn: Path, payload: dict[str, Any], tmp_path: Path
+) -> None:
+    page = tmp_path / "a b#c%.html"
+    written = write_report([drawn], page, assets=True)
+    assert written.assets == tmp_path / "a b#c%_assets"
+    outside = payload_of(page)
+    assert "exhibits" not in outside
+    assert outside["tables"] == payload["tables"]
+    urls = [*outside["pictures"].values(), *outside["thumbs"].values()]
+    urls += [*outside["exhibit_files"], *outside["mesh_files"].values()]
+    assert all(url.startswith("a%20b%23c%25_assets/") for url in urls)
+    names = {url.removeprefix("a%20b%23c%25_assets/") for url in urls}
+    assert names == {path.name for path in written.assets.iterdir()}
+    (script,) = outside["exhibit_files"]
+    assert outside["exhibits_per_file"] >= 8
+    text = (written.assets / script.split("/")[1]).read_text(encoding="utf-8")
+    calls = re.findall(r"^cadalignExhibit\((\d+), (.*)\);$", text, re.M)
+    assert {key: json.loads(exhibit) for key, exhibit in calls} == payload["exhibits"]
+    for key, url in outside["mesh_files"].items():
+        text = (written.assets / url.split("/")[1]).read_text(encoding="utf-8")
+        found = re.fullmatch(r'cadalignMesh\("(\w+)", (.*)\);\n', text)
+        assert found is not None
+        assert found[1] == key
+        assert json.loads(found[2]) == payload["meshes"][key]
+
+
+def test_a_page_that_would_be_too_large_has_its_pictures_beside_it(
+    drawn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cadalign.report.page.INLINE_LIMIT", 10_000)
+    written = write_report([drawn], tmp_path / "report.html")
+    assert written.assets == tmp_path / "report_assets"
+    before = {path.name for path in written.assets.iterdir()}
+    (written.assets / "picture_999999.webp").touch()  # of a larger report before
+    (written.assets / "mine.txt").touch()
+    write_report([drawn], tmp_path / "report.html")
+    assert {path.name for path in written.assets.iterdir()} == before | {"mine.txt"}
+    assert media.INLINE_LIMIT == 60_000_000
+
+
+# --- odd runs --------------------------------------------------------------------------------
+
+
+def test_texts_cannot_leave_their_place(tmp_path: Path) -> None:
+    names = [HOSTILE, "a/b", "..", "x" * 300, "nul\0l", "\"'`", "μ-模型"]
+    run = evaluate(annotations(tmp_path / "data", names), tmp_path / "run", methods=("optimal",))
+    page = write_report([run], tmp_path / "page.html", title=HOSTILE).path
+    text = page.read_text(encoding="utf-8")
+    assert "onerror" in text
+    assert "<img" not in text.split("</noscript>")[0]
+    inside = text.split('id="payload">')[1].split("</script>")[0]
+    assert not set("<>&\u2028") & set(inside)
+    found = payload_of(page)
+    strings, instances, _ = columns(found)
+    assert {strings[place] for place in instances["model"]} == set(names)
+    assert found["title"] == HOSTILE
+    beside = write_report([run], tmp_path / "beside.html", assets=True)
+    assert beside.assets is not None
+
+
+def test_a_run_without_success_says_why(tmp_path: Path) -> None:
+    root = annotations(tmp_path / "data", ["a", "b"])
+    run = evaluate(root, tmp_path / "run", methods=("optimal", "aepnp"), min_visible=13)
+    found = report(tmp_path, run)
+    _, instances, rows = columns(found)
+    assert rows["status"] == [1] * 4
+    assert set(rows["rotation_error_deg"]) == set(instances["keypoints"]) == {None}
+    assert found["exhibits"] == found["pictures"] == {}
+    for row in found["headline"]["rows"]:
+        assert (row["cells"]["instances"], row["cells"]["failed"]) == (2, 2)
+        assert row["cells"]["rotation_error_deg"] is None
+        assert row["cells"]["success_5deg_5pct"] == 0
+    failures = found["headline"]["failures"]
+    assert [(f["method"], f["count"]) for f in failures] == [("optimal", 2), ("aepnp", 2)]
+    assert all("13 keypoints should be visible" in failure["reason"] for failure in failures)
+
+
+def test_one_instance_is_a_report(tmp_path: Path) -> None:
+    run = evaluate(annotations(tmp_path / "data", ["a"]), tmp_path / "run", methods=("optimal",))
+    found = report(tmp_path, run)
+    assert found["summary"].startswith("One method on 1 model in 1 category of data, 1 px")
+    assert len(found["exhibits"]) == 1
+    assert [row["best"] for row in found["headline"]["rows"]] == [[]]  # without rivals
+
+
+def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
+    root = annotations(tmp_path / "data", [f"m{k:03d}" for k in range(150)])
+    run = evaluate(root, tmp_path / "run", methods=("optimal", "limit"))
+    whole = report(tmp_path, run)
+    unfinished = half_finished(run, KeypointNetExperiment(("optimal", "limit")), root)
+    found = report(tmp_path, unfinished)
+    (state,) = found["runs"]
+    assert (state["state"], state["done"], state["total"]) == ("unfinished", 64 + 22, 150)
+    assert "unfinished, 86 of 150 tasks are done" in found["summary"]
+    strings, instances, _ = columns(found)
+    names = [strings[place] for place in instances["model"]]
+    assert names == [f"m{k:03d}" for k in (*range(64), *range(128, 150))]
+    assert len(found["exhibits"]) == 86
+    last = whole["exhibits"]["149"]
+    assert found["exhibits"]["85"] == last
+
+
+def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> Path:
+    """Put a run back to where its second chunk of three was missing."""
+    from cadalign.evaluation.runs.tables import write_rows
+
+    folder = RunFolder(run)
+    for path in (folder.results, folder.exhibits, folder.timings):
+        path.unlink()
+    folder.parts.mkdir()
+    tasks = KeypointTasks(KeypointNet(root), views=1)
+    for index in (0, 2):
+        result = experiment.evaluate(tasks[64 * index : 64 * index + 64])
+        write_rows(folder.part(index), experiment.columns, result.rows)
+        write_rows(folder.part_exhibits(index), experiment.exhibit_columns, result.exhibits)
+        write_rows(folder.part_timings(index), experiment.timing_columns, result.timings)
+    return run
+
+
+def test_several_runs_are_joined_by_what_names_an_instance(tmp_path: Path) -> None:
+    root = annotations(tmp_path / "data", ["a", "b", "c"])
+    first = evaluate(root, tmp_path / "x" / "run", methods=("optimal", "aepnp"))
+    second = evaluate(
+        root, tmp_path / "y" / "run", methods=("optimal", "epnp"), noise_px=3.0, max_models=2
+    )
+    found = report(tmp_path, first, second)
+    assert [run["name"] for run in found["runs"]] == ["x/run", "y/run"]
+    assert found["title"] == "2 runs compared: alignment on data"
+    assert [method["key"] for method in found["methods"]] == ["optimal", "aepnp", "epnp"]
+    strings, instances, _ = columns(found)
+    assert instances["run"] == [0, 0, 0, 1, 1]
+    assert instances["id"] == [0, 1, 2, 0, 1]
+    assert instances["noise"] == [1.0] * 3 + [3.0] * 2
+    assert [strings[k] for k in instances["model"]] == ["a", "b", "c", "a", "b"]
+    for one, other in ((0, 3), (1, 4)):  # the same view and stretch, other noise
+        for name in ("true_y", "true_z", "keypoints"):
+            assert instances[name][one] == instances[name][other]
+        exhibits = found["exhibits"]
+        assert exhibits[str(one)]["gt"] == exhibits[str(other)]["gt"]
+        assert exhibits[str(one)]["points_2d"] != exhibits[str(other)]["points_2d"]
+    assert {row["run"] for row in found["headline"]["rows"]} == {0, 1}
+    assert found["summary"].count("x/run: ") == found["summary"].count("y/run: ") == 1
+
+
+def test_compared_runs_share_pictures(drawn: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
+    found = report(tmp_path, drawn, copy)
+    assert len(found["pictures"]) == len(found["thumbs"]) == 8
+    assert len(found["meshes"]) == 4
+    assert len(found["exhibits"]) == 16
+
+
+# --- other kinds of runs ---------------------------------------------------------------------
+
+
+def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
+    kind = sweep_of("noise", values=[1, 4], runs=12, methods=["optimal", "aepnp", "limit"])
+    run_sweep(kind, RunFolder(tmp_path / "run"), workers=0)
+    found = report(tmp_path, tmp_path / "run")
+    assert found["tables"] is None
+    assert found["title"] == "Simulation: noise"
+    assert found["headline"]["group"] == "noise of the keypoints [px]"
+    assert [row["category"] for row in found["headline"]["rows"]] == ["1"] * 3 + ["4"] * 3
+    plot = found["plots"][0]
+    assert (plot["id"], plot["x"]["unit"], plot["y"]["log"]) == ("rotation_error_deg", "px", True)
+    for trace in plot["traces"]:
+        assert trace["x"] == [1, 4]
+        assert all(
+            low <= middle <= high
+            for low, middle, high in zip(trace["low"], trace["y"], trace["high"], strict=True)
+        )
+    medians = {
+        (row["category"], row["method"]): row["cells"]["rotation_error_deg"]
+        for row in found["headline"]["rows"]
+    }
+    for trace in plot["traces"]:
+        for value, median in zip(("1", "4"), trace["y"], strict=True):
+            assert medians[value, trace["method"]] == pytest.approx(median, rel=1e-5)
+    assert "the AEPnP paper's simulation, noise varied, 12 problems" in found["summary"]
+
+
+def test_running_time_is_shown_where_it_is_what_was_measured(tmp_path: Path) -> None:
+    kind = sweep_of("runtime", values=[8], runs=2, methods=["aepnp"])
+    run_sweep(kind, RunFolder(tmp_path / "run"), workers=0)
+    found = report(tmp_path, tmp_path / "run")
+    assert found["plots"][0]["id"] == "microseconds"
+    assert found["headline"]["rows"][0]["cells"]["microseconds"] > 0
+
+
+def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path: Path) -> None:
+    run_correspondences(
+        real_data / "sfm" / "maupertuis_colmap",
+        CorrespondenceOptions(outliers=(0.0, 0.5), draws=1, methods=("ransac-optimal", "epnp")),
+        RunFolder(tmp_path / "run"),
+        workers=0,
+    )
+    found = report(tmp_path, tmp_path / "run")
+    assert found["headline"]["group"] == "outliers [%]"
+    assert [row["category"] for row in found["headline"]["rows"]] == ["0", "0", "50", "50"]
+    success = found["plots"][0]
+    assert success["id"] == "success"
+    robust, epnp = success["traces"]
+    assert robust["y"] == [100, 100]
+    assert max(epnp["y"]) < 50
+    assert "4 images of maupertuis_colmap" in found["summary"]
+    assert found["title"] == "Correspondences on maupertuis_colmap"
+
+
+def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
+    root = annotations(tmp_path / "data", [f"m{k}" for k in range(4)])
+    # Shapes that no stretch makes equal.
+    file = root / "annotations" / "knife.json"
+    entries = json.loads(file.read_text())
+    for row, entry in enumerate(entries):
+        xyz = np.random.default_rng(row).uniform(-0.3, 0.3, (12, 3)).tolist()
+        for keypoint, point in zip(entry["keypoints"], xyz, strict=True):
+            keypoint["xyz"] = point
+    file.write_text(json.dumps(entries))
+    options = RetrievalEvaluation(keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
+    run_retrieval(root, options, RunFolder(tmp_path / "run"), workers=0)
+    found = report(tmp_path, tmp_path / "run")
+    assert found["title"] == "Retrieval on data"
+    assert "One method of finding 4 models of data again" in found["summary"]
+    (run,) = found["runs"]
+    assert run["what"] == "retrieval"
+    groups = [row["category"] for row in found["headline"]["rows"]]
+    assert groups[0] == "all, leave-in, 1 px, 8 keypoints"
+    assert len(set(groups)) == len(groups) == 4
+    first = found["plots"][0]
+    assert (first["id"], first["traces"][0]["x"]) == ("rank_1_1", [8, 10])
+    rates = [row["cells"]["rank_1"] for row in found["headline"]["rows"][:2]]
+    assert first["traces"][0]["y"] == rates
+    assert min(rates) >= 75
+
+
+def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) -> None:
+    file = tmp_path / "library"
+    models = [
+        LibraryModel("box", f"{k:02d}", xyz, np.arange(9), np.array([[-0.3] * 3, [0.3] * 3]))
+        for k, xyz in enumerate(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 9, 3)))
+    ]
+    Library.from_models(models).save(file)
+    options = RetrievalEvaluation(keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
+
+    def stop(progress: Progress) -> None:
+        if progress.done:
+            raise KeyboardInterrupt
+
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt):
+        run_retrieval(file, options, folder, workers=0, on_progress=stop)
+    found = report(tmp_path, folder.path)
+    (run,) = found["runs"]
+    assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
+    rows = [row["cells"] for row in found["headline"]["rows"]]
+    assert [row["instances"] for row in rows] == [16, 16]
+    results = read_table(folder.part(0)).to_pylist()
+    ranks = [row["rank"] for row in results if row["protocol"] == "leave-in"]
+    assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
+    assert rows[0]["milliseconds"] > 0
+    assert found["plots"][0]["traces"][0]["y"] == [rows[0]["rank_1"]]
+    run_retrieval(file, options, folder, workers=0)
+    folder.timings.unlink()  # what was not kept is not shown
+    found = report(tmp_path, folder.path)
+    assert found["runs"][0]["state"] == "finished"
+    rows = [row["cells"] for row in found["headline"]["rows"]]
+    assert [(row["instances"], row["milliseconds"]) for row in rows] == [(20, None)] * 2
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+
+def missing(path: Path) -> None:
+    pass
+
+
+def empty(path: Path) -> None:
+    path.mkdir()
+
+
+def foreign(path: Path) -> None:
+    path.mkdir()
+    (path / "run.json").write_text('{"experiment": "brewing"}')
+
+
+def damaged(path: Path) -> None:
+    path.mkdir()
+    (path / "run.json").write_text("{")
+
+
+def begun(path: Path) -> None:
+    path.mkdir()
+    (path / "run.json").write_text('{"experiment": "keypointnet", "tasks": 3, "chunk_size": 1}')
+
+
+def unreadable(path: Path) -> None:
+    begun(path)
+    (path / "results.parquet").write_text("not a table")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (missing, "no such folder; give a folder that cadalign demo, evaluate or simulate"),
+        (empty, "not the folder of a run: it has no run.json; give a folder"),
+        (foreign, "no report on a run of 'brewing'; known are keypointnet, demo, simulate, c"),
+        (damaged, "cannot be read"),
+        (begun, "nothing of the run is finished yet; wait, or start the command"),
+        (unreadable, "not a table that can be read"),
+    ],
+)
+def test_what_is_no_run_is_refused(
+    tmp_path: Path, make: Callable[[Path], None], message: str
+) -> None:
+    make(tmp_path / "run")
+    with pytest.raises(DataError, match=message) as error:
+        write_report([tmp_path / "run"], tmp_path / "report.html")
+    assert str(tmp_path / "run") in str(error.value)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -> None:
+    for name in ("noise", "points"):
+        kind = sweep_of(name, values=[8], runs=1, methods=["aepnp"])
+        run_sweep(kind, RunFolder(tmp_path / name), workers=0)
+    page = tmp_path / "report.html"
+    with pytest.raises(InputError, match="none is given"):
+        write_report([], page)
+    with pytest.raises(InputError, match="the run is given twice"):
+        write_report([drawn, drawn / ".." / drawn.name], page)
+    with pytest.raises(InputError, match=r"noise is a run of cadalign simulate noise, .* views"):
+        write_report([drawn, tmp_path / "noise"], page)
+    with pytest.raises(InputError, match=r"simulate points, .* simulate noise; write a report"):
+        write_report([tmp_path / "noise", tmp_path / "points"], page)
+
+
+def test_a_page_that_cannot_be_written_is_an_error(drawn: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot be written"):
+        write_report([drawn], tmp_path / "file" / "report.html")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match="cannot be written"):
+        write_report([drawn], tmp_path / "folder")

@@ -1,0 +1,173 @@
+"""The report's command line, and its table as Markdown, CSV and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from cadalign.cli import main
+from cadalign.errors import InputError
+from cadalign.evaluation.api import run_sweep, sweep_of
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.report import FORMATS, headline_text
+from cadalign.report.headline import Column, Headline, HeadlineRow
+from cadalign.report.tables import table_text
+
+HOSTILE = "a|b_c\\ & 50 % #1 {x} ~^$ <img src=x onerror=alert(1)> *`[]\nnext"
+COLUMNS = (Column("n", "instances", digits=0, better=None), Column("r", "R error", "deg", digits=3))
+
+
+def headline(category: str = "chair") -> Headline:
+    rows = [
+        HeadlineRow(0, category, "optimal", {"n": 3.0, "r": 0.12345}, ("r",)),
+        HeadlineRow(0, category, "epnp", {"n": 3.0, "r": 10.0}),
+        HeadlineRow(0, "all", "limit", {"n": 3.0, "r": None}),
+    ]
+    paper = [HeadlineRow(0, category, "stated", {"n": None, "r": 0.998})]
+    return Headline("category", COLUMNS, rows, paper=paper, note="Medians, in %.")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "a_run"
+    kind = sweep_of("noise", values=[1, 4], runs=4, methods=["optimal", "aepnp", "limit"])
+    run_sweep(kind, RunFolder(out), workers=0)
+    return out
+
+
+def test_markdown_has_best_values_bold() -> None:
+    assert table_text(headline(), ["run"], format="md") == (
+        "| category | method | instances | R error \\[deg\\] |\n"
+        "| --- | --- | ---: | ---: |\n"
+        "| chair | optimal \\(ours\\) | 3 | **0.123** |\n"
+        "| chair | EPnP \\(no stretch\\) | 3 | 10.000 |\n"
+        "| chair | stated | - | 0.998 |\n"
+        "| all | Cramer-Rao limit | 3 | - |\n"
+        "\n"
+        "Medians, in %.\n"
+    )
+
+
+def test_latex_is_a_booktabs_table_with_groups_apart() -> None:
+    assert table_text(headline(), ["run"], format="latex") == (
+        "% needs \\usepackage{booktabs,textcomp}\n"
+        "\\begin{tabular}{llrr}\n"
+        "\\toprule\n"
+        "category & method & instances & R error [deg] \\\\\n"
+        "\\midrule\n"
+        "chair & optimal (ours) & 3 & \\textbf{0.123} \\\\\n"
+        "chair & EPnP (no stretch) & 3 & 10.000 \\\\\n"
+        "chair & stated & - & 0.998 \\\\\n"
+        "\\addlinespace\n"
+        "all & Cramer-Rao limit & 3 & - \\\\\n"
+        "\\bottomrule\n"
+        "\\end{tabular}\n"
+    )
+
+
+def test_csv_has_all_digits_and_the_methods_names() -> None:
+    rows = list(csv.reader(io.StringIO(table_text(headline(), ["run"], format="csv"))))
+    assert rows == [
+        ["category", "method", "instances", "R error [deg]"],
+        ["chair", "optimal", "3.0", "0.12345"],
+        ["chair", "epnp", "3.0", "10.0"],
+        ["chair", "stated", "", "0.998"],
+        ["all", "limit", "3.0", ""],
+    ]
+
+
+def test_names_cannot_break_a_table() -> None:
+    markdown = table_text(headline(HOSTILE), ["run"], format="md")
+    table = markdown.split("\n\n")[0]
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()} == {5}
+    assert "<img" not in markdown
+    latex = table_text(headline(HOSTILE), ["run"], format="latex")
+    lines = [line for line in latex.splitlines() if line.endswith("\\\\")]
+    assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {3}
+    assert not re.search(r"(?<!\\)[#$_%]", "".join(lines))
+    assert r"\textbackslash{} \& 50 \% \#1 \{x\} \textasciitilde{}\textasciicircum{}\$" in latex
+    text = table_text(headline(HOSTILE), ["run"], format="csv")
+    rows = list(csv.reader(io.StringIO(text, newline="")))
+    assert rows[1][0] == HOSTILE
+
+
+def test_several_runs_are_told_apart_in_every_format(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "b_run"
+    kind = sweep_of("noise", values=[1], runs=4, methods=["aepnp"])
+    run_sweep(kind, RunFolder(other), workers=0)
+    for format, names in (("md", "a\\_run"), ("csv", "a_run"), ("latex", "a\\_run")):
+        text = headline_text([run, other], format=format)
+        assert text.count(names) == 6
+        assert text.count(names.replace("a", "b", 1)) == 1
+        assert len(re.findall(r"\brun\b", text.splitlines()[0 if format != "latex" else 3])) == 1
+
+
+def test_the_command_prints_a_table_or_writes_it(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for format in FORMATS:
+        assert main(["report", str(run), "--format", format]) == 0
+        printed = capsys.readouterr().out
+        assert printed == headline_text([run], format=format)
+        out = tmp_path / f"table.{format}"
+        assert main(["report", str(run), "--format", format, "--out", str(out)]) == 0
+        assert out.read_text(encoding="utf-8") == printed
+        assert capsys.readouterr().out == ""
+
+
+def test_the_page_goes_into_the_folder_of_the_run(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(run)]) == 0
+    assert (run / "report.html").is_file()
+    assert f"Report: {run / 'report.html'}" in capsys.readouterr().err.replace("\n", "")
+
+
+def test_the_page_of_several_runs_goes_where_one_is(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = sweep_of("noise", values=[1], runs=4, methods=["aepnp"])
+    run_sweep(kind, RunFolder(tmp_path / "b"), workers=0)
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(run), "b"]) == 0
+    assert (tmp_path / "report.html").is_file()
+    assert main(["report", str(run), "b", "--out", "deep/er/page.html"]) == 0
+    assert (tmp_path / "deep" / "er" / "page.html").is_file()
+
+
+def test_commands_write_the_page_at_their_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--values", "1", "--runs", "3", "--methods", "aepnp", "--workers", "0", "--json"]
+    out = tmp_path / "run"
+    assert main(["simulate", "noise", *options, "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["rows"] == 3
+    assert "report.html" in captured.err
+    assert "<!doctype html>" in (out / "report.html").read_text(encoding="utf-8")[:20]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "runs: none is given; give a folder that cadalign demo, evaluate or simulate has"),
+        (["RUN", "--format", "md", "--assets"], "--assets: a table has no pictures (--format md)"),
+        (["/nowhere"], "/nowhere: no such folder"),
+        (["/nowhere", "--format", "csv"], "/nowhere: no such folder"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(["report", *(str(run) if word == "RUN" else word for word in options)]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_an_unknown_format_is_named(run: Path) -> None:
+    with pytest.raises(InputError, match="unknown format 'pdf'; known are md, csv, latex"):
+        headline_text([run], format="pdf")

@@ -1,0 +1,199 @@
+"""The report's dialog in a real browser: overlays, numbers, keys, and the 3D view."""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from page_watch import Opened, card_names, open_first, watched
+from PIL import Image
+from playwright.sync_api import Browser, Locator, expect
+from report_payloads import METHODS, WARNING, Recipe, listed, payload_of, write_page
+
+from cadalign import Alignment
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+
+NO_WEBGL = """
+const real = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+    return kind.startsWith("webgl") ? null : real.call(this, kind, ...rest);
+};
+"""
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Opened]:
+    with watched(browser) as open_page:
+        yield open_page
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
+
+
+def look(canvas: Locator) -> np.ndarray:
+    """The canvas's pixels, (n, 4) of 8 bits; its scene is drawn with the next frame."""
+    canvas.evaluate(
+        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
+    address = canvas.evaluate("(canvas) => canvas.toDataURL()")
+    data = base64.b64decode(address.split(",")[1])
+    return np.array(Image.open(io.BytesIO(data)), dtype=np.int16).reshape(-1, 4)
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> float:
+    """The share of pixels that differ."""
+    return float((np.abs(before - after).max(axis=1) > 24).mean())
+
+
+def test_an_instance_opens_with_layers_numbers_and_warnings(opened: Opened, plain: str) -> None:
+    page = opened(plain + "#order=best")
+    dialog = open_first(page)
+    best = listed(payload_of(Recipe()), "rotation_error_deg")
+    best = min(best, key=lambda i: np.inf if i["error"] is None else i["error"])
+    expect(dialog.locator("h2")).to_have_text(best["model"])
+    for label, selector in (
+        ("ground truth", ".overlay .box.gt"),
+        ("prediction", ".overlay .box.est"),
+        ("keypoints", ".overlay .keypoints"),
+    ):
+        expect(dialog.locator(selector)).to_have_count(1)
+        dialog.get_by_label(label).uncheck()
+        expect(dialog.locator(selector)).to_have_count(0)
+        dialog.get_by_label(label).check()
+    dialog.get_by_label("wireframe").check()
+    expect(dialog.locator(".overlay .wire")).to_have_count(2)
+    expect(dialog.locator(".warnings")).to_contain_text(WARNING)
+    estimate = dialog.locator("table").nth(1)
+    expect(estimate).to_contain_text(re.compile(r"scale y.*\u00b1 2\.00%"))
+    expect(estimate).to_contain_text(re.compile(r"rotation\u00b1 0\.70\u00b0"))
+    drawn = dialog.locator(".overlay .box.est").get_attribute("d")
+    dialog.get_by_label("another").check()
+    expect(dialog.locator(".overlay .box.est")).not_to_have_attribute("d", drawn or "")
+    dialog.get_by_role("radio", name="AEPnP, 4 x 4").check()
+    expect(dialog.locator(".warnings")).to_have_count(0)
+
+
+def test_boxes_and_keypoints_are_where_the_camera_sees_them(opened: Opened, plain: str) -> None:
+    payload = payload_of(Recipe())
+    page = opened(f"{plain}#order=listed&show={METHODS[1]}")
+    dialog = open_first(page)
+    exhibit = payload["exhibits"]["0"]
+    gt = Alignment(np.reshape(exhibit["gt"]["rotation"], (3, 3)), *_rest(exhibit["gt"]))
+    low, high = exhibit["bounds"]
+    corners = KEYPOINT_CAMERA.project(
+        gt.apply(list(itertools.product(*zip(low, high, strict=True))))
+    )
+    path = dialog.locator(".overlay .box.gt").get_attribute("d")
+    drawn = np.array(re.findall(r"(-?[\d.]+) (-?[\d.]+)", path or ""), dtype=float)
+    assert len(drawn) == 24
+    distance = np.linalg.norm(drawn[:, None] - corners[None], axis=2)
+    assert distance.min(axis=1).max() < 0.1
+    assert distance.min(axis=0).max() < 0.1
+    seen = dialog.locator(".overlay .seen").evaluate_all(
+        "(rings) => rings.map((ring) => [ring.cx.baseVal.value, ring.cy.baseVal.value])"
+    )
+    np.testing.assert_allclose(seen, exhibit["points_2d"], atol=1e-3)
+    # Pixel centres are whole numbers: the picture begins half a pixel before.
+    assert dialog.locator(".overlay").get_attribute("viewBox") == "-0.5 -0.5 640 480"
+
+
+def _rest(pose: dict[str, Any]) -> tuple[list[float], list[float]]:
+    return pose["translation"], pose["scale"]
+
+
+def test_keys_walk_through_and_close(opened: Opened, plain: str) -> None:
+    page = opened(plain)
+    order = card_names(page)
+    dialog = open_first(page)
+    expect(dialog.get_by_label("previous instance")).to_be_disabled()
+    for step, model in (
+        ("ArrowRight", order[1]),
+        ("ArrowRight", order[2]),
+        ("ArrowLeft", order[1]),
+    ):
+        page.keyboard.press(step)
+        expect(dialog.locator("h2")).to_have_text(model)
+    for _ in range(40):  # the focus does not leave the dialog
+        page.keyboard.press("Tab")
+        assert page.evaluate("!document.activeElement.closest('.page')")
+    page.keyboard.press("Escape")
+    expect(page.locator("dialog[open]")).to_have_count(0)
+    # The focus is on what was seen last, and arrows walk from there.
+    focused = "document.activeElement.querySelector('.name').textContent"
+    page.wait_for_function(f"(name) => {focused} === name", arg=order[1])
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(focused) == order[2]
+    page.keyboard.press("Enter")
+    expect(page.locator("dialog[open] h2")).to_have_text(order[2])
+    page.go_back()
+    expect(page.locator("dialog[open]")).to_have_count(0)
+    expect(page.locator("#gallery")).to_be_visible()
+
+
+def test_the_scene_is_drawn_and_orbits(opened: Opened, plain: str) -> None:
+    page = opened(plain + "#order=best")
+    canvas = open_first(page).locator("canvas")
+    canvas.scroll_into_view_if_needed()
+    views = [look(canvas)]
+    assert (views[0][:, 3] > 0).mean() > 0.05  # more than an empty canvas
+    red = (views[0][:, 0] > views[0][:, 1] + 40) & (views[0][:, 3] > 0)
+    green = (views[0][:, 1] > views[0][:, 0] + 20) & (views[0][:, 3] > 0)
+    assert min(red.sum(), green.sum()) > 200  # both models are seen
+    box = canvas.bounding_box()
+    assert box is not None
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 120, middle[1] + 20, steps=4)
+    page.mouse.up()
+    views.append(look(canvas))
+    page.mouse.wheel(0, 300)
+    views.append(look(canvas))
+    title = page.locator("dialog h2").inner_text()
+    canvas.focus()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowLeft")
+    views.append(look(canvas))
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    views.append(look(canvas))
+    for way in ("As in the picture", "With the camera", "The object"):
+        page.get_by_role("button", name=way).click()
+        views.append(look(canvas))
+    assert all(changed(a, b) > 0.04 for a, b in itertools.pairwise(views))
+    assert changed(views[0], views[-1]) < 0.01
+    assert page.locator("dialog h2").inner_text() == title  # arrows did not walk on
+
+
+def test_the_scene_orbits_by_touch(opened: Opened, plain: str) -> None:
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True}
+    page = opened(plain + "#order=best", **phone)
+    canvas = open_first(page).locator("canvas")
+    canvas.scroll_into_view_if_needed()
+    before = look(canvas)
+    box = canvas.bounding_box()
+    assert box is not None
+    touch = page.context.new_cdp_session(page)
+    at = {"x": box["x"] + box["width"] / 3, "y": box["y"] + box["height"] / 2}
+    touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
+    for step in range(1, 5):
+        moved = {**at, "x": at["x"] + 30 * step}
+        touch.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": [moved]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    assert changed(before, look(canvas)) > 0.01
+
+
+def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
+    page = opened(plain, script=NO_WEBGL, allowed="WebGL")
+    dialog = open_first(page)
+    expect(dialog.locator(".stage")).to_contain_text("needs WebGL")
+    page.keyboard.press("ArrowRight")
+    expect(dialog.locator("table").first).to_be_visible()

@@ -1,0 +1,622 @@
+"""`Library.retrieve`: the likelihood, the bound, what matches hold, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import eigh
+
+from cadalign import Alignment, Box, Camera, Library, Match, fit
+from cadalign.datasets import KeypointNet, Symmetries
+from cadalign.errors import DegenerateError, InputError
+from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
+from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.bounds import error_bound
+from cadalign.retrieval.candidates import gather_field, observe
+from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.ranking import rank
+from cadalign.retrieval.shape import is_same_shape, shape_distance
+
+CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
+LENS = replace(CAMERA, distortion=(-0.1, 0.03, 0.001, -0.002))
+IDS = np.arange(10)
+
+
+def make_model(number: int, ids: Sequence[int] = tuple(IDS), category: str = "box") -> LibraryModel:
+    """A model whose keypoint with a certain id depends on number and id alone."""
+    xyz = np.array([np.random.default_rng([number, i]).uniform(-0.3, 0.3, 3) for i in ids])
+    bounds = np.array([[-0.3] * 3, [0.3] * 3])
+    return LibraryModel(category, f"{number:03d}", xyz, np.array(ids), bounds)
+
+
+MODELS = [make_model(number) for number in range(60)]
+LIBRARY = Library.from_models(MODELS)
+
+
+def pose_of(seed: int, scale: tuple[float, float] = (1.4, 0.7)) -> Alignment:
+    rng = np.random.default_rng(seed)
+    return Alignment(random_rotation(rng), np.array([0.05, -0.02, 2.3]), np.array([1.0, *scale]))
+
+
+def view(
+    model: LibraryModel, pose: Alignment, *, noise_px: float = 0.0, seed: int = 0, camera=CAMERA
+) -> np.ndarray:
+    pixels = camera.project(pose.apply(model.xyz))
+    return pixels + noise_px * np.random.default_rng(seed).standard_normal(pixels.shape)
+
+
+def names(matches: Sequence[Match]) -> list[str]:
+    return [match.model_id for match in matches]
+
+
+def same(one: Sequence[Match], other: Sequence[Match]) -> bool:
+    return [m.to_dict() for m in one] == [m.to_dict() for m in other]
+
+
+# --- what it finds ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_the_model_is_found_with_pose_and_stretch(camera: Camera) -> None:
+    for number in (0, 17, 59):
+        pose = pose_of(number)
+        pixels = view(MODELS[number], pose, camera=camera)
+        best = LIBRARY.retrieve(pixels, IDS, camera)[0]
+        assert best.model_id == f"{number:03d}"
+        assert best.score > 0.999
+        assert best.rms < 0.05
+        np.testing.assert_allclose(best.alignment.scale, pose.scale, rtol=0.01)
+        np.testing.assert_allclose(best.alignment.rotation, pose.rotation, atol=0.01)
+
+
+def test_a_match_holds_what_belongs_to_its_pose() -> None:
+    model = MODELS[3]
+    pixels = view(model, pose_of(3), noise_px=2.0)
+    shown = [1, 2, 4, 5, 6, 7, 8, 9]
+    best = LIBRARY.retrieve(pixels[shown], IDS[shown], CAMERA, sigma=2.0)[0]
+    assert best.model_id == "003"
+    assert best.shared == 8
+    assert best.missing_ids == ()
+    assert best.semantic_ids.tolist() == shown
+    np.testing.assert_array_equal(best.points_3d, model.xyz[shown])
+    np.testing.assert_array_equal(best.points_2d, pixels[shown])
+    projected = CAMERA.project(best.alignment.apply(model.xyz[shown]))
+    np.testing.assert_allclose(best.residuals, projected - pixels[shown])
+    assert best.rms == pytest.approx(np.sqrt((best.residuals**2).sum(axis=1).mean()))
+    box = Box.from_model(model.bounds, best.alignment)
+    np.testing.assert_array_equal(best.box.corners, box.corners)
+    assert repr(best).startswith("Match('box', '003', score=")
+
+
+def test_the_alignment_is_the_optimum_that_fit_finds() -> None:
+    for number in range(6):
+        pixels = view(MODELS[number], pose_of(number), noise_px=2.0, seed=number)
+        best = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=2.0)[0]
+        fitted = fit(MODELS[number].xyz, pixels, CAMERA, sigma=2.0, scale_prior_sigma=0.4)
+        np.testing.assert_allclose(best.alignment.rotation, fitted.alignment.rotation, atol=1e-6)
+        np.testing.assert_allclose(best.alignment.scale, fitted.alignment.scale, rtol=1e-6)
+
+
+def test_the_log_likelihood_is_what_the_documentation_says() -> None:
+    """Of a model that lacks keypoints of the image, and has some which the image lacks."""
+    model = make_model(5, ids=(0, 1, 2, 3, 4, 5, 8, 9))
+    library = Library.from_models([model, make_model(6, ids=(6, 7))])
+    whole = make_model(5)
+    shown = [0, 1, 2, 3, 4, 5, 6, 7]
+    pixels = view(whole, pose_of(2), noise_px=1.5)[shown]
+    sigma = np.linspace(1.0, 2.0, 8)
+    (match,) = library.retrieve(
+        pixels, shown, CAMERA, sigma=sigma, missing_prob=0.3, spurious=0.05, scale_prior_sigma=0.6
+    )
+    shared = slice(0, 6)
+    residuals = CAMERA.project(match.alignment.apply(model.xyz[shared])) - pixels[shared]
+    gaussian = -((residuals / sigma[shared, None]) ** 2).sum(axis=1) / 2
+    gaussian -= np.log(2 * np.pi * sigma[shared] ** 2)
+    logs = np.log(match.alignment.scale[1:])
+    prior = -(logs**2 / (2 * 0.6**2)) - np.log(0.6 * np.sqrt(2 * np.pi))
+    expected = (
+        (np.log(0.7) + gaussian).sum()
+        + 2 * np.log(0.3)
+        + 2 * np.log(0.05 / (640 * 480))
+        + prior.sum()
+    )
+    assert match.log_likelihood == pytest.approx(expected, abs=1e-9)
+    assert match.missing_ids == (6, 7)
+
+
+def test_scores_are_likelihoods_over_their_sum() -> None:
+    pixels = view(MODELS[8], pose_of(8), noise_px=30.0)[:6]
+    matches = LIBRARY.retrieve(pixels, IDS[:6], CAMERA, sigma=30.0, top=60, exhaustive=True)
+    assert len(matches) == 60
+    scores = np.array([match.score for match in matches])
+    assert scores.sum() == pytest.approx(1.0)
+    logs = np.array([match.log_likelihood for match in matches])
+    np.testing.assert_allclose(scores, np.exp(logs - logs[0]) * scores[0], rtol=1e-9)
+    assert (np.diff(scores) <= 0).all()
+    assert 0.02 < scores[0] < 0.98  # so that this tests something
+
+
+def test_a_model_that_lacks_keypoints_of_the_image_has_to_fit_much_better() -> None:
+    """Fewer keypoints are explained with ease; that must not win."""
+    few = [make_model(100 + n, ids=(0, 1, 2, 3)) for n in range(200)]
+    library = Library.from_models([MODELS[0], *few])
+    matches = library.retrieve(view(MODELS[0], pose_of(1), noise_px=2.0), IDS, CAMERA, sigma=2.0)
+    assert matches[0].model_id == "000"
+    assert matches[0].score > 0.999
+    assert matches[1].shared == 4
+    assert matches[1].missing_ids == (4, 5, 6, 7, 8, 9)
+    assert matches[1].rms < matches[0].rms
+
+
+def test_keypoints_that_the_object_does_not_have_are_tolerated() -> None:
+    model = make_model(7, ids=(0, 1, 2, 3, 4, 5, 6, 7))
+    others = [make_model(n) for n in range(20, 40)]
+    pixels = np.vstack([view(model, pose_of(4), noise_px=1.0), [[30.0, 40.0]]])
+    best = Library.from_models([model, *others]).retrieve(pixels, np.arange(9), CAMERA)[0]
+    assert best.model_id == "007"
+    assert best.missing_ids == (8,)
+
+
+def test_hidden_keypoints_hardly_count() -> None:
+    """The same model with more keypoints, which this image does not show, loses by log 2 each."""
+    model = make_model(7, ids=range(8))
+    library = Library.from_models([model, replace(make_model(7), model_id="more")])
+    pixels = view(model, pose_of(4), noise_px=1.0)
+    first, second = library.retrieve(pixels, np.arange(8), CAMERA)
+    assert names([first, second]) == ["007", "more"]
+    assert first.log_likelihood - second.log_likelihood == pytest.approx(2 * np.log(2))
+
+
+def test_each_keypoint_may_have_its_own_sigma_or_covariance() -> None:
+    pixels = view(MODELS[2], pose_of(2), noise_px=2.0)
+    one = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=2.0)
+    each = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=np.full(10, 2.0))
+    full = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=np.tile(4.0 * np.eye(2), (10, 1, 1)))
+    assert names(one) == names(each) == names(full)
+    assert one[0].log_likelihood == pytest.approx(each[0].log_likelihood)
+    assert one[0].log_likelihood == pytest.approx(full[0].log_likelihood)
+    pixels[4] += (60.0, 0.0)
+    sigma = np.where(IDS == 4, 50.0, 2.0)
+    assert LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=sigma)[0].model_id == "002"
+
+
+def test_shape_sigma_adds_a_share_of_the_extent_to_the_noise() -> None:
+    pixels = view(MODELS[2], pose_of(2), noise_px=2.0)
+    extent = np.linalg.norm(np.ptp(pixels, axis=0))
+    one = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=2.0, shape_sigma=0.03)
+    sigma = float(np.hypot(2.0, 0.03 * extent))
+    other = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=sigma)
+    assert names(one) == names(other)
+    assert one[0].log_likelihood == pytest.approx(other[0].log_likelihood)
+
+
+def test_a_robust_loss_tolerates_wrong_keypoints() -> None:
+    found = {"linear": 0, "cauchy": 0}
+    for number in range(8):
+        pixels = view(MODELS[number], pose_of(number), noise_px=1.0, seed=number)
+        pixels[[2, 5, 7]] = pixels[[5, 7, 2]] + [[90.0, -50.0], [-60.0, 80.0], [40.0, 60.0]]
+        for loss in found:
+            best = LIBRARY.retrieve(pixels, IDS, CAMERA, loss=loss)[0]
+            found[loss] += best.model_id == f"{number:03d}"
+    assert found["cauchy"] == 8
+    assert found["linear"] <= 4
+
+
+class TestStretch:
+    def test_no_model_is_stretched_beyond_the_limit(self) -> None:
+        pixels = view(MODELS[4], pose_of(4, scale=(2.5, 1.0)))
+        wide = LIBRARY.retrieve(pixels, IDS, CAMERA, scale_prior_sigma=None)
+        assert wide[0].model_id == "004"
+        assert wide[0].alignment.scale[1] == pytest.approx(2.5, rel=1e-3)
+        narrow = LIBRARY.retrieve(
+            pixels, IDS, CAMERA, scale_prior_sigma=None, max_stretch=2.0, top=60
+        )
+        (held,) = (match for match in narrow if match.model_id == "004")
+        assert held.alignment.scale[1] == pytest.approx(2.0)
+        assert held.rms > 1
+        held_fit = fit(MODELS[4].xyz * [1, 2, 1], pixels, CAMERA, stretch="z")
+        assert held.rms == pytest.approx(held_fit.rms, rel=1e-4)
+        for match in narrow:
+            assert (match.alignment.scale >= 0.5 - 1e-12).all()
+            assert (match.alignment.scale <= 2.0 + 1e-12).all()
+
+    def test_the_prior_keeps_a_model_from_being_flattened_to_win(self) -> None:
+        """Two models, one the other squeezed to a third: the nearer one to the object wins."""
+        tall = MODELS[0]
+        flat = replace(tall, model_id="flat", xyz=tall.xyz * [1, 1 / 3, 1])
+        library = Library.from_models([tall, flat])
+        pixels = view(tall, pose_of(1, scale=(1.1, 1.0)))
+        first, second = library.retrieve(pixels, IDS, CAMERA)
+        assert names([first, second]) == ["000", "flat"]
+        assert second.alignment.scale[1] == pytest.approx(3.3, rel=0.02)
+        # The density of log 3.3 over that of log 1.1.
+        ratio = np.exp((np.log(1.1) ** 2 - np.log(3.3) ** 2) / (2 * 0.4**2))
+        assert second.score / first.score == pytest.approx(ratio, rel=0.1)
+        equal = library.retrieve(pixels, IDS, CAMERA, scale_prior_sigma=None)
+        assert [m.score for m in equal] == pytest.approx([0.5, 0.5], abs=1e-6)
+
+    def test_axes_can_be_held(self) -> None:
+        pixels = view(MODELS[4], pose_of(4, scale=(1.5, 1.0)))
+        (best, *_) = LIBRARY.retrieve(pixels, IDS, CAMERA, stretch="y")
+        assert best.model_id == "004"
+        assert best.alignment.scale[2] == 1
+        (best, *_) = LIBRARY.retrieve(
+            view(MODELS[4], pose_of(4, (1, 1))), IDS, CAMERA, stretch="none"
+        )
+        assert best.model_id == "004"
+        assert best.alignment.scale.tolist() == [1, 1, 1]
+
+    def test_epnp_does_not_stretch_and_finds_what_is_not_stretched(self) -> None:
+        pixels = view(MODELS[4], pose_of(4, scale=(1.0, 1.0)), noise_px=0.5)
+        best = LIBRARY.retrieve(pixels, IDS, CAMERA, method="epnp")[0]
+        assert best.model_id == "004"
+        assert best.alignment.scale.tolist() == [1, 1, 1]
+        stretched = view(MODELS[4], pose_of(4, scale=(1.8, 0.6)), noise_px=0.5)
+        assert LIBRARY.retrieve(stretched, IDS, CAMERA)[0].rms < 2
+        assert LIBRARY.retrieve(stretched, IDS, CAMERA, method="epnp")[0].rms > 5
+
+    def test_flat_models_can_be_retrieved(self) -> None:
+        models = [replace(m, xyz=m.xyz * [1, 1, 0]) for m in MODELS[:20]]
+        pixels = view(models[5], pose_of(5, scale=(1.2, 1.0)), noise_px=0.5)
+        best = Library.from_models(models).retrieve(pixels, IDS, CAMERA)[0]
+        assert best.model_id == "005"
+        assert best.alignment.scale[1] == pytest.approx(1.2, rel=0.05)
+
+
+class TestMirroredLabels:
+    PAIRS = ((0, 1), (2, 3), (4, 5))
+
+    def models(self) -> list[LibraryModel]:
+        models = []
+        for number in range(12):
+            model = make_model(number)
+            xyz = model.xyz.copy()
+            for left, right in self.PAIRS:
+                xyz[right] = xyz[left] * [-1, 1, 1]
+            symmetries = Symmetries(reflections=self.PAIRS)
+            models.append(replace(model, xyz=xyz, symmetries=symmetries))
+        return models
+
+    def test_exchanged_labels_are_found_out(self) -> None:
+        models = self.models()
+        library = Library.from_models(models)
+        pixels = view(models[3], pose_of(3), noise_px=0.5)
+        wrong = np.array([1, 0, 3, 2, 5, 4, 6, 7, 8, 9])
+        tried = library.retrieve(pixels, wrong, CAMERA, symmetries=True)
+        assert tried[0].model_id == "003"
+        assert tried[0].mirrored
+        assert tried[0].rms < 1
+        # Matches are in the order of the labels, with the points that these mean on this model.
+        np.testing.assert_array_equal(tried[0].points_3d, models[3].xyz[wrong])
+        assert len(set(names(tried))) == len(tried) == 10
+        assert library.retrieve(pixels, wrong, CAMERA)[0].rms > 5
+
+    def test_right_labels_stay_as_they_are(self) -> None:
+        models = self.models()
+        library = Library.from_models(models)
+        pixels = view(models[3], pose_of(3), noise_px=0.5)
+        best = library.retrieve(pixels, IDS, CAMERA, symmetries=True)[0]
+        plain = library.retrieve(pixels, IDS, CAMERA)[0]
+        assert (best.model_id, best.mirrored) == ("003", False)
+        # Two labelings, equally likely beforehand.
+        assert plain.log_likelihood - best.log_likelihood == pytest.approx(np.log(2))
+
+
+class TestCategories:
+    LIBRARY = Library.from_models(
+        [*MODELS, *(make_model(n, category="can") for n in range(60, 90))]
+    )
+
+    def test_without_a_name_all_are_compared(self) -> None:
+        for number, category in ((3, "box"), (70, "can")):
+            pixels = view(make_model(number), pose_of(number), noise_px=0.5)
+            best = self.LIBRARY.retrieve(pixels, IDS, CAMERA)[0]
+            assert (best.category, best.model_id) == (category, f"{number:03d}")
+
+    def test_a_named_one_is_the_only_one(self) -> None:
+        pixels = view(make_model(70), pose_of(7), noise_px=0.5)
+        alone = self.LIBRARY.retrieve(pixels, IDS, CAMERA, category="box")
+        assert {match.category for match in alone} == {"box"}
+        assert same(alone, LIBRARY.retrieve(pixels, IDS, CAMERA))
+
+    def test_an_unknown_one_is_refused(self) -> None:
+        with pytest.raises(
+            InputError, match="category: unknown category 'boxx', did you mean 'box'"
+        ):
+            self.LIBRARY.retrieve(np.zeros((10, 2)), IDS, CAMERA, category="boxx")
+
+    def test_models_can_be_excluded(self) -> None:
+        pixels = view(MODELS[3], pose_of(3), noise_px=0.5)
+        rest = self.LIBRARY.retrieve(pixels, IDS, CAMERA, exclude=[("box", "003")], top=90)
+        assert ("box", "003") not in {(match.category, match.model_id) for match in rest}
+        assert same(
+            rest[:5],
+            Library.from_models([m for m in self.LIBRARY if m.key != ("box", "003")]).retrieve(
+                pixels, IDS, CAMERA, top=5
+            ),
+        )
+        with pytest.raises(InputError, match="exclude: all models are excluded"):
+            self.LIBRARY.retrieve(pixels, IDS, CAMERA, exclude=self.LIBRARY.keys)
+
+
+# --- the bound and the order -----------------------------------------------------------------
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(6, 12),
+    depth=st.floats(0.4, 5.0),
+    noise_px=st.floats(0.0, 200.0),
+    own_sigmas=st.booleans(),
+)
+def test_no_pose_has_errors_below_the_bound(
+    seed: int, count: int, depth: float, noise_px: float, own_sigmas: bool
+) -> None:
+    """Also of poses so near that depths differ by large factors."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-0.3, 0.3, (count, 3)) * rng.uniform(0.02, 1.0, 3)
+    pose = Alignment(
+        random_rotation(rng), np.array([0, 0, depth]), np.array([1, *rng.uniform(0.3, 3, 2)])
+    )
+    inside = pose.apply(xyz)
+    if inside[:, 2].min() < 0.02:
+        return
+    pixels = CAMERA.project(inside)
+    seen = pixels + noise_px * rng.standard_normal(pixels.shape)
+    covariances = np.tile(np.eye(2), (count, 1, 1))
+    if own_sigmas:
+        factors = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
+        covariances = factors @ factors.transpose(0, 2, 1)
+    options = RetrievalOptions(sigma=covariances)
+    model = LibraryModel("box", "1", xyz, np.arange(count), np.zeros((2, 3)))
+    field = gather_field(
+        Library.from_models([model])._table,
+        observe(seen, np.arange(count), CAMERA, options),
+        options,
+    )
+    errors = pixels - seen
+    cost = np.einsum("ni,nij,nj->", errors, np.linalg.inv(covariances), errors)
+    assert field.bounds[0] <= cost * (1 + 1e-9) + 1e-9
+
+
+def test_the_bound_is_the_eigenvalue_over_the_largest_leverage() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        points, rays = rng.uniform(-0.3, 0.3, (9, 3)), rng.uniform(-0.2, 0.2, (9, 2))
+        seen, weights = rng.permutation(9), rng.uniform(1, 4, 9)
+        a = np.hstack([np.ones((9, 1)), points])
+        w, (u, v) = weights[seen], rays[seen].T
+        p = (a.T * w) @ a
+        p_u, p_v = (a.T * (w * u)) @ a, (a.T * (w * v)) @ a
+        s = (a.T * (w * (u**2 + v**2))) @ a
+        s -= p_u @ np.linalg.solve(p, p_u) + p_v @ np.linalg.solve(p, p_v)
+        leverage = np.einsum("ni,ij,nj->n", a, np.linalg.inv(p), a)
+        expected = eigh(s, p, eigvals_only=True)[0] / leverage.max()
+        assert error_bound(points, seen, rays, weights) == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_bound_spares_most_of_the_work() -> None:
+    pixels = view(MODELS[3], pose_of(3), noise_px=1.0)
+    options = RetrievalOptions(top=1)
+    many = Library.from_models([make_model(number) for number in range(2000)])
+    observed = observe(pixels, IDS, CAMERA, options)
+    ranking = rank(gather_field(many._table, observed, options), observed, options)
+    assert ranking.searched < 500
+
+
+@pytest.mark.parametrize("noise_px", [0.5, 4.0, 12.0])
+def test_the_list_is_the_same_as_if_all_models_were_searched(noise_px: float) -> None:
+    for number in range(8):
+        pixels = view(MODELS[number], pose_of(number), noise_px=noise_px, seed=number)
+        found = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=noise_px)
+        every = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=noise_px, exhaustive=True)
+        assert names(found) == names(every)
+        for one, other in zip(found, every, strict=True):
+            assert one.log_likelihood == other.log_likelihood
+            assert one.score == pytest.approx(other.score, abs=1e-4)
+
+
+def test_nothing_depends_on_the_order_of_anything_or_on_the_workers() -> None:
+    rng = np.random.default_rng(0)
+    shuffled = Library.from_models([MODELS[k] for k in rng.permutation(60)])
+    for noise_px in (1.0, 8.0):
+        pixels = view(MODELS[5], pose_of(5), noise_px=noise_px)
+        one = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=noise_px, workers=1)
+        order = rng.permutation(10)
+        assert same(one, shuffled.retrieve(pixels, IDS, CAMERA, sigma=noise_px))
+        assert same(one, LIBRARY.retrieve(pixels[order], IDS[order], CAMERA, sigma=noise_px))
+        for workers in (2, 5):
+            found = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=noise_px, workers=workers)
+            assert same(one, found)
+
+
+def test_ties_are_broken_by_the_id() -> None:
+    twins = [replace(MODELS[3], model_id=name) for name in ("c", "a", "d", "b")]
+    for models in (twins, twins[::-1]):
+        library = Library.from_models([*MODELS[10:30], *models])
+        matches = library.retrieve(view(MODELS[3], pose_of(3), noise_px=1.0), IDS, CAMERA)
+        assert names(matches)[:4] == ["a", "b", "c", "d"]
+        assert [match.score for match in matches[:4]] == pytest.approx([0.25] * 4)
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+PIXELS = view(MODELS[0], pose_of(0))
+
+
+def test_an_empty_library_is_refused() -> None:
+    with pytest.raises(InputError, match="library: the library is empty"):
+        Library.from_models([]).retrieve(PIXELS, IDS, CAMERA)
+
+
+def test_unknown_semantic_ids_are_refused_and_the_known_ones_named() -> None:
+    models = [
+        make_model(1, ids=(0, 1, 2, 3, 7, 8)),
+        make_model(2, ids=range(30, 36), category="can"),
+    ]
+    library = Library.from_models(models)
+    with pytest.raises(
+        InputError,
+        match=r"no model of the library has .* with the semantic id 5; known are 0-3, 7-8, 30-35$",
+    ):
+        library.retrieve(PIXELS[:6], [0, 1, 2, 3, 7, 5], CAMERA)
+    with pytest.raises(InputError, match=r"no model of the category 'box' .* the semantic id 30;"):
+        library.retrieve(PIXELS[:6], [0, 1, 2, 3, 7, 30], CAMERA, category="box")
+
+
+def test_too_few_shared_keypoints_are_refused() -> None:
+    models = [make_model(1, ids=range(5)), make_model(2, ids=range(5, 10))]
+    with pytest.raises(
+        DegenerateError, match=r"no model shares more than 3 keypoints .* at least 4"
+    ):
+        Library.from_models(models).retrieve(PIXELS[2:8], IDS[2:8], CAMERA)
+    with pytest.raises(DegenerateError, match=r"no model shares more than 0 keypoints"):
+        LIBRARY.retrieve(np.empty((0, 2)), [], CAMERA)
+
+
+def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
+    same_points = replace(MODELS[0], xyz=np.full((10, 3), 0.1))
+    with pytest.raises(DegenerateError, match="no model can be aligned with the keypoints"):
+        Library.from_models([same_points]).retrieve(PIXELS, IDS, CAMERA, method="epnp")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points_2d": PIXELS[:9]}, r"semantic_ids: int64 of shape \(10,\), expected .* \(9,\)"),
+        ({"points_2d": PIXELS * np.nan}, "points_2d: NaN or infinite values in rows 0, 1"),
+        ({"semantic_ids": np.r_[IDS[:9], 3]}, "semantic_ids: the semantic id 3 occurs twice"),
+        ({"semantic_ids": IDS + 0.5}, "semantic_ids: float64 of shape"),
+        ({"camera": "none"}, "camera: expected a cadalign.Camera, got str"),
+        ({"top": 0}, "top: 0 is not a number of matches"),
+        ({"method": "aepnp"}, "method: unknown method 'aepnp'; known are optimal, epnp"),
+        ({"method": "epnp", "loss": "huber"}, "'epnp' knows neither loss nor stretch"),
+        ({"method": "epnp", "stretch": "y"}, "'epnp' knows neither loss nor stretch"),
+        ({"sigma": 0.0}, "sigma: has values that are not positive"),
+        ({"sigma": None}, "sigma: the noise must be known"),
+        ({"sigma": np.ones(9)}, r"sigma: shape \(9,\)"),
+        ({"shape_sigma": -1.0}, "shape_sigma: -1.0 is out of range"),
+        ({"missing_prob": 1.0}, "missing_prob: 1.0 is out of range"),
+        ({"spurious": 0.0}, "spurious: 0.0 is out of range"),
+        ({"max_stretch": 0.5}, "max_stretch: 0.5 is out of range"),
+        ({"max_stretch": float("nan")}, "max_stretch: nan is out of range"),
+        ({"loss": "tukey"}, "loss: unknown loss 'tukey'; known are linear, huber, cauchy"),
+        ({"loss_scale": -1}, "loss_scale: -1 is not positive"),
+        ({"scale_prior_sigma": 0.0}, "scale_prior_sigma: 0.0 is not positive"),
+        ({"stretch": "x"}, "stretch: 'x' are not axes that can stretch"),
+        ({"workers": 0}, "workers: 0 is not a number of threads; or -1"),
+        ({"mask": np.ones((480, 640)), "image": np.ones((480, 640, 3))}, "a mask or an image, not"),
+    ],
+)
+def test_invalid_arguments_are_refused(change: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"points_2d": PIXELS, "semantic_ids": IDS, "camera": CAMERA}
+    with pytest.raises(InputError, match=message):
+        LIBRARY.retrieve(**{**arguments, **change})
+
+
+# --- shapes ----------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 1000), y=st.floats(0.3, 3.0), z=st.floats(0.3, 3.0))
+def test_shape_distance_knows_no_place_and_no_stretch(seed: int, y: float, z: float) -> None:
+    rng = np.random.default_rng(seed)
+    model = MODELS[seed % 60]
+    order = rng.permutation(10)
+    moved = replace(
+        model,
+        model_id="moved",
+        xyz=(model.xyz * [1, y, z] + rng.normal(size=3))[order],
+        semantic_ids=model.semantic_ids[order],
+    )
+    assert shape_distance(moved, model) < 1e-9
+    assert is_same_shape(moved, model)
+    wider = replace(model, xyz=model.xyz * [1.2, 1, 1])
+    assert shape_distance(wider, model) > 0.01
+    assert not is_same_shape(wider, model)
+
+
+def test_shape_distance_is_a_share_of_the_extent() -> None:
+    xyz = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [4, 3, 0]])
+    gt = LibraryModel("box", "gt", xyz, np.arange(4), np.zeros((2, 3)))
+    narrow = replace(gt, xyz=xyz * [0.95, 1, 1])  # each 0.1 off along x, of an extent of 5
+    assert shape_distance(narrow, gt) == pytest.approx(0.02)
+
+
+def test_shapes_of_other_categories_or_keypoints_are_not_the_same() -> None:
+    model = MODELS[0]
+    assert not is_same_shape(replace(model, category="can"), model)
+    fewer = make_model(0, ids=range(9))
+    assert shape_distance(fewer, model) < 1e-12
+    assert not is_same_shape(fewer, model)
+    with pytest.raises(InputError, match="the one is of 'can', the other of 'box'"):
+        shape_distance(replace(model, category="can"), model)
+
+
+# --- real annotations ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chairs(real_data: Path) -> Library:
+    return Library.from_dataset(KeypointNet(real_data / "keypointnet"), categories=["chair"])
+
+
+def rank_1_rate(library: Library, noise_px: float, keypoints: int, queries: int) -> float:
+    """Of the models evenly spread over the library; the same on every machine."""
+    models = list(library)
+    hits = 0
+    made = 0
+    for model in models[:: max(1, len(models) // queries)]:
+        try:
+            seen = observe_model(model, RetrievalTask(*model.key, noise_px, keypoints), seed=0)
+        except DegenerateError:
+            continue
+        made += 1
+        best = library.retrieve(
+            seen.points_2d, seen.semantic_ids, seen.camera, sigma=noise_px, top=1
+        )[0]
+        hits += is_same_shape(library[best.category, best.model_id], model)
+    assert made > queries / 3
+    return hits / made
+
+
+@pytest.mark.parametrize(
+    ("noise_px", "keypoints", "least"),
+    [(1.0, 8, 0.97), (1.0, 10, 0.99), (3.0, 8, 0.82), (5.0, 8, 0.60)],
+)
+def test_real_chairs_are_found_among_799(
+    chairs: Library, noise_px: float, keypoints: int, least: float
+) -> None:
+    assert len(chairs) == 799
+    assert rank_1_rate(chairs, noise_px, keypoints, 60) >= least
+
+
+@pytest.mark.slow
+def test_scores_of_real_chairs_are_calibrated(chairs: Library) -> None:
+    """The mean probability of the first match is the share of right ones."""
+    models = list(chairs)[::10]
+    right, scores = [], []
+    for model in models:
+        task = RetrievalTask(*model.key, 5.0, 8)
+        seen = observe_model(model, task, seed=3)
+        best = chairs.retrieve(seen.points_2d, seen.semantic_ids, CAMERA, sigma=5.0, top=1)[0]
+        right.append(is_same_shape(chairs[best.category, best.model_id], model))
+        scores.append(best.score)
+    assert np.mean(scores) == pytest.approx(np.mean(right), abs=0.12)
+
+
+def test_the_list_is_exact_in_a_library_of_real_chairs(chairs: Library) -> None:
+    for place, noise_px in enumerate((1.0, 3.0, 5.0)):
+        model = list(chairs)[100 * place]
+        seen = observe_model(model, RetrievalTask(*model.key, noise_px, 8), seed=1)
+        arguments = (seen.points_2d, seen.semantic_ids, seen.camera)
+        found = chairs.retrieve(*arguments, sigma=noise_px)
+        every = chairs.retrieve(*arguments, sigma=noise_px, exhaustive=True)
+        assert names(found) == names(every)

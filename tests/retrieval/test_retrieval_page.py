@@ -1,0 +1,463 @@
+"""Silhouettes, and `cadalign retrieve` and `cadalign library`: tables, files, page, refusals."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser
+
+from cadalign import Library, Match, Mesh
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
+from cadalign.io.observation import Observation
+from cadalign.render import Frame, RaycastRenderer, Scene, look_at
+from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.page import draw_match, write_retrieval
+from cadalign.retrieval.pictures import read_opacity
+from cadalign.retrieval.query import read_query
+
+
+@dataclass(frozen=True)
+class Case:
+    """A photo of a stretched chair, its keypoints, and a library with the chair."""
+
+    folder: Path
+    library: Library
+    model_id: str
+    frame: Frame
+    observation: Observation
+
+    @property
+    def photo(self) -> np.ndarray:
+        return self.frame.composite()
+
+    def retrieve(self, **options: Any) -> list[Match]:
+        seen = self.observation
+        return self.library.retrieve(seen.points_2d, seen.semantic_ids, CAMERA, **options)
+
+    @property
+    def arguments(self) -> list[str]:
+        return [str(self.folder / "seen.json"), "--library", str(self.folder / "lib.cadalign")]
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("retrieval")
+    root = write_sample_dataset(folder / "sample", per_category=4, categories=["chair", "bottle"])
+    library = Library.from_dataset(KeypointNet(root))
+    library.save(folder / "lib.cadalign")
+    model = library["chair", "sample_chair_002"]
+    pose = look_at(azimuth=40.0, elevation=25.0, distance=2.6, scale=(1.0, 1.3, 0.8))
+    frame = RaycastRenderer().render(Scene(model.load_mesh()), CAMERA, pose)
+    cv2.imwrite(str(folder / "photo.png"), frame.composite()[..., ::-1])
+    cv2.imwrite(str(folder / "mask.png"), 255 * frame.mask.astype(np.uint8))
+    noise = np.random.default_rng(0).standard_normal((len(model.xyz), 2))
+    observation = Observation(
+        points_3d=np.zeros((len(model.xyz), 3)),
+        points_2d=CAMERA.project(pose.apply(model.xyz)) + noise,
+        camera=CAMERA,
+        semantic_ids=model.semantic_ids,
+        image=folder / "photo.png",
+    )
+    observation.save(folder / "seen.json")
+    return Case(folder, library, model.model_id, frame, observation)
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("cadalign: ")
+    assert captured.err.count("\n") == 1
+    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
+
+
+# --- silhouettes -----------------------------------------------------------------------------
+
+
+class TestSilhouettes:
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def twins(tmp_path_factory: pytest.TempPathFactory) -> Library:
+        """Two models with the same keypoints: a full block and one with a corner cut off."""
+        folder = tmp_path_factory.mktemp("twins")
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
+        full, cut = _hull(corners), _hull(np.delete(corners, 6, axis=0))
+        models = []
+        for name, mesh in (("a-cut", cut), ("b-full", full)):
+            path = folder / f"{name}.obj"
+            lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices.tolist()]
+            lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist()]
+            path.write_text("\n".join(lines) + "\n")
+            bounds = np.array([[-0.5] * 3, [0.5] * 3])
+            xyz = corners[:7] * [1.0, 0.8, 0.6]
+            models.append(LibraryModel("block", name, xyz, np.arange(7), bounds, mesh_path=path))
+        models.append(replace(models[0], model_id="c-bare", mesh_path=None))
+        return Library.from_models(models)
+
+    @staticmethod
+    def seen(library: Library, name: str) -> tuple[np.ndarray, Frame]:
+        model = library["block", name]
+        pose = look_at(azimuth=35.0, elevation=30.0, distance=4.5, scale=(1.0, 1.2, 1.1))
+        frame = RaycastRenderer().render(Scene(model.load_mesh()), CAMERA, pose)
+        return CAMERA.project(pose.apply(model.xyz)), frame
+
+    @pytest.mark.parametrize("name", ["a-cut", "b-full"])
+    def test_a_mask_tells_models_with_the_same_keypoints_apart(self, twins, name) -> None:
+        pixels, frame = self.seen(twins, name)
+        plain = twins.retrieve(pixels, np.arange(7), CAMERA)
+        assert [match.model_id for match in plain] == ["a-cut", "b-full", "c-bare"]
+        assert [match.score for match in plain] == pytest.approx([1 / 3] * 3)
+        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
+        assert ranked[0].model_id == name
+        assert ranked[0].silhouette_iou is not None
+        assert ranked[0].silhouette_iou > 0.99
+        # Without a mesh: neither preferred nor rejected.
+        assert [match.model_id for match in ranked][1] == "c-bare"
+        assert ranked[1].silhouette_iou is None
+        assert sum(match.score for match in ranked) == pytest.approx(1.0)
+        gap = ranked[0].silhouette_iou - ranked[2].silhouette_iou
+        assert ranked[0].score / ranked[2].score == pytest.approx(np.exp(gap / 0.05))
+
+    def test_a_mask_may_hold_opacities(self, twins) -> None:
+        pixels, frame = self.seen(twins, "b-full")
+        by_mask = twins.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
+        for mask in (255 * frame.mask.astype(np.uint8), frame.mask.astype(float)):
+            ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=mask)
+            assert [m.to_dict() for m in ranked] == [m.to_dict() for m in by_mask]
+
+    def test_an_image_s_opacity_is_its_mask(self, twins) -> None:
+        pixels, frame = self.seen(twins, "b-full")
+        image = np.dstack([np.zeros((480, 640, 3)), 255 * frame.mask]).astype(np.uint8)
+        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, image=image)
+        assert ranked[0].model_id == "b-full"
+        assert ranked[0].silhouette_iou > 0.99
+
+    @pytest.mark.parametrize("name", ["a-cut", "b-full"])
+    def test_the_object_is_cut_out_of_a_photo(self, twins, name) -> None:
+        pixels, frame = self.seen(twins, name)
+        rng = np.random.default_rng(0)
+        grass = np.array([70, 120, 60]) + 15 * rng.standard_normal((480, 640, 3))
+        image = np.where(frame.mask[..., None], frame.composite(), grass.clip(0, 255))
+        ranked = twins.retrieve(pixels, np.arange(7), CAMERA, image=image.astype(np.uint8))
+        assert ranked[0].model_id == name
+        assert ranked[0].silhouette_iou > 0.95
+
+    def test_what_shows_nothing_or_does_not_fit_is_refused(self, twins) -> None:
+        pixels, _ = self.seen(twins, "b-full")
+
+        def retrieve(**options: Any) -> None:
+            twins.retrieve(pixels, np.arange(7), CAMERA, **options)
+
+        with pytest.raises(InputError, match="mask: it shows no pixel of the object"):
+            retrieve(mask=np.zeros((480, 640), dtype=bool))
+        with pytest.raises(InputError, match=r"mask: shape \(640, 480\), but .* 480 high and 640"):
+            retrieve(mask=np.zeros((640, 480), dtype=bool))
+        with pytest.raises(InputError, match=r"image: float64 of shape \(480, 640, 3\), expected"):
+            retrieve(image=np.zeros((480, 640, 3)))
+        with pytest.raises(InputError, match=r"image: shape \(48, 64\), but"):
+            retrieve(image=np.full((48, 64, 4), 255, dtype=np.uint8))
+
+    def test_without_meshes_the_order_stays_and_a_warning_is_given(self, twins, caplog) -> None:
+        pixels, frame = self.seen(twins, "b-full")
+        bare = Library.from_models([replace(model, mesh_path=None) for model in twins])
+        plain = bare.retrieve(pixels, np.arange(7), CAMERA)
+        ranked = bare.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
+        assert [m.to_dict() for m in ranked] == [m.to_dict() for m in plain]
+        assert "none of the matches has a mesh" in caplog.text
+
+    def test_a_mesh_that_is_gone_does_not_stop_the_others(self, twins, caplog) -> None:
+        pixels, frame = self.seen(twins, "b-full")
+        gone = [
+            replace(model, mesh_path=Path("/nowhere.obj")) if model.model_id == "a-cut" else model
+            for model in twins
+        ]
+        ranked = Library.from_models(gone).retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
+        overlaps = {match.model_id: match.silhouette_iou for match in ranked}
+        assert overlaps["b-full"] > 0.99
+        assert overlaps["a-cut"] is None
+        assert "no silhouette: /nowhere.obj: no such mesh file" in caplog.text
+
+
+def _hull(points: np.ndarray) -> Mesh:
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    faces = hull.simplices.copy()
+    for face, normal in zip(faces, hull.equations[:, :3], strict=True):
+        a, b, c = points[face]
+        if np.cross(b - a, c - a) @ normal < 0:
+            face[[1, 2]] = face[[2, 1]]
+    return Mesh(points, faces)
+
+
+# --- the commands ----------------------------------------------------------------------------
+
+
+def test_a_library_is_built_and_shown(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "all.cadalign"
+    assert main(["library", "build", str(case.folder / "sample"), "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "8 models: 4 bottle, 4 chair" in captured.err
+    assert out.read_bytes() == (case.folder / "lib.cadalign").read_bytes()
+    assert main(["library", "show", str(out)]) == 0
+    assert capsys.readouterr().out == "8 models: 4 bottle, 4 chair\n"
+    chairs = ["--categories", "chair", "--split", "train", "--out", str(tmp_path / "some")]
+    assert main(["library", "build", str(case.folder / "sample"), *chairs]) == 0
+    assert Library.open(tmp_path / "some").categories == ("chair",)
+
+
+def test_models_with_malformed_annotations_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_sample_dataset(tmp_path / "sample", per_category=2, categories=["chair"])
+    path = root / "annotations" / "chair.json"
+    entries = json.loads(path.read_text())
+    del entries[0]["keypoints"]
+    path.write_text(json.dumps(entries))
+    assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 0
+    assert "Left out: 1 models with malformed annotations" in capsys.readouterr().err
+    assert len(Library.open(tmp_path / "lib")) == 1
+
+
+def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["retrieve", *case.arguments, "--top", "3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    matches = case.retrieve(top=3)
+    assert lines[0].split()[:3] == ["category", "model", "score"]
+    assert len(lines) == 5
+    assert lines[2].split()[:4] == ["1", "chair", case.model_id, "100.0"]
+    assert lines[2].split()[-4:-2] == [f"{matches[0].rms:.2f}", "13/13"]
+    assert not any("IoU" in line for line in lines)
+
+
+def test_matches_as_json_are_those_of_the_library(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--robust", "--json"]
+    assert main(["retrieve", *case.arguments, *options]) == 0
+    expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
+    assert json.loads(capsys.readouterr().out) == [match.to_dict() for match in expected]
+
+
+def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    path = case.folder / "sigmas.json"
+    sigma = np.linspace(1, 3, 13)
+    replace(case.observation, sigma=sigma).save(path)
+    assert main(["retrieve", str(path), *case.arguments[1:], "--json"]) == 0
+    expected = [match.to_dict() for match in case.retrieve(sigma=sigma)]
+    assert json.loads(capsys.readouterr().out) == expected
+
+
+@pytest.mark.parametrize("option", ["--mask", "--silhouette"])
+def test_silhouettes_are_compared(
+    case: Case, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extra = [option, str(case.folder / "mask.png")] if option == "--mask" else [option]
+    assert main(["retrieve", *case.arguments, *extra]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[-1] == "IoU"
+    assert float(lines[2].split()[-1]) > 0.9
+
+
+def test_a_photo_with_opacity_needs_no_cutting_out(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = np.dstack([case.photo, 255 * case.frame.mask]).astype(np.uint8)
+    Image.fromarray(image).save(case.folder / "clear.png")
+    path = case.folder / "clear.json"
+    replace(case.observation, image=case.folder / "clear.png").save(path)
+    assert main(["retrieve", str(path), *case.arguments[1:], "--silhouette", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    expected = case.retrieve(mask=case.frame.mask)
+    assert found[0]["silhouette_iou"] == expected[0].silhouette_iou
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize("mode", ["RGBA", "P"])
+def test_opacity_is_upright_and_may_be_of_a_palette(
+    case: Case, tmp_path: Path, mode: str, orientation: int
+) -> None:
+    quarter_turns = {1: 0, 3: 2, 6: 1}[orientation]  # what makes the stored pixels of upright ones
+    mask = np.rot90(case.frame.mask, quarter_turns)
+    colors = np.rot90(case.photo, quarter_turns)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "photo.png"
+    if mode == "RGBA":
+        stored = Image.fromarray(np.dstack([colors, 255 * mask]).astype(np.uint8))
+        stored.save(path, exif=exif)
+    else:
+        stored = Image.fromarray(mask.astype(np.uint8)).convert("P")
+        stored.putpalette([255, 255, 255, 200, 60, 30])
+        stored.save(path, transparency=0, exif=exif)
+    found = read_opacity(path, CAMERA)
+    assert found.shape == (480, 640, 4)
+    np.testing.assert_array_equal(found[..., 3] > 127, case.frame.mask)
+    if mode == "RGBA":
+        np.testing.assert_array_equal(found[..., :3], case.photo)
+
+
+def test_a_photo_without_opacity_has_three_channels(case: Case, tmp_path: Path) -> None:
+    path = tmp_path / "palette.png"
+    Image.fromarray(case.photo).convert("P").save(path)
+    assert read_opacity(path, CAMERA).shape == (480, 640, 3)
+
+
+def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, gone = tmp_path / "moved.json", tmp_path / "gone.png"
+    replace(case.observation, image=gone).save(path)
+    arguments = [str(path), *case.arguments[1:], "--mask", str(case.folder / "mask.png")]
+    assert main(["retrieve", *arguments]) == 0
+    assert case.model_id in capsys.readouterr().out
+    for option in (["--out", str(tmp_path / "out")], ["--silhouette"]):
+        text = refusal(capsys, "retrieve", *arguments, *option)
+        assert text == f"{gone}: no such file"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_page_shows_the_matches_side_by_side(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str], browser: Browser
+) -> None:
+    out = tmp_path / "out"
+    assert main(["retrieve", *case.arguments, "--top", "4", "--out", str(out)]) == 0
+    assert f"Page: {out / 'index.html'}" in capsys.readouterr().err
+    written = [f"overlay_{place:02d}.png" for place in range(1, 5)]
+    assert sorted(p.name for p in out.iterdir()) == ["index.html", "matches.json", *written]
+    matches = case.retrieve(top=4)
+    assert json.loads((out / "matches.json").read_text()) == [m.to_dict() for m in matches]
+    first = cv2.imread(str(out / written[0]))[..., ::-1]
+    np.testing.assert_array_equal(first, draw_match(case.photo, CAMERA, matches[0]))
+    for width in (1280, 390):
+        for scheme in ("light", "dark"):
+            page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+            problems: list[str] = []
+            page.on("console", lambda message, to=problems: to.append(message.text))
+            page.on("pageerror", lambda error, to=problems: to.append(str(error)))
+            page.goto((out / "index.html").as_uri())
+            cards = page.locator("li.retrieved")
+            assert cards.count() == 4
+            assert case.model_id in cards.first.inner_text()
+            assert "100.0 %" in cards.first.inner_text()
+            loaded = "image => image.decode().then(() => image.naturalWidth)"
+            assert page.locator("img").first.evaluate(loaded) == 640
+            overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            assert page.evaluate(overflow) == 0
+            bar = page.locator(".retrieved-score i").first.bounding_box()
+            assert bar is not None
+            assert bar["width"] > 100
+            assert 3 < bar["height"] < 12
+            assert problems == []
+            page.close()
+
+
+def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None:
+    for top in (3, 2):
+        write_retrieval(tmp_path, case.retrieve(top=top), CAMERA, title="t", library="l")
+    assert len(list(tmp_path.glob("overlay_*.png"))) == 2
+
+
+def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) -> None:
+    mine = ["overlay_mine.png", "overlay_1.png", "overlay_007.png", "overlay_12_old.png"]
+    for name in (*mine, "overlay_12.png", "overlay_100.png"):
+        (tmp_path / name).touch()
+    write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
+    left = sorted(path.name for path in tmp_path.glob("overlay_*.png"))
+    assert left == sorted([*mine, "overlay_01.png"])
+
+
+def test_an_old_overlay_that_cannot_be_removed_is_one_line(case: Case, tmp_path: Path) -> None:
+    (tmp_path / "overlay_02.png").mkdir()
+    with pytest.raises(DataError, match=f"{tmp_path}: cannot be written"):
+        write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
+
+
+def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>"
+    match = replace(case.retrieve(top=1)[0], model_id=evil, category='"><b>', mesh_path=None)
+    page = write_retrieval(tmp_path, [match], CAMERA, title=evil, library=evil)
+    text = page.read_text(encoding="utf-8")
+    assert "<script>" not in text
+    assert "<b>" not in text
+    assert text.count("&lt;script&gt;alert(1)&lt;/script&gt;") == 5
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+
+def write_json(path: Path, value: Any) -> str:
+    path.write_text(json.dumps(value))
+    return str(path)
+
+
+def test_a_query_needs_no_model_points_but_semantic_ids(case: Case, tmp_path: Path) -> None:
+    data = json.loads((case.folder / "seen.json").read_text())
+    for keypoint in data["keypoints"]:
+        del keypoint["xyz"]
+    data["image"] = None if "image" not in data else str(case.folder / "photo.png")
+    query = read_query(Path(write_json(tmp_path / "bare.json", data)))
+    np.testing.assert_array_equal(query.points_2d, case.observation.points_2d)
+    np.testing.assert_array_equal(query.semantic_ids, case.observation.semantic_ids)
+    for keypoint in data["keypoints"]:
+        del keypoint["semantic_id"]
+    with pytest.raises(
+        DataError, match=r"bare\.json: the keypoints have no semantic_id; give each"
+    ):
+        read_query(Path(write_json(tmp_path / "bare.json", data)))
+
+
+def test_malformed_queries_are_refused(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    library = case.arguments[1:]
+    path = tmp_path / "query.json"
+
+    def refused(value: Any) -> str:
+        text = refusal(capsys, "retrieve", write_json(path, value), *library)
+        assert text.startswith(f"{path}: ")
+        return text.removeprefix(f"{path}: ")
+
+    camera = CAMERA.to_dict()
+    assert refused([]) == "expected an object, got list"
+    assert refused({"camera": camera}) == "keypoints: missing"
+    keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
+    assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})
+    assert "keypoints[0]" in refused({"camera": camera, "keypoints": [3]})
+    assert "'uvw'" in refused({"camera": camera, "keypoints": [{**keypoint, "uvw": 1}]})
+    path.write_text("{")
+    assert "not valid JSON" in refusal(capsys, "retrieve", str(path), *library)
+    missing = refusal(capsys, "retrieve", str(tmp_path / "no.json"), *library)
+    assert missing == f"{tmp_path / 'no.json'}: no such file"
+
+
+def test_what_the_library_refuses_is_one_line(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = case.arguments[0]
+    nowhere = refusal(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
+    assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it again, with")
+    unknown = refusal(capsys, "retrieve", *case.arguments, "--category", "chiar")
+    assert "did you mean 'chair'" in unknown
+    masked = refusal(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
+    assert masked == f"{tmp_path / 'no.png'}: no such file"
+    path = tmp_path / "blind.json"
+    replace(case.observation, image=None).save(path)
+    blind = refusal(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
+    assert blind.startswith("--silhouette: the observation names no image; give its image, or")
+    assert "no such folder" in refusal(capsys, "library", "build", str(tmp_path / "none"))
+    (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
+    assert "not a library file" in refusal(capsys, "library", "show", str(tmp_path / "lib"))

@@ -22,6 +22,7 @@ from cadalign.datasets.sfm.colmap_text import read_cameras_text, read_images_tex
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
 
 _STEMS = ("cameras", "images", "points3D")
 # COLMAP itself prefers the binary files where both are there.
@@ -120,41 +121,6 @@ class Colmap(CorrespondenceSet):
             raise DataError(
                 error.what, where=f"{self._camera_file}, camera {camera_id}", fix=error.fix
             ) from None
-
-
-def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
-    """The rotation matrix of a quaternion.
-
-    Parameters
-    ----------
-    quat_wxyz : (4,) float
-        Scalar first, of any length but 0.
-
-    Returns
-    -------
-    (3, 3) float
-
-    Raises
-    ------
-    InputError
-        If it is zero or not finite.
-
-    Examples
-    --------
-    >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    length = np.linalg.norm(quat_wxyz)
-    if not (np.isfinite(length) and length > 0):
-        raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
-    w, x, y, z = quat_wxyz / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _find_model(root: Path) -> tuple[Path, str]:

@@ -27,6 +27,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
 
 _OPEN3D_VIEW = "PinholeCameraParameters"
 _OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
@@ -150,7 +151,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     for number, view in enumerate(views, start=1):
         camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
         pose = _rigid(view, number - 1)
-        values = [*_quat_wxyz(pose.rotation), *pose.translation]
+        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
         text = " ".join(f"{value:.17g}" for value in values)
         images.append(f"{number} {text} {camera_id} {view.name}\n\n")
     cameras = []
@@ -296,14 +297,6 @@ def _read_colmap(folder: Path) -> list[CameraView]:
     model = Colmap(folder)
     images = (model[name] for name in model.ids)
     return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]
-
-
-def _quat_wxyz(rotation: FloatArray) -> FloatArray:
-    """The quaternion of a rotation matrix, scalar first and not negative."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])
 
 
 # All of them

@@ -13,10 +13,10 @@ from cadalign import Alignment, Camera, fit
 from cadalign.annotate.advice import Advice, best_next, unknown_name, updated_variances
 from cadalign.annotate.alignment import Lens, LiveAlignment, align
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.prediction import projection_jacobian
 from cadalign.annotate.words import advice_text, facts_of, notes_of
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.fitting.prediction import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
 UNKNOWN = FocalChoice(known=False)

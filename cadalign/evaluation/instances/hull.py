@@ -110,7 +110,7 @@ def sample_hull_view(
             translation = center - rotation @ middle
             visible = hull.visible_from(-rotation.T @ translation)
             if visible.sum() >= min_visible:
-                return Alignment.from_solver(rotation, translation, np.ones(3)), visible
+                return Alignment(rotation, translation, np.ones(3), is_valid=True), visible
             best = max(best, int(visible.sum()))
     found = f"the best of {_ATTEMPTS} views shows {best}" if best else f"there are only {count}"
     raise DegenerateError(

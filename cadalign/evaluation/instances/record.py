@@ -38,7 +38,7 @@ from cadalign.evaluation.accuracy.outcome import OK, Outcome
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.fitting.result import Alternative, FitResult
-from cadalign.fitting.uncertainty import Deviation
+from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.files import dense_json
 
@@ -64,7 +64,7 @@ class Estimate:
     alignment : Alignment
     sigma : float, optional
         Standard deviation of the keypoints that was reckoned with [px].
-    std : Deviation, optional
+    std : Uncertainty, optional
         Predicted standard deviations; None for methods that have none.
     warnings : tuple of str
         What the keypoints do not determine.
@@ -74,7 +74,7 @@ class Estimate:
 
     alignment: Alignment
     sigma: float | None = None
-    std: Deviation | None = None
+    std: Uncertainty | None = None
     warnings: tuple[str, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
 

@@ -22,6 +22,7 @@ from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import AbortError, Columns, Result, Row, reason_of
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.projection import perspective
 
 if TYPE_CHECKING:
     from cadalign.render import Scene
@@ -285,7 +286,7 @@ class _Instances:
 def _projected(instance: Instance, estimate: Alignment) -> FloatArray:
     """Where an estimate puts the keypoints [px]; also behind the camera, for the limit's sake."""
     points = (instance.points_3d @ estimate.linear.T) + estimate.translation
-    return instance.camera.pixels_from_normalized(points[:, :2] / points[:, 2:])
+    return instance.camera.pixels_from_normalized(perspective(points))
 
 
 def _known(instance: Instance) -> dict[str, Any]:

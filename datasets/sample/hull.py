@@ -75,19 +75,18 @@ class Hull:
         """The part under water, a stripe at the water line, the side, and the deck."""
         water = self.water_share
         band = water + 0.12 * (1 - water)
-        inset = 0.012
-        edge = self._outline(1.0)
-        inner = self._outline(1.0, inset=inset)
+        below, line, above = (
+            [self._outline(share) for share in np.linspace(low, high, count)]
+            for low, high, count in ((0.0, water, 6), (water, band, 2), (band, 1.0, 5))
+        )
+        inner = self._outline(1.0, inset=0.012)
         lowered = inner - (0, self.bulwark, 0)
         return [
-            loft(self._levels(np.linspace(0.0, water, 6)), bottom),
-            loft(self._levels(np.array([water, band])), stripe),
-            loft(np.array([*self._levels(np.linspace(band, 1.0, 5)), edge, inner, lowered]), side),
-            loft(np.array([lowered - (0, 0.004, 0), lowered - (0, -0.002, 0)]), deck),
+            loft(below, bottom),
+            loft(line, stripe),
+            loft([*above, inner, lowered], side),
+            loft([lowered - (0, 0.004, 0), lowered + (0, 0.002, 0)], deck),
         ]
-
-    def _levels(self, shares: FloatArray) -> FloatArray:
-        return np.array([self._outline(share) for share in shares])
 
     def _outline(self, share: float, *, inset: float = 0.0) -> FloatArray:
         """A closed line around the hull, from the middle of the stern over the right side."""

@@ -118,10 +118,10 @@ def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) ->
     a, b, c = scaled[faces].transpose(1, 0, 2)
     faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]  # rounding flattens some
     mesh = Mesh(scaled, faces, vertex_colors=colors, source=f"{category} {model_id}")
-    keypoints = tuple(
-        _on_surface(mesh, semantic_id, (np.array(place) - center) / diagonal + offset)
-        for semantic_id, place in sorted(draft.places.items())
-    )
+    places = {
+        k: (np.array(place) - center) / diagonal + offset for k, place in draft.places.items()
+    }
+    keypoints = _on_surface(mesh, places)
     symmetries = draft.mirrored, draft.turned, draft.round
     return SampleModel(category, model_id, mesh, keypoints, *symmetries)
 
@@ -176,14 +176,22 @@ def split_creases(
     return positions, label.reshape(faces.shape).astype(np.int64)
 
 
-def _on_surface(mesh: Mesh, semantic_id: int, place: FloatArray) -> SampleKeypoint:
-    """The keypoint at the surface's nearest point to a place (3,)."""
-    weights = closest_barycentric(mesh.triangles, place)
-    nearest = np.einsum("mc,mcd->md", weights, mesh.triangles)
-    face = int(np.argmin(np.linalg.norm(nearest - place, axis=1)))
-    xyz = weights[face] @ mesh.triangles[face]
-    vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
-    return SampleKeypoint(semantic_id, xyz, face, weights[face], vertex)
+def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKeypoint, ...]:
+    """Keypoints at the surface's nearest points to places (3,)."""
+    triangles = mesh.triangles
+    centroid = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
+    keypoints = []
+    for semantic_id, place in sorted(places.items()):
+        distance = np.linalg.norm(centroid - place, axis=1)
+        near = np.flatnonzero(distance - radius <= distance.min())
+        weights = closest_barycentric(triangles[near], place)
+        points = np.einsum("mc,mcd->md", weights, triangles[near])
+        best = int(np.argmin(np.linalg.norm(points - place, axis=1)))
+        xyz, face = points[best], int(near[best])
+        vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
+        keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights[best], vertex))
+    return tuple(keypoints)
 
 
 def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:

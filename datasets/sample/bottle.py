@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.model import Draft
@@ -80,17 +81,18 @@ class _Bottle:
     label: Color
     stripe: Color
 
-    def exponent(self, height: FloatArray) -> FloatArray:
+    def exponent(self, height: npt.ArrayLike) -> FloatArray:
         """The superellipse's exponent at heights: the body's below, round at the neck."""
         return 2.0 + (self.kind.exponent - 2.0) * self._below_neck(height) ** 0.7
 
-    def depth(self, height: FloatArray) -> FloatArray:
+    def depth(self, height: npt.ArrayLike) -> FloatArray:
         """The extent along z relative to x at heights."""
         return 1.0 + (self.kind.depth - 1.0) * self._below_neck(height)
 
-    def _below_neck(self, height: FloatArray) -> FloatArray:
+    def _below_neck(self, height: npt.ArrayLike) -> FloatArray:
         kind = self.kind
-        return np.clip((kind.neck - height) / (kind.neck - kind.shoulder), 0, 1)
+        share = (kind.neck - np.asarray(height)) / (kind.neck - kind.shoulder)
+        return np.asarray(np.clip(share, 0, 1))
 
     def turned(self, profile: FloatArray, color: Color) -> Solid:
         """A profile turned around the bottle's axis, as round as the bottle is at each height."""

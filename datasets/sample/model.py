@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -170,7 +171,8 @@ def split_creases(
     # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
     corner = (faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)
     joined = (3 * beside[:, :, None] + corner).transpose(0, 2, 1).reshape(-1, 2)
-    label = trimesh.graph.connected_component_labels(joined, node_count=faces.size)
+    graph: Any = trimesh.graph
+    label = graph.connected_component_labels(joined, node_count=faces.size)
     positions = np.empty((label.max() + 1, 3))
     positions[label] = vertices[faces].reshape(-1, 3)
     return positions, label.reshape(faces.shape).astype(np.int64)
@@ -206,7 +208,7 @@ def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
     [[0.0, 1.0, 0.0]]
     """
     points = np.broadcast_to(point, (len(triangles), 3))
-    nearest = trimesh.triangles.closest_point(triangles, points)
-    weights = trimesh.triangles.points_to_barycentric(triangles, nearest, method="cross")
-    weights = np.maximum(weights, 0)
+    surface: Any = trimesh.triangles
+    nearest = surface.closest_point(triangles, points)
+    weights = np.maximum(surface.points_to_barycentric(triangles, nearest, method="cross"), 0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))

@@ -277,7 +277,7 @@ def rod(
     """A round bar between two points, tapered where ``end_radius`` differs."""
     taper = 1.0 if end_radius is None else end_radius / radius
     outline = ellipse(2 * radius, 2 * radius, count=sides)
-    return sweep([start, end], outline, color, scales=[1.0, taper])
+    return sweep(np.array([start, end], dtype=float), outline, color, scales=[1.0, taper])
 
 
 def beam(
@@ -292,7 +292,9 @@ def beam(
 ) -> Solid:
     """A bar of rectangular section between two points; ``size`` is along and across ``side``."""
     outline = rounded_rectangle(*size, radius=0.18 * min(size) * bevel, steps=int(bevel))
-    return sweep([start, end], outline, color, scales=[1.0, taper], side=side)
+    return sweep(
+        np.array([start, end], dtype=float), outline, color, scales=[1.0, taper], side=side
+    )
 
 
 def lathe(

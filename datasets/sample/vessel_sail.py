@@ -99,11 +99,11 @@ def _rig(p: VesselShape, z: float, foot: float, top: float, *, boom: float) -> l
     ]
     for start, end in bands:
         steps = np.linspace(start, end, 6)
-        edges = (
+        left, right = (
             np.stack([np.interp(steps, shares, values) for values in edge.T], axis=1)
             for edge in (luff, leech)
         )
-        solids.append(_flat(*edges, p.accent if striped else _SEAM, 0.008))
+        solids.append(_flat(left, right, p.accent if striped else _SEAM, 0.008))
     return solids
 
 

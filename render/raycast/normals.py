@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.render.raycast.coincident import number_rows
+from cadalign.geometry.edges import number_rows
 
 # A point at which more triangles meet than this is left faceted: pairs grow with the square.
 _MAX_VALENCE = 1024

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import FloatArray
+from cadalign.geometry.conventions import rescaled_pixels
 from cadalign.render.drawing.color import ByteImage
 
 Color = tuple[int, int, int]
@@ -65,7 +66,7 @@ class Canvas:
 
     def place(self, points: FloatArray) -> FloatArray:
         """Take pixels (n, 2) of the image to those of the canvas."""
-        return np.asarray((points + 0.5) * self._zoom - 0.5)
+        return rescaled_pixels(points, self._zoom)
 
     def finished(self) -> ByteImage:
         """The drawn image at its own size; where nothing was drawn it is what it was."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.pictures import (
     depth_picture,
@@ -200,16 +201,7 @@ def turntable(
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
     """Feature lines drawn at twice the size and shrunk."""
-    doubled = replace(
-        camera,
-        width=2 * camera.width,
-        height=2 * camera.height,
-        fx=2 * camera.fx,
-        fy=2 * camera.fy,
-        # Pixel borders, not centres, are what doubling keeps in place.
-        cx=2 * camera.cx + 0.5,
-        cy=2 * camera.cy + 0.5,
-    )
+    doubled = resized_camera(camera, 2 * camera.width, 2 * camera.height)
     lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
     # Two pixels wide there is one pixel wide here.
     lines[:, :, 3] = cv2.dilate(lines[:, :, 3], np.ones((2, 2), np.uint8))

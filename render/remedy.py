@@ -1,4 +1,4 @@
-"""What to do about a renderer that does not work: the exact command."""
+"""The exact command that would enable a renderer that does not work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `cadalign render` does: from words to pictures."""
+"""Work of `cadalign render`: arguments checked, files read, pictures drawn and written."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from cadalign.datasets.models.annotations import parse_entry, read_entries
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.drawing.movie import contact_sheet, write_movie
 from cadalign.render.drawing.stills import (
     VIEWS,
     Angles,
     draw_still,
-    on_background,
     pose_in_view,
     turntable,
     with_keypoints,
@@ -105,7 +104,7 @@ class RenderJob:
             raise InputError(f"{scale} is not positive", where="--scale")
         chosen = tuple(view for word in views for view in _views(word, factors))
         if not chosen:
-            raise InputError("there is none", where="--view")
+            raise InputError("no view is given", where="--view", fix="give one or more")
         if color is None and (movie or len(chosen) > 1 or keypoints is not None):
             raise InputError(
                 "only a still without keypoints can be transparent", where="--background"
@@ -125,8 +124,13 @@ class RenderJob:
         )
 
     @property
+    def drawn_by(self) -> str:
+        """Name of the renderer that really draws the model."""
+        return self.renderer.drawn_by(self.scene, samples=self.samples)
+
+    @property
     def is_movie(self) -> bool:
-        """Whether a turntable is asked for."""
+        """True for a turntable, False for a still."""
         return self.out.suffix.lower() == ".mp4"
 
     def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
@@ -136,7 +140,7 @@ class RenderJob:
         )
         if self.background is None:
             return color
-        image = on_background(color, self.background)
+        image = composite(color, self.background)
         if self.keypoints is not None:
             image = with_keypoints(image, self.scene, camera, pose, self.keypoints)
         return image

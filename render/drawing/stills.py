@@ -21,10 +21,10 @@ from cadalign.render.drawing.pictures import (
     line_picture,
     normal_picture,
 )
-from cadalign.render.frame import Frame, Renderer
+from cadalign.render.frame import Renderer
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.scene import Scene
-from cadalign.render.views.views import frame_object, look_at
+from cadalign.render.views.viewpoints import frame_object, look_at
 from cadalign.render.views.visibility import visible_keypoints
 
 VIEWS: dict[str, tuple[float, float]] = {
@@ -133,18 +133,6 @@ def draw_still(
             f"unknown style {style!r}", where="style", fix=f"known are {', '.join(STYLES)}"
         )
     return pictures[style](cast_geometry(scene, camera, cam_from_model))
-
-
-def on_background(color: ByteImage, background: tuple[int, int, int] | ByteImage) -> ByteImage:
-    """Put a picture with opacity (h, w, 4) on a colour or an image; (h, w, 3) uint8."""
-    empty = np.zeros(color.shape[:2])
-    frame = Frame(
-        depth=empty,
-        face_id=np.full(empty.shape, -1, dtype=np.int32),
-        normal=np.zeros((*empty.shape, 3), dtype=np.float32),
-        color=color,
-    )
-    return frame.composite(background)
 
 
 def with_keypoints(

@@ -55,12 +55,7 @@ class GlContext:
                 self._renderer.delete()
 
     def check_process(self) -> None:
-        """Refuse a process that was forked from the one that made the context.
-
-        Raises
-        ------
-        RenderError
-        """
+        """Refuse a process that was forked from the one that made the context."""
         if os.getpid() != self._process:
             raise RenderError(
                 "this process was forked from one that draws with OpenGL",
@@ -91,7 +86,7 @@ class GlContext:
         return np.asarray(color, dtype=np.uint8)
 
     def description(self) -> str:
-        """What draws: the graphics card's or the software's name."""
+        """Name of the graphics card, or of the software that imitates one."""
         from OpenGL import GL
 
         platform = self._renderer._platform

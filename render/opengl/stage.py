@@ -33,7 +33,7 @@ class WindowCamera(pyrender.Camera):  # type: ignore[misc]
         self.projection: FloatArray = np.eye(4)
 
     def get_projection_matrix(self, width: object = None, height: object = None) -> FloatArray:
-        """What pyrender asks for."""
+        """The projection matrix, in pyrender's terms."""
         return self.projection
 
 

@@ -35,7 +35,7 @@ class RayEngine(Protocol):
     def blocked(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Whether anything is hit before ``origin + reach * direction``, (n,) bool."""
+        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
 
 
 EngineMaker = Callable[[SingleArray, FaceArray], RayEngine]
@@ -167,7 +167,7 @@ class RayCaster:
         )
 
     def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
-        """Where the rays cross the planes of their triangles, (n,) float."""
+        """Ray parameters at the planes of their triangles, (n,) float."""
         distance = np.full(len(face), np.inf)
         hit = np.flatnonzero(face >= 0)
         found, along = face[hit], directions[hit]

@@ -64,7 +64,7 @@ def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> Flo
 
 
 def _runs(values: IntArray) -> tuple[IntArray, IntArray]:
-    """Where runs of equal values start in a sorted array, and how long they are."""
+    """Starts and lengths of the runs of equal values in a sorted array."""
     start = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
     return start, np.diff(np.concatenate([start, [len(values)]]))
 

@@ -1,4 +1,4 @@
-"""What colour a mesh has at a point of its surface: materials, vertex colours, textures."""
+"""Colours of a mesh at points of its surface: materials, vertex colours, textures."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ class Surface:
 
     @property
     def varies(self) -> bool:
-        """Whether the colour changes within a face, so that a lookup needs weights."""
+        """The colour changes within a face, so that a lookup needs weights."""
         return self._corner_color is not None or bool(self._textures)
 
     @property
     def opaque(self) -> bool:
-        """Whether nothing can be seen through the surface."""
+        """Nothing can be seen through the surface."""
         color = self._face_color if self._corner_color is None else self._corner_color
         return bool((color[..., 3] >= 1).all()) and all(
             bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()

@@ -50,8 +50,7 @@ def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
         box.export(path)
         out = tmp_path / f"box{opacity}.png"
         assert _run(path, "--out", out, "--size", "64x48", renderer="pyrender") == 0
-        said = "".join(capsys.readouterr().out.split())  # lines are wrapped
-        names[opacity] = said.split("drawnby")[1].strip(")")
+        names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
     assert names == {255: "pyrender", 90: "raycast"}
 
 

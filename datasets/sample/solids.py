@@ -24,20 +24,10 @@ _TINY_AREA = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A closed surface of one colour.
+    """A closed surface of one colour."""
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions, all different.
-    faces : (m, 3) int
-        Triangles, counter-clockwise as seen from outside.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
+    vertices: FloatArray  # (n, 3), all different
+    faces: IntArray  # (m, 3), counter-clockwise as seen from outside
     color: Color
 
     @classmethod
@@ -138,7 +128,6 @@ def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
         spine in the middle of them, so outlines should be symmetric in that order. An outline may
         shrink to a line or a point.
     color : tuple of 3 int
-        Red, green and blue, 0 to 255.
     """
     rings = np.asarray(outlines, dtype=float)
     # An end is one more outline that has collapsed onto its spine.
@@ -184,20 +173,9 @@ def rounded_box(
     corner_radius: float | None = None,
     steps: int = 2,
 ) -> Solid:
-    """An upright box with rounded edges.
+    """An upright box with rounded edges; ``steps`` flat pieces make a quarter circle.
 
-    Parameters
-    ----------
-    center, size : (3,) float
-        Centre and full side lengths.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    radius : float
-        Radius of the horizontal edges.
-    corner_radius : float, optional
-        Radius of the vertical edges; by default the same.
-    steps : int
-        Flat pieces of a quarter circle.
+    ``radius`` is that of the horizontal edges, ``corner_radius`` that of the vertical ones.
     """
     width, height, depth = np.asarray(size, dtype=float)
     radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
@@ -235,21 +213,10 @@ def sweep(
     scales: npt.ArrayLike = 1.0,
     side: npt.ArrayLike | None = None,
 ) -> Solid:
-    """Move an outline along a path.
+    """Move an outline (n, 2) along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
 
-    Parameters
-    ----------
-    path : (k, 3) float
-        Points of the path.
-    section : (n, 2) float
-        The outline across the path: its first coordinate along ``side``, its second across.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    scales : (k,) or (k, 2) float
-        Factor of the outline at each point.
-    side : (3,) float, optional
-        Direction of the outline's first coordinate, made perpendicular to the path; by default x,
-        or z where the path runs along x.
+    The outline's first coordinate is along ``side``, made perpendicular to the path: by default
+    along x, or z where the path runs along x.
     """
     points = np.asarray(path, dtype=float)
     tangent = _normalized(np.gradient(points, axis=0))
@@ -306,22 +273,10 @@ def lathe(
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
 ) -> Solid:
-    """Turn a profile around a vertical axis.
+    """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
 
-    Parameters
-    ----------
-    profile : (k, 2) float
-        Radius and height.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    center : (3,) float
-        The axis's origin.
-    count : int
-        Points around the axis, a multiple of 4.
-    depth : float or (k,) float
-        Extent along z relative to x.
-    exponent : float or (k,) float
-        2 for circles, more for rounded squares; see `ellipse`.
+    ``depth``, one or (k,), is the extent along z relative to x; ``exponent`` is 2 for circles, more
+    for rounded squares (see `ellipse`).
     """
     points = np.asarray(profile, dtype=float)
     shape = np.broadcast_arrays(points[:, 0], points[:, 1], depth, exponent)

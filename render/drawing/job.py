@@ -15,6 +15,7 @@ from cadalign.datasets.models.annotations import parse_entry, read_entries
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import write_whole
 from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.drawing.movie import contact_sheet, write_movie
 from cadalign.render.drawing.stills import (
@@ -36,31 +37,17 @@ _MAX_FRAMES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """Everything that a picture needs, checked.
-
-    Parameters
-    ----------
-    scene : Scene
-    renderer : Renderer
-    views : tuple of (str, Angles or (Camera, Alignment))
-        Labels, and angles or whole cameras.
-    camera : Camera
-    out : Path
-    style : str
-    background : tuple of 3 int, optional
-        None is transparent.
-    keypoints : (k, 3) float, optional
-    scale : (3,) float
-    samples : int
-    """
+    """Everything that a picture needs, checked."""
 
     scene: Scene
     renderer: Renderer
     views: tuple[tuple[str, Angles | tuple[Camera, Alignment]], ...]
+    """Labels, and angles or whole cameras."""
     camera: Camera
     out: Path
     style: str
     background: tuple[int, int, int] | None
+    """None is transparent."""
     keypoints: FloatArray | None
     scale: FloatArray
     samples: int
@@ -81,13 +68,7 @@ class RenderJob:
         samples: int,
         renderer: str,
     ) -> RenderJob:
-        """Check the words of the command line and read the files that they name.
-
-        Raises
-        ------
-        InputError, DataError, RenderError
-            If a word, a file or the renderer won't do.
-        """
+        """Check the arguments of the command line and read the files that they name."""
         width, height = parse_size(size)
         camera = Camera.from_fov(width, height, fov_x=fov)
         check_image_size(camera)
@@ -146,17 +127,8 @@ class RenderJob:
         return image
 
     def write_picture(self, image: ByteImage) -> None:
-        """Write a PNG file.
-
-        Raises
-        ------
-        DataError
-            If that is not possible.
-        """
-        try:
-            Image.fromarray(image).save(self.out, format="PNG")
-        except OSError as error:
-            raise DataError(f"cannot be written ({error})", where=str(self.out)) from None
+        """Write a PNG file, whole or not at all."""
+        write_whole(self.out, lambda path: Image.fromarray(image).save(path, format="PNG"))
 
     def write_movie(self, frames: Iterable[ByteImage], *, fps: float) -> None:
         """Write an MP4 file; see `write_movie`."""

@@ -28,10 +28,6 @@ _MODULES = {"pyrender": ("pyrender", "pyrender2"), "open3d": ("open3d", "'cadali
 def remedy(probe: Probe) -> str:
     """The command that would enable a renderer; empty where it works or none is known.
 
-    Parameters
-    ----------
-    probe : Probe
-
     Examples
     --------
     >>> remedy(Probe("raycast", True, "processor", ""))

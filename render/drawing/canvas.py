@@ -25,15 +25,7 @@ _SMALL_SIDE = 1000
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """A line of the legend.
-
-    Parameters
-    ----------
-    text : str
-    color : tuple of 3 int
-    marker : str
-        "line", "ring" or "cross".
-    """
+    """A line of the legend; its marker is a "line", "ring" or "cross"."""
 
     text: str
     color: Color
@@ -43,12 +35,7 @@ class LegendEntry:
 class Canvas:
     """An image that is drawn on, a small one at twice its size, for finer lines.
 
-    All methods take pixels of the canvas, which `place` makes of the image's.
-
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-        Copied, not changed.
+    The image (h, w, 3) uint8 is copied. All methods take pixels of the canvas: see `place`.
 
     Attributes
     ----------

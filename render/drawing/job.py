@@ -131,7 +131,7 @@ class RenderJob:
         write_whole(self.out, lambda path: Image.fromarray(image).save(path, format="PNG"))
 
     def write_movie(self, frames: Iterable[ByteImage], *, fps: float) -> None:
-        """Write an MP4 file; see `write_movie`."""
+        """Write an MP4 file, whole or not at all."""
         write_movie(self.out, frames, fps=fps)
 
 
@@ -152,13 +152,7 @@ def draw_picture(job: RenderJob) -> ByteImage:
 
 
 def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[ByteImage], int]:
-    """Draw a turntable that starts in the first view: its frames, and how many there are.
-
-    Raises
-    ------
-    InputError
-        If there would be no frames or more than 10,000, or the first view is a camera file.
-    """
+    """Draw a turntable that starts in the first view: its frames, and their number."""
     frames = seconds * fps
     if not 1 <= frames <= _MAX_FRAMES:
         raise InputError(
@@ -176,11 +170,6 @@ def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[
 def parse_size(text: str) -> tuple[int, int]:
     """Read an image size ``WIDTHxHEIGHT``.
 
-    Raises
-    ------
-    InputError
-        If it is not one.
-
     Examples
     --------
     >>> parse_size("640x480")
@@ -196,11 +185,6 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def parse_background(text: str) -> tuple[int, int, int] | None:
     """Read a colour's name or ``#rrggbb``; None for ``transparent``.
-
-    Raises
-    ------
-    InputError
-        If it is none of these.
 
     Examples
     --------

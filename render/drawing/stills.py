@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ _FILL = 0.88
 
 @dataclass(frozen=True)
 class Angles:
-    """From where a model is looked at; see `look_at`.
+    """Viewing angles of a model; see `look_at`.
 
     Parameters
     ----------
@@ -95,13 +95,7 @@ def pose_in_view(
     InputError
         If an angle or a scale is out of its range.
     """
-    rotation = look_at(
-        azimuth=angles.azimuth,
-        elevation=angles.elevation,
-        roll=angles.roll,
-        distance=1.0,
-        scale=scale,
-    ).rotation
+    rotation = look_at(**asdict(angles), distance=1.0, scale=scale).rotation
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
 
 
@@ -164,7 +158,7 @@ def turntable(
     angles : Angles
         Of the first pose.
     count : int
-        How many.
+        Number of poses.
     scale : (3,) float
     """
     low, high = scene.bounds
@@ -177,12 +171,8 @@ def turntable(
     placed = frame_object(np.array([-wide, wide]), camera, rotation=first, fill=_FILL)
     depth = placed.translation
     for number in range(count):
-        rotation = look_at(
-            azimuth=angles.azimuth + 360.0 * number / count,
-            elevation=angles.elevation,
-            roll=angles.roll,
-            distance=1.0,
-        ).rotation
+        turned = replace(angles, azimuth=angles.azimuth + 360.0 * number / count)
+        rotation = look_at(**asdict(turned), distance=1.0).rotation
         center = rotation @ (middle * around.scale)
         yield Alignment(rotation, depth - center, around.scale)
 

@@ -64,13 +64,7 @@ class GlContext:
             )
 
     def draw(self, scene: Any, *, width: int, height: int) -> ByteImage:
-        """Draw a `pyrender.Scene`; (height, width, 4) uint8, red, green and blue premultiplied.
-
-        Raises
-        ------
-        RenderError
-            If OpenGL reports an error, or in a forked process.
-        """
+        """Draw a `pyrender.Scene`; (height, width, 4) uint8, red, green and blue premultiplied."""
         self.check_process()
         with self._lock:
             self._renderer.viewport_width = width
@@ -99,13 +93,7 @@ class GlContext:
 
 @cache
 def shared_context() -> GlContext:
-    """The process's context, made on the first call.
-
-    Raises
-    ------
-    RenderError
-        If OpenGL does not start.
-    """
+    """The process's context, made on the first call; a `RenderError` if OpenGL does not start."""
     return GlContext()
 
 

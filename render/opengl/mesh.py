@@ -26,14 +26,6 @@ def gl_meshes(scene: Scene) -> tuple[Any, Any]:
     it is and in the other turned round with its normals, and OpenGL culls what is turned away: the
     two sides look alike, as with ray casting. Of triangles that coincide, the one wound towards
     the viewer is kept.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    front, back : pyrender.Mesh
     """
     alike, opposite = scene.coincident_faces
     own = np.arange(len(alike))

@@ -38,16 +38,9 @@ class WindowCamera(pyrender.Camera):  # type: ignore[misc]
 
 
 class GlStage:
-    """Lights and camera that stand still, and a mesh that stays loaded between frames.
+    """A `pyrender.Scene`: lights and camera that stand still, a mesh that stays loaded.
 
-    Parameters
-    ----------
-    studio : Studio
-        OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
-
-    Attributes
-    ----------
-    scene : pyrender.Scene
+    OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
     """
 
     def __init__(self, studio: Studio) -> None:

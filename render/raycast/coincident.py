@@ -14,11 +14,6 @@ def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, I
     Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
     front and of its back. The one to show is wound towards the viewer.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-    faces : (m, 3) int
-
     Returns
     -------
     alike, opposite : (m,) int

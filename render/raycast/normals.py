@@ -19,16 +19,8 @@ def corner_normals(
 
     Faces meet where their vertices have the same position, whether they share the vertex or not.
     Those that are turned the other way count with their normal reversed, since the faces of many
-    CAD models are turned at random. Each counts by its angle at the corner.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float
-    faces : (m, 3) int
-    face_normals : (m, 3) float
-        Unit normals.
-    crease_angle : float
-        Faces at a larger angle than this [degrees] meet in an edge.
+    CAD models are turned at random. Each counts by its angle at the corner. Faces at a larger angle
+    than ``crease_angle`` [degrees] meet in an edge.
 
     Returns
     -------

@@ -35,7 +35,7 @@ class Rectangle:
 
     @property
     def width(self) -> int:
-        """Columns [px]."""
+        """Number of columns."""
         return self.right - self.left
 
     @property

@@ -15,10 +15,6 @@ class Surface:
 
     Vertex colours, where there are any, take the place of the materials' plain colour; a texture
     multiplies with it. Textures repeat outside [0, 1]; their v runs up from the bottom row.
-
-    Parameters
-    ----------
-    mesh : Mesh
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -54,19 +50,9 @@ class Surface:
         )
 
     def color(self, face: FaceArray, weights: LinearArray | None) -> LinearArray:
-        """Look up the colour at points of the surface.
+        """Look up linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
 
-        Parameters
-        ----------
-        face : (n,) int
-            Triangle numbers.
-        weights : (n, 3) float, optional
-            Barycentric coordinates; needed where `varies`.
-
-        Returns
-        -------
-        (n, 4) float32
-            Linear red, green, blue, and opacity; not premultiplied.
+        Their barycentric coordinates ``weights`` (n, 3) are needed where the colour `varies`.
         """
         if weights is None or not self.varies:
             return np.asarray(self._face_color[face])

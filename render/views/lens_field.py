@@ -16,17 +16,8 @@ def within_lens_field(camera: Camera, normalized: FloatArray) -> npt.NDArray[np.
 
     A distortion polynomial turns back at some radius and from there on folds far-off directions
     into the image. Points beyond are not seen by the camera, wherever the model puts them.
-
-    Parameters
-    ----------
-    camera : Camera
-    normalized : (n, 2) float
-        Normalised image coordinates, undistorted.
-
-    Returns
-    -------
-    (n,) bool
-        The distorted radius grows all the way from the centre to the point.
+    For undistorted normalised coordinates (n, 2), tell if the distorted radius grows all the way
+    from the centre to the point, (n,) bool.
     """
     if not camera.distortion:
         return np.ones(len(normalized), dtype=bool)

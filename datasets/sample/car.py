@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.sample import solids as make
 from cadalign.datasets.sample.car_parts import trim, wheels
 from cadalign.datasets.sample.car_shape import CarShape
 from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import Point, Solid, beam, both_sides, box, loft, stacked
+from cadalign.datasets.sample.solids import Point, Solid
 
 _GLASS = (30, 38, 48)
 _DARK = (34, 34, 38)
@@ -57,7 +58,7 @@ def _body(p: CarShape) -> Solid:
         feet = [(axle - reach - 0.002, p.sill), (axle + reach + 0.002, p.sill)]
         stations = [(z, y) for z, y in stations if abs(z - axle) > reach + 0.02]
         stations += [*zip(*(values.tolist() for values in arch), strict=True), *feet]
-    return loft([_section(p, z, bottom) for z, bottom in sorted(stations)], p.paint)
+    return make.loft([_section(p, z, bottom) for z, bottom in sorted(stations)], p.paint)
 
 
 def _section(p: CarShape, z: float, bottom: float) -> FloatArray:
@@ -108,7 +109,7 @@ class _GlassHouse:
         p = self.p
         y, width, front, rear = self.level(-0.25)
         sunk = (y, width - 0.14, front, rear - 0.14)
-        glass = stacked([sunk, self.level(0.0), self.level(0.92)], _GLASS, radius=0.12)
+        glass = make.stacked([sunk, self.level(0.0), self.level(0.92)], _GLASS, radius=0.12)
         y, width, front, rear = self.level(1.0)
         long = rear - front
         levels = [
@@ -118,12 +119,12 @@ class _GlassHouse:
             (y + 0.03, width - 0.3, front + 0.16 * long, rear - 0.14 * long),
             (y + 0.042, width - 0.7, front + 0.34 * long, rear - 0.3 * long),
         ]
-        solids = [glass, stacked(levels, p.paint, radius=0.12), *self._pillars()]
+        solids = [glass, make.stacked(levels, p.paint, radius=0.12), *self._pillars()]
         if p.z_panel is not None:
             levels = [self.level(share, grow=0.008, front=p.z_panel) for share in (-0.2, 0.9)]
             middle = (0, self.height(0.5), self.rear(0.5) + 0.005)
             size = (1.3 * self.half(0.5), 0.5 * (p.roof - p.belt), 0.03)
-            solids += [stacked(levels, p.paint, radius=0.1), box(middle, size, _GLASS)]
+            solids += [make.stacked(levels, p.paint, radius=0.1), make.box(middle, size, _GLASS)]
         elif p.steep:
             solids.append(self._tailgate())
         return solids
@@ -136,7 +137,7 @@ class _GlassHouse:
             levels.append(
                 (self.height(share), 2 * self.half(share) - 0.14, rear - 0.3, rear + 0.015)
             )
-        return stacked(levels, self.p.paint, radius=0.1)
+        return make.stacked(levels, self.p.paint, radius=0.1)
 
     def _pillars(self) -> list[Solid]:
         shares, inset = (-0.1, 0.92), 0.045
@@ -150,8 +151,8 @@ class _GlassHouse:
                 (self.half(share) - depth, self.height(share), z)
                 for share, z in zip(shares, ends, strict=True)
             )
-            solids.append(beam(low, high, size, self.p.paint, side=(0, 0, 1)))
-        return both_sides(*solids)
+            solids.append(make.beam(low, high, size, self.p.paint, side=(0, 0, 1)))
+        return make.both_sides(*solids)
 
 
 def _bed(p: CarShape) -> list[Solid]:
@@ -167,5 +168,5 @@ def _bed(p: CarShape) -> list[Solid]:
         ((0, y, rear - 0.04), (2 * half + 0.1, tall, 0.08)),
         ((0, y, front + 0.03), (2 * half + 0.1, tall, 0.06)),
     ]
-    floor = box((0, low + 0.055, middle), (2 * half - 0.02, 0.04, rear - front - 0.08), _DARK)
-    return [*(box(center, size, p.paint) for center, size in walls), floor]
+    floor = make.box((0, low + 0.055, middle), (2 * half - 0.02, 0.04, rear - front - 0.08), _DARK)
+    return [*(make.box(center, size, p.paint) for center, size in walls), floor]

@@ -7,21 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.sample import solids as make
 from cadalign.datasets.sample.chair_base import chair_base
 from cadalign.datasets.sample.chair_shape import ChairShape, lighter
 from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import (
-    Solid,
-    beam,
-    both_sides,
-    ellipse,
-    rod,
-    rounded_box,
-    rounded_rectangle,
-    sheet,
-    smooth_curve,
-    sweep,
-)
+from cadalign.datasets.sample.solids import Solid
 
 _SPOKE_IDS = (10, 11, 12, 13, 14)
 _DARK = (38, 38, 42)
@@ -79,16 +69,16 @@ def _seat(p: ChairShape) -> list[Solid]:
     center, size = (0, y - p.seat_thickness / 2, 0), (width, p.seat_thickness, depth)
     if p.base == "club":
         soft = (0, y + 0.03, -0.03), (width - 0.14, 0.12, depth - 0.04)
-        cushion = rounded_box(*soft, lighter(p.fabric), radius=0.045, steps=4)
-        return [rounded_box(center, size, p.fabric, radius=0.03, steps=3), cushion]
+        cushion = make.rounded_box(*soft, lighter(p.fabric), radius=0.045, steps=4)
+        return [make.rounded_box(center, size, p.fabric, radius=0.03, steps=3), cushion]
     color = p.frame if p.base in ("straight", "tapered", "turned") else p.fabric
     color = color if p.cushion else lighter(color)
     edge = 0.4 * p.seat_thickness
-    seat = rounded_box(center, size, color, radius=edge, corner_radius=0.05, steps=3)
+    seat = make.rounded_box(center, size, color, radius=edge, corner_radius=0.05, steps=3)
     if not (p.cushion or p.back == "panel"):
         return [seat]
     soft = (0, y + 0.012, -0.01), (width - 0.03, 0.045, depth - 0.05)
-    return [seat, rounded_box(*soft, p.fabric, radius=0.02, corner_radius=0.06, steps=4)]
+    return [seat, make.rounded_box(*soft, p.fabric, radius=0.02, corner_radius=0.06, steps=4)]
 
 
 def _arms(p: ChairShape) -> list[Solid]:
@@ -97,23 +87,27 @@ def _arms(p: ChairShape) -> list[Solid]:
     middle = (front + rear) / 2
     if p.base == "club":
         center, size = (x, y / 2 + 0.05, middle + 0.03), (0.13, y - 0.1, rear - front + 0.1)
-        return both_sides(rounded_box(center, size, p.fabric, radius=0.06, steps=4))
+        return make.both_sides(make.rounded_box(center, size, p.fabric, radius=0.06, steps=4))
     color = _DARK if p.base in ("swivel", "cantilever") else p.frame
     center, size = (x, y - 0.012, middle), (0.05, 0.024, rear - front)
-    pad = rounded_box(center, size, color, radius=0.01, corner_radius=0.022, steps=3)
+    pad = make.rounded_box(center, size, color, radius=0.01, corner_radius=0.022, steps=3)
     low, inner = p.seat_height - 0.6 * p.seat_thickness, p.width / 2 - 0.012
     if p.base == "swivel":
-        stem = rounded_rectangle(0.016, 0.05, radius=0.006, steps=1)
+        stem = make.rounded_rectangle(0.016, 0.05, radius=0.006, steps=1)
         knots = [(0.5 * inner, low, 0.02), (x - 0.005, low + 0.01, 0.02), (x, y - 0.02, 0.02)]
-        return both_sides(pad, sweep(smooth_curve(knots, 9), stem, p.frame, side=(0, 0, 1)))
+        return make.both_sides(
+            pad, make.sweep(make.smooth_curve(knots, 9), stem, p.frame, side=(0, 0, 1))
+        )
     if p.base == "turned":
         path = np.linspace((inner, low, front + 0.06), (x, y - 0.01, front + 0.03), 5)
-        section, joint = ellipse(0.026, 0.026, count=10), p.back_half_width(0.45)
-        post = sweep(path, section, p.frame, scales=[0.8, 1.2, 0.8, 1.15, 0.8])
-        tail = rod((x, y - 0.012, rear - 0.05), (joint, y - 0.012, rear + 0.01), 0.014, p.frame)
-        return both_sides(pad, post, tail)
+        section, joint = make.ellipse(0.026, 0.026, count=10), p.back_half_width(0.45)
+        post = make.sweep(path, section, p.frame, scales=[0.8, 1.2, 0.8, 1.15, 0.8])
+        tail = make.rod(
+            (x, y - 0.012, rear - 0.05), (joint, y - 0.012, rear + 0.01), 0.014, p.frame
+        )
+        return make.both_sides(pad, post, tail)
     foot, head = (inner, low, front + 0.04), (x, y - 0.01, front + 0.04)
-    return both_sides(pad, beam(foot, head, (0.026, 0.034), p.frame))
+    return make.both_sides(pad, make.beam(foot, head, (0.026, 0.034), p.frame))
 
 
 # Backs --------------------------------------------------------------------------------------------
@@ -124,7 +118,7 @@ def _slat_back(p: ChairShape) -> list[Solid]:
     low, high = 0.2 * p.back_height, 0.93 * p.back_height
     color = p.fabric if p.base == "cantilever" else p.frame
     slats = [
-        beam(p.bowed(s, x, low), p.bowed(s, x, high), (0.75 * x / p.bars, 0.014), color)
+        make.beam(p.bowed(s, x, low), p.bowed(s, x, high), (0.75 * x / p.bars, 0.014), color)
         for s in np.linspace(-x, x, p.bars + 2)[1:-1]
     ]
     return [*_posts(p), _rail(p, high, 0.07), _rail(p, low, 0.04), *slats]
@@ -142,64 +136,64 @@ def _post_offset(p: ChairShape) -> float:
 def _posts(p: ChairShape) -> list[Solid]:
     x = _post_offset(p)
     low, high = (x, *p.back_point(-0.03)[1:]), (x, *p.back_point(p.back_height)[1:])
-    return both_sides(beam(low, high, (0.8 * p.leg, p.leg), p.frame, taper=0.85))
+    return make.both_sides(make.beam(low, high, (0.8 * p.leg, p.leg), p.frame, taper=0.85))
 
 
 def _rail(p: ChairShape, height: float, tall: float) -> Solid:
     half = _post_offset(p)
     path = [p.bowed(x, half, height) for x in np.linspace(-half, half, 9)]
-    return sweep(path, rounded_rectangle(0.02, tall, radius=0.006, steps=1), p.frame)
+    return make.sweep(path, make.rounded_rectangle(0.02, tall, radius=0.006, steps=1), p.frame)
 
 
 def _panel_back(p: ChairShape) -> list[Solid]:
     half, tall = p.back_half_width(1.0), p.back_height
-    outline = rounded_rectangle(2 * half, 0.05, radius=0.02, steps=3)
+    outline = make.rounded_rectangle(2 * half, 0.05, radius=0.02, steps=3)
     scales = [(0.9, 0.5), (0.95, 0.8), (1, 1), (1, 1), (1, 1), (0.97, 0.85), (0.92, 0.5)]
     path = [p.back_point(share * tall) for share in (0.28, 0.3, 0.36, 0.6, 0.9, 0.97, 1.0)]
-    panel = sweep(path, outline, p.fabric, scales=scales)
+    panel = make.sweep(path, outline, p.fabric, scales=scales)
     if p.base == "swivel":
         low, high = p.back_point(0.12 * tall), p.back_point(0.55 * tall)
         knots = [
             (0, p.seat_height - 0.04, 0.05), (0, p.seat_height - 0.03, p.depth / 2 + 0.03),
             (0, low[1], low[2] + 0.045), (0, high[1], high[2] + 0.03),
         ]  # fmt: skip
-        section = rounded_rectangle(0.07, 0.02, radius=0.006, steps=1)
-        return [panel, sweep(smooth_curve(knots, 14), section, p.frame, side=(1, 0, 0))]
+        section = make.rounded_rectangle(0.07, 0.02, radius=0.006, steps=1)
+        return [panel, make.sweep(make.smooth_curve(knots, 14), section, p.frame, side=(1, 0, 0))]
     behind = np.array([p.back_point(-0.05), p.back_point(0.8 * tall)])
     low, high = behind + (half - 0.5 * p.leg, 0, 0.018)
-    return [panel, *both_sides(beam(low, high, (0.028, 0.022), p.frame))]
+    return [panel, *make.both_sides(make.beam(low, high, (0.028, 0.022), p.frame))]
 
 
 def _spindle_back(p: ChairShape) -> list[Solid]:
     half, lower = p.back_half_width(1.0), p.back_half_width(0.0)
     path = [p.bowed(x, half, p.back_height - 0.045) for x in np.linspace(-half, half, 11)]
     scales = np.stack([np.ones(11), 0.75 + 0.25 * np.sin(np.linspace(0, np.pi, 11))], axis=1)
-    crest = rounded_rectangle(0.024, 0.09, radius=0.011, steps=2)
-    solids = [sweep(path, crest, p.frame, scales=scales)]
+    crest = make.rounded_rectangle(0.024, 0.09, radius=0.011, steps=2)
+    solids = [make.sweep(path, crest, p.frame, scales=scales)]
     for share in np.linspace(-1, 1, 2 * p.bars + 1):
         low = p.bowed(share * lower, lower, -0.02)
         high = p.bowed(share * (half - 0.02), half, p.back_height - 0.06)
         thick = 0.03 if abs(share) == 1.0 else 0.019
-        outline, swelling = ellipse(thick, thick, count=8), [0.8, 1.1, 1.2, 1.0, 0.7]
-        solids.append(sweep(np.linspace(low, high, 5), outline, p.frame, scales=swelling))
+        outline, swelling = make.ellipse(thick, thick, count=8), [0.8, 1.1, 1.2, 1.0, 0.7]
+        solids.append(make.sweep(np.linspace(low, high, 5), outline, p.frame, scales=swelling))
     return solids
 
 
 def _shell(p: ChairShape) -> list[Solid]:
     """Seat and back as one curved plate."""
-    return [sheet(p.shell(), 0.014, p.fabric)]
+    return [make.sheet(p.shell(), 0.014, p.fabric)]
 
 
 def _club_back(p: ChairShape) -> list[Solid]:
     half, tall = p.back_half_width(1.0), p.back_height
     path = _rounded_end(np.array(p.back_point(-0.1)), np.array(p.back_point(tall)), 0.05)
     scales = [(1, 1), (1, 1), (1, 1), (0.985, 0.9), (0.95, 0.65), (0.92, 0.3)]
-    outline = rounded_rectangle(2 * half, 0.16, radius=0.05, steps=4)
-    back = sweep(path, outline, p.fabric, scales=scales)
+    outline = make.rounded_rectangle(2 * half, 0.16, radius=0.05, steps=4)
+    back = make.sweep(path, outline, p.fabric, scales=scales)
     _, y, z = p.back_point(0.5 * tall)
     size = (2 * half - 0.2, 0.75 * tall, 0.08)
-    pad = rounded_box((0, y + 0.02, z - 0.085), size, lighter(p.fabric), radius=0.035, steps=3)
-    return [back, pad, rod((0, y, z - 0.12), (0, y, z - 0.13), 0.012, p.frame)]
+    pad = make.rounded_box((0, y + 0.02, z - 0.085), size, lighter(p.fabric), radius=0.035, steps=3)
+    return [back, pad, make.rod((0, y, z - 0.12), (0, y, z - 0.13), 0.012, p.frame)]
 
 
 def _rounded_end(low: FloatArray, high: FloatArray, length: float) -> FloatArray:

@@ -18,27 +18,17 @@ _CREASE_DEGREES = 35.0
 
 @dataclass(frozen=True)
 class Draft:
-    """A model in its builder's units, y up and the front at -z.
-
-    Parameters
-    ----------
-    solids : tuple of Solid
-        The parts.
-    places : dict of int to (float, float, float)
-        By semantic id: each keypoint lands on the nearest point of the surface.
-    mirrored : tuple of (int, int)
-        Semantic ids that a mirror plane of the model exchanges.
-    turned : tuple of tuple of int
-        Groups of semantic ids that a rotation about y permutes.
-    round : bool
-        Any rotation about y maps the model to itself, so that each group lies on a circle.
-    """
+    """A model in its builder's units, y up and the front at -z."""
 
     solids: tuple[Solid, ...]
     places: Mapping[int, Point]
+    """By semantic id: each keypoint lands on the nearest point of the surface."""
     mirrored: tuple[tuple[int, int], ...] = ()
+    """Semantic ids that a mirror plane of the model exchanges."""
     turned: tuple[tuple[int, ...], ...] = ()
+    """Groups of semantic ids that a rotation about y permutes."""
     round: bool = False
+    """Any rotation about y maps the model to itself, so that each group lies on a circle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +92,7 @@ def mirrored_places(pairs: Mapping[tuple[int, int], Point]) -> dict[int, Point]:
 def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) -> SampleModel:
     """Join a draft's parts, scale the mesh, and set the keypoints on its surface.
 
-    Parameters
-    ----------
-    draft : Draft
-        The parts and the places of the keypoints.
-    category, model_id : str
-        The model's names.
-    offset : (3,) float
-        Centre of the bounding box [model units].
+    The centre of the bounding box comes to ``offset`` (3,).
     """
     vertices, faces, colors = _join(draft.solids)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -142,21 +125,9 @@ def _join(solids: Sequence[Solid]) -> tuple[FloatArray, IntArray, FloatArray]:
 def split_creases(
     vertices: FloatArray, faces: IntArray, *, crease: float = _CREASE_DEGREES
 ) -> tuple[FloatArray, IntArray]:
-    """Double the vertices along sharp edges, so that shading stays smooth only where the shape is.
+    """Double the vertices along edges sharper than an angle [degrees]: new vertices and faces.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions.
-    faces : (m, 3) int
-        Triangles.
-    crease : float
-        Faces that meet at a larger angle [degrees] don't share vertices.
-
-    Returns
-    -------
-    vertices : (k, 3) float
-    faces : (m, 3) int
+    Shading then stays smooth only where the shape is.
 
     Examples
     --------

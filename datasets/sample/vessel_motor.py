@@ -6,21 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cadalign.datasets.sample.solids import (
-    Color,
-    Point,
-    Solid,
-    beam,
-    both_sides,
-    box,
-    ellipse,
-    lathe,
-    rod,
-    rounded_box,
-    stacked,
-    sweep,
-    wheel,
-)
+from cadalign.datasets.sample import solids as make
+from cadalign.datasets.sample.solids import Color, Point, Solid
 from cadalign.datasets.sample.vessel_shape import (
     BLACK,
     GLASS,
@@ -65,13 +52,13 @@ def tug(p: VesselShape) -> Superstructure:
     slim, foot = (0.075 if twin else 0.12), (0.27 * house if twin else 0.0, y - 0.02, z_funnel)
     stack = funnel(foot, funnel_top - y + 0.02, slim, 1.1 * slim, p.accent)
     solids = (
-        rounded_box(main, size, WHITE, radius=0.012),
+        make.rounded_box(main, size, WHITE, radius=0.012),
         *windows(main, size, count=4, height=0.3),
         *_storey(levels, p.accent, (0.03, 0.03, 0.035), posts, (0.012, 0.008)),
-        rod((0, top - 0.02, z_mast), (0, mast_top, z_mast), 0.009, SPAR, end_radius=0.005),
-        box((0, top + 0.12, z_mast), (0.12, 0.008, 0.012), SPAR),
-        rounded_box((0, top + 0.055, z_mast - 0.02), (0.1, 0.014, 0.02), STEEL, radius=0.005),
-        *(both_sides(*stack) if twin else stack),
+        make.rod((0, top - 0.02, z_mast), (0, mast_top, z_mast), 0.009, SPAR, end_radius=0.005),
+        make.box((0, top + 0.12, z_mast), (0.12, 0.008, 0.012), SPAR),
+        make.rounded_box((0, top + 0.055, z_mast - 0.02), (0.1, 0.014, 0.02), STEEL, radius=0.005),
+        *(make.both_sides(*stack) if twin else stack),
         *_towing_gear(p),
     )
     return Superstructure(
@@ -113,11 +100,13 @@ def yacht(p: VesselShape) -> Superstructure:
     arch, summit = _radar_arch(y, wide, rear)
     platform = (1.7 * p.hull.half_width(0.5, p.hull.water_share), 0.014, 0.09)
     stern = (0.0, 0.012, p.hull.stern(0.6) + 0.02)
-    solids += [*arch, *_rails(p), rounded_box(stern, platform, _TEAK, radius=0.005)]
+    solids += [*arch, *_rails(p), make.rounded_box(stern, platform, _TEAK, radius=0.005)]
     y = 0.55 * p.hull.freeboard
     for z in np.linspace(-0.12, 0.22, 4):
         x = p.hull.half_width(z, (p.hull.draft + y) / (p.hull.draft + p.hull.freeboard))
-        solids += both_sides(rounded_box((x, y, z), (0.006, 0.016, 0.05), GLASS, radius=0.003))
+        solids += make.both_sides(
+            make.rounded_box((x, y, z), (0.006, 0.016, 0.05), GLASS, radius=0.003)
+        )
     return Superstructure(tuple(solids), corners[0], corners[1], summit)
 
 
@@ -130,11 +119,11 @@ def _storey(
 ) -> list[Solid]:
     """White wall, glass and roof, each between two levels, and white posts before the glass."""
     solids = [
-        stacked(levels[2 * k : 2 * k + 2], color, radius=radii[k])
+        make.stacked(levels[2 * k : 2 * k + 2], color, radius=radii[k])
         for k, color in enumerate((WHITE, GLASS, roof))
     ]
     for foot, head in posts:
-        solids += both_sides(beam(foot, head, size, WHITE, side=(0, 0, 1)))
+        solids += make.both_sides(make.beam(foot, head, size, WHITE, side=(0, 0, 1)))
     return solids
 
 
@@ -145,22 +134,22 @@ def _towing_gear(p: VesselShape) -> list[Solid]:
         [(0, 0), (r, 0), (r, end), (0, end)] for r, end in ((0.035, 0.12), (0.052, 0.012))
     )
     solids = [
-        wheel((-0.06, deck + 0.04, 0.24), drum, STEEL),
-        *both_sides(wheel((0.05, deck + 0.04, 0.24), cheek, p.accent)),
-        beam((0, deck - 0.01, 0.33), (0, deck + 0.06, 0.33), (0.035, 0.025), BLACK),
+        make.wheel((-0.06, deck + 0.04, 0.24), drum, STEEL),
+        *make.both_sides(make.wheel((0.05, deck + 0.04, 0.24), cheek, p.accent)),
+        make.beam((0, deck - 0.01, 0.33), (0, deck + 0.06, 0.33), (0.035, 0.025), BLACK),
     ]
     tyre = [(0.0, 0.006), (0.012, 0.0), (0.03, 0.0), (0.034, 0.01), (0.034, 0.02), (0.03, 0.028),
             (0.012, 0.028), (0.0, 0.022)]  # fmt: skip
     for z in np.linspace(-0.24, 0.36, 6):
         y = hull.edge(z) - 0.045
         x = hull.half_width(z, (hull.draft + y) / (hull.draft + hull.edge(z))) - 0.008
-        solids += both_sides(wheel((x, y, z), tyre, BLACK, count=16))
+        solids += make.both_sides(make.wheel((x, y, z), tyre, BLACK, count=16))
     stations = np.linspace(-1, 1, 15)
     z = -0.505 + 0.15 * np.abs(stations) ** 1.6
     half = np.array([hull.half_width(min(max(s, -0.5), 0.5)) for s in z])
     edge = np.array([hull.edge(s) - 0.02 for s in z])
     path = np.stack([np.sign(stations) * (half + 0.004), edge, z - 0.004], axis=1)
-    return [*solids, sweep(path, ellipse(0.036, 0.05, count=10), BLACK, side=(0, 1, 0))]
+    return [*solids, make.sweep(path, make.ellipse(0.036, 0.05, count=10), BLACK, side=(0, 1, 0))]
 
 
 def _radar_arch(y: float, wide: float, rear: float) -> tuple[list[Solid], Point]:
@@ -173,11 +162,11 @@ def _radar_arch(y: float, wide: float, rear: float) -> tuple[list[Solid], Point]
     )
     drum = [(0, 0), (0.01, 0), (0.01, 0.02), (0, 0.02)]
     solids = [
-        *both_sides(beam(foot, bend, (0.05, 0.014), WHITE, side=(0, 0, 1))),
-        box((0, top, z), (0.76 * wide, 0.014, 0.05), WHITE),
-        rounded_box((0, top + 0.022, z), (0.09, 0.012, 0.014), STEEL, radius=0.004),
-        lathe(drum, WHITE, center=(0, top, z), count=12),
-        rod((0, top, z + 0.015), tip, 0.0045, SPAR, end_radius=0.003),
+        *make.both_sides(make.beam(foot, bend, (0.05, 0.014), WHITE, side=(0, 0, 1))),
+        make.box((0, top, z), (0.76 * wide, 0.014, 0.05), WHITE),
+        make.rounded_box((0, top + 0.022, z), (0.09, 0.012, 0.014), STEEL, radius=0.004),
+        make.lathe(drum, WHITE, center=(0, top, z), count=12),
+        make.rod((0, top, z + 0.015), tip, 0.0045, SPAR, end_radius=0.003),
     ]
     return solids, tip
 
@@ -187,5 +176,5 @@ def _rails(p: VesselShape) -> list[Solid]:
     stations = np.linspace(-0.47, -0.12, 7)
     feet = np.array([(0.93 * p.hull.half_width(z), p.hull.edge(z) - 0.004, z) for z in stations])
     heads = feet + (0, 0.035, 0)
-    posts = [rod(a, b, 0.002, STEEL, sides=6) for a, b in zip(feet, heads, strict=True)]
-    return both_sides(sweep(heads, ellipse(0.005, 0.005, count=6), STEEL), *posts)
+    posts = [make.rod(a, b, 0.002, STEEL, sides=6) for a, b in zip(feet, heads, strict=True)]
+    return make.both_sides(make.sweep(heads, make.ellipse(0.005, 0.005, count=6), STEEL), *posts)

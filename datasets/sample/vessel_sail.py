@@ -5,16 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.solids import (
-    Color,
-    Solid,
-    both_sides,
-    box,
-    rod,
-    rounded_box,
-    sheet,
-    stacked,
-)
+from cadalign.datasets.sample import solids as make
+from cadalign.datasets.sample.solids import Color, Solid
 from cadalign.datasets.sample.vessel_shape import (
     BLACK,
     GLASS,
@@ -40,17 +32,17 @@ def sail(p: VesselShape) -> Superstructure:
         (high, 0.86 * wide, front + 0.03, rear - 0.015),
     ]
     panes = (
-        rounded_box((0.475 * wide, deck + 0.022, z), (0.02, 0.018, 0.05), GLASS, radius=0.006)
+        make.rounded_box((0.475 * wide, deck + 0.022, z), (0.02, 0.018, 0.05), GLASS, radius=0.006)
         for z in (front + 0.08, front + 0.16, front + 0.24)
     )
     coaming = [(low, wide, rear - 0.01, 0.42), (deck + 0.02, 0.48 * beam, rear - 0.01, 0.41)]
     well, size = (0, deck + 0.012, (rear + 0.41) / 2), (0.36 * beam, 0.02, 0.37 - rear)
     z_mast, foot, top = -0.1, deck + 0.04, deck + (0.86 if ketch else 1.02) * p.tall
     solids = [
-        stacked(house, WHITE, radius=0.03),
-        *both_sides(*panes),
-        stacked(coaming, _VARNISH, radius=0.02),
-        box(well, size, BLACK),
+        make.stacked(house, WHITE, radius=0.03),
+        *make.both_sides(*panes),
+        make.stacked(coaming, _VARNISH, radius=0.02),
+        make.box(well, size, BLACK),
         *_keel(p),
         *_rig(p, z_mast, foot, top, boom=0.3 if ketch else 0.4),
         _foresail(p, z_mast, top),
@@ -74,7 +66,7 @@ def _keel(p: VesselShape) -> list[Solid]:
         (y + 0.02, 0.026, -0.1, 0.16),
     ]
     rudder = [(y - 0.07, 0.014, 0.36, 0.41), (y + 0.04, 0.018, 0.33, 0.41)]
-    return [stacked(fin, p.bottom, radius=0.012), stacked(rudder, p.bottom, radius=0.007)]
+    return [make.stacked(fin, p.bottom, radius=0.012), make.stacked(rudder, p.bottom, radius=0.007)]
 
 
 def _rig(p: VesselShape, z: float, foot: float, top: float, *, boom: float) -> list[Solid]:
@@ -92,9 +84,9 @@ def _rig(p: VesselShape, z: float, foot: float, top: float, *, boom: float) -> l
     striped = p.variant == 2
     bands = [(0.0, 0.3), (0.66, 1.0)] if striped else [(0.24, 0.31), (0.62, 0.69)]
     solids = [
-        rod((0, foot - 0.05, z), (0, top, z), 0.011, SPAR, end_radius=0.006),
-        rod((0, low, z), (0, low, z + boom), 0.008, SPAR),
-        *both_sides(rod(chain, (0, 0.96 * top, z), 0.0022, STEEL, sides=6)),
+        make.rod((0, foot - 0.05, z), (0, top, z), 0.011, SPAR, end_radius=0.006),
+        make.rod((0, low, z), (0, low, z + boom), 0.008, SPAR),
+        *make.both_sides(make.rod(chain, (0, 0.96 * top, z), 0.0022, STEEL, sides=6)),
         _flat(luff, leech, _CLOTH, 0.006),
     ]
     for start, end in bands:
@@ -112,7 +104,7 @@ def _flat(left: FloatArray, right: FloatArray, color: Color, thickness: float) -
     across = np.linspace(0, 1, 5)[None, :, None]
     grid = left[:, None] + across * (right - left)[:, None]
     points = np.insert(grid[..., ::-1], 0, 0.0, axis=-1)
-    return sheet(points, thickness, color)
+    return make.sheet(points, thickness, color)
 
 
 def _foresail(p: VesselShape, z_mast: float, top: float) -> Solid:

@@ -22,13 +22,12 @@ from cadalign.datasets.sfm.colmap_text import read_cameras_text, read_images_tex
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import PIXEL_CENTRE
 
 _STEMS = ("cameras", "images", "points3D")
 # COLMAP itself prefers the binary files where both are there.
 _SUFFIXES = (".bin", ".txt")
 _SUBFOLDERS = (".", "sparse/0", "sparse", "0")
-# COLMAP puts the centre of the top-left pixel at (0.5, 0.5), cadalign at (0, 0).
-_PIXEL_CENTRE = 0.5
 
 
 class Colmap(CorrespondenceSet):
@@ -86,7 +85,7 @@ class Colmap(CorrespondenceSet):
         return Correspondences(
             id=image.name,
             points_3d=self._points[self._point_rows(point_ids, image.name)],
-            points_2d=view.points_2d[rows] - _PIXEL_CENTRE,
+            points_2d=view.points_2d[rows] - PIXEL_CENTRE,
             camera=self._camera(view.camera_id, image.name),
             cam_from_world=rigid_pose(rotation_from_quat_wxyz(view.quat_wxyz), view.translation),
             point_ids=point_ids,

@@ -56,8 +56,8 @@ class _Half(JsonDocument):
 class _Unfinished(JsonDocument):
     """The file of halves of pairs."""
 
-    format: str
     pairs: list[_Half]
+    format: str = ""
 
 
 @dataclass(frozen=True)

@@ -131,6 +131,16 @@ def in_file(path: Path) -> Iterator[None]:
         raise DataError(error.what, where=where, fix=error.fix) from None
 
 
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """Let errors about a part of a file's content name the part, as ``frames[3]``."""
+    try:
+        yield
+    except CadalignError as error:
+        where = ".".join(part for part in (place, error.where) if part)
+        raise DataError(error.what, where=where or None, fix=error.fix) from None
+
+
 def path_from(text: str, folder: Path | None) -> Path:
     """The path that a file in a folder writes relative to the folder."""
     path = Path(text) if folder is None else folder / text
@@ -213,11 +223,9 @@ def _wanted(text: str) -> str:
     length = re.fullmatch(r" of length (>= )?(\d+)", rule)
     if length:
         return f"{words} of {'at least ' if length[1] else ''}{length[2]}"
-    if bound and float(bound[2]) == 0:
-        return "a positive number" if bound[1] == ">" else f"{words} of at least 0"
-    if bound and kinds == ["int"]:
-        return f"{words} {bound[1]} {bound[2]}"
-    return words
+    if bound is None or abs(float(bound[2])) == _MAX:
+        return words
+    return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
 
 
 def _known_fields(kind: Any, path: str) -> set[str]:

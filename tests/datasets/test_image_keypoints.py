@@ -527,9 +527,7 @@ def test_empty_frames_of_a_video_are_passed_over(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [[1], {"a": 1}])
 def test_category_that_is_no_id_is_refused(tmp_path: Path, value: Any) -> None:
-    with pytest.raises(
-        DataError, match=r"annotations\[0\]\.category_id: .* is not a whole number or a text"
-    ):
+    with pytest.raises(DataError, match=r"annotations\[0\]\.category_id: .* is not a whole number"):
         read(tmp_path, changed("annotations.0.category_id", value))
 
 
@@ -542,9 +540,7 @@ def test_weights_need_a_positive_deviation(tmp_path: Path, sigma: float) -> None
 
 def test_whole_numbers_beyond_all_floats_are_refused(tmp_path: Path) -> None:
     huge = changed("annotations.0.keypoints.0", 10**400)
-    with pytest.raises(
-        CadalignError, match=r"keypoints\[0\]: 1000+\.\.\.0+ is not a finite number"
-    ):
+    with pytest.raises(CadalignError, match=r"keypoints\[0\]: 10+\.\.\.0+ is not a finite"):
         read(tmp_path, huge)
     with pytest.raises(DataError, match="not valid JSON"):
         read(tmp_path, '{"annotations": ' + "1" * 5000 + "}")

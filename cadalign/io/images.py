@@ -40,7 +40,7 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     try:
         # Waiting for the other end of a pipe could take for ever, and images need random access.
         if path.exists() and not path.is_file():
-            raise DataError("not a regular file", where=str(path))
+            raise OSError("not a regular file")
         with Image.open(path) as image:
             yield image
     except FileNotFoundError:

@@ -18,26 +18,46 @@ import numpy as np
 from cadalign.annotate.document import Document, Pair
 from cadalign.annotate.keypoint_book import KeypointBook
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.annotations import parse_entry, read_entries
 from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError, InputError
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_json
-from cadalign.io.json_file import (
-    as_index,
-    as_numbers,
-    as_object,
-    as_path,
+from cadalign.io.documents import Document as JsonDocument
+from cadalign.io.documents import (
+    Index,
+    PathText,
+    Point2,
+    convert,
+    in_file,
+    path_from,
+    read_document,
     read_json,
-    refuse_unknown,
 )
+from cadalign.io.files import write_json
 from cadalign.io.observation import Observation
 
 _UNFINISHED = "cadalign unfinished pairs"
 SAME_PLACE = 1e-6
 """How far apart two points may lie that are one [diagonals]."""
+
+
+class _Half(JsonDocument):
+    """A pair of which one half is placed: the pixel or the keypoint's number."""
+
+    uv: Point2 | None = None
+    semantic_id: Index | None = None
+
+    def __post_init__(self) -> None:
+        if self.uv is None and self.semantic_id is None:
+            raise InputError("neither uv nor semantic_id")
+
+
+class _Unfinished(JsonDocument):
+    """The file of halves of pairs."""
+
+    pairs: list[_Half]
+    format: str = ""
 
 
 @dataclass(frozen=True)
@@ -149,14 +169,12 @@ class Sheet:
         data = read_json(self.observation)
         if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
             # All pairs were deleted; the camera is kept.
-            try:
+            with in_file(self.observation):
                 camera = Camera.from_dict(data["camera"])
-            except CadalignError as error:
-                raise DataError(error.what, where=f"{self.observation}: {error.where}") from None
-            if data.get("model") is not None:  # the halves of pairs are that model's
-                where = f"{self.observation}: model"
-                named = as_path(data["model"], folder=self.observation.parent, where=where)
-                refuse_other_model(named, self.model, where=self.observation)
+                named: str | None = convert(data.get("model"), PathText | None, where="model")
+            if named is not None:  # the halves of pairs are that model's
+                path = path_from(named, self.observation.parent)
+                refuse_other_model(path, self.model, where=self.observation)
             return Observation(np.empty((0, 3)), np.empty((0, 2)), camera)
         observation = Observation.load(self.observation)
         refuse_other_model(observation.model, self.model, where=self.observation)
@@ -220,28 +238,7 @@ def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeyp
     DataError
         If it is neither, or has no keypoints of this model.
     """
-    if isinstance(read_json(path), dict):
-        return ModelKeypoints.load(path, mesh=mesh).keypoints
-    places = {part.split(".")[0] for part in model.absolute().parts}
-    for entry in read_entries(path):
-        if isinstance(entry, dict) and entry.get("model_id") in places:
-            keypoints = parse_entry(entry, where=f"{path}, {entry['model_id']}").keypoints
-            rows = zip(
-                keypoints.semantic_ids.tolist(),
-                keypoints.xyz.tolist(),
-                keypoints.face_index.tolist(),
-                keypoints.barycentric.tolist(),
-                strict=True,
-            )
-            return tuple(
-                ModelKeypoint(f"keypoint {number}", tuple(xyz), number, face, tuple(weights))
-                for number, xyz, face, weights in rows
-            )
-    raise DataError(
-        "has no annotations of a model whose id occurs in the model's path",
-        where=str(path),
-        fix=f"is {model} of this category?",
-    )
+    return ModelKeypoints.load(path, mesh=mesh, model=model).keypoints
 
 
 def keypoints_file(model: Path, folder: Path) -> Path:
@@ -316,28 +313,17 @@ def _keypoint_of(
 
 
 def _with_halves(document: Document, path: Path, book: KeypointBook) -> Document:
-    data = as_object(read_json(path), where=str(path))
-    refuse_unknown(data, {"format", "pairs"}, where=str(path))
-    entries = data.get("pairs")
-    if data.get("format") != _UNFINISHED or not isinstance(entries, list):
+    data = read_document(path, _Unfinished)
+    if data.format != _UNFINISHED:
         raise DataError(
             f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to go on without"
         )
-    for row, entry in enumerate(entries):
-        where = f"{path}, pairs[{row}]"
-        entry = as_object(entry, where=where)
-        refuse_unknown(entry, {"uv", "semantic_id"}, where=where)
-        pair = Pair(document.next_number)
-        if "uv" in entry:
-            u, v = as_numbers(entry["uv"], 2, where=f"{where}.uv")
-            pair = replace(pair, uv=(u, v))
-        elif "semantic_id" in entry:
-            keypoint = as_index(entry["semantic_id"], where=f"{where}.semantic_id")
-            if keypoint not in book or keypoint in document.keypoints:
+    for half in data.pairs:
+        pair = Pair(document.next_number, uv=half.uv)
+        if half.uv is None:
+            if half.semantic_id not in book or half.semantic_id in document.keypoints:
                 continue  # its other half was saved, or the file of keypoints is gone
-            pair = replace(pair, keypoint=keypoint)
-        else:
-            raise DataError("neither uv nor semantic_id", where=where)
+            pair = replace(pair, keypoint=half.semantic_id)
         document = replace(
             document, pairs=(*document.pairs, pair), next_number=document.next_number + 1
         )

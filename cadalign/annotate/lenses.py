@@ -10,7 +10,7 @@ from cadalign.annotate.photos import Photo
 from cadalign.errors import CadalignError, DataError
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.geometry.camera import Camera
-from cadalign.io.json_file import read_json
+from cadalign.io.documents import read_json
 from cadalign.render.views.camera_files import read_camera_views
 
 _LIKELY_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]

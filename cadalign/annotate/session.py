@@ -22,7 +22,7 @@ from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.simulation.problems import simulate_problem
-from cadalign.io.json_file import as_index, as_numbers, as_text
+from cadalign.io.documents import Finite, Index, Text, convert
 
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length, in image widths
 
@@ -279,7 +279,7 @@ class Session:
         pair = slide.document.pair(self._index(action, "pair"))
         if pair.keypoint is None:
             raise InputError("this pair has no model point yet", where="pair")
-        self.book.rename(pair.keypoint, as_text(action.get("name"), where="name"))
+        self.book.rename(pair.keypoint, convert(action.get("name"), Text, where="name"))
         return Outcome(pair.number)
 
     def _focal(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
@@ -287,7 +287,7 @@ class Session:
         if not isinstance(known, bool):
             raise InputError(f"{known!r} is neither true nor false", where="known")
         if pixels is not None:
-            (pixels,) = as_numbers([pixels], 1, where="pixels")
+            pixels = float(convert(pixels, Finite, where="pixels"))
             low, high = (bound * slide.photo.width for bound in _FOCAL_RANGE)
             if not low <= pixels <= high:
                 raise InputError(
@@ -314,13 +314,17 @@ class Session:
 
     @staticmethod
     def _numbers(action: Mapping[str, Any], name: str, count: int) -> tuple[float, ...]:
-        return as_numbers(action.get(name), count, where=name)
+        numbers: list[float] = convert(action.get(name), list[Finite], where=name)
+        if len(numbers) != count:
+            raise InputError(f"{len(numbers)} numbers, not {count}", where=name)
+        return tuple(numbers)
 
     @staticmethod
     def _index(action: Mapping[str, Any], name: str) -> int:
-        return as_index(action.get(name), where=name)
+        number: int = convert(action.get(name), Index, where=name)
+        return number
 
     @staticmethod
     def _optional(action: Mapping[str, Any], name: str) -> int | None:
-        value = action.get(name)
-        return None if value is None else as_index(value, where=name)
+        number: int | None = convert(action.get(name), Index | None, where=name)
+        return number

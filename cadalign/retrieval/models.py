@@ -253,7 +253,9 @@ class ModelTable:
             xyz=self.xyz[own],
             semantic_ids=self.semantic_ids[own],
             bounds=self.bounds[row],
-            symmetries=_symmetries_from(self.table["symmetries"][row].as_py()),
+            symmetries=_symmetries_from(
+                self.table["symmetries"][row].as_py(), own.stop - own.start
+            ),
             mesh_path=None if path is None else Path(path),
         )
 
@@ -295,7 +297,20 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     }
 
 
-def _symmetries_from(text: str) -> Symmetries:
+def _symmetries_from(text: str, count: int) -> Symmetries:
+    """The symmetries of a model of so many keypoints out of its row of the table."""
+    try:
+        symmetries = _parse_symmetries(text)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
+    rows = [row for pair in symmetries.reflections for row in pair]
+    rows += [row for rotation in symmetries.rotations for row in rotation.keypoints]
+    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
+        raise DataError("a keypoint that does not exist is named", where="symmetries")
+    return symmetries
+
+
+def _parse_symmetries(text: str) -> Symmetries:
     from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
     data = json.loads(text)

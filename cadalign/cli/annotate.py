@@ -43,7 +43,7 @@ class Annotate:
         import webbrowser
 
         from cadalign.annotate.guard import Access
-        from cadalign.annotate.prepare import open_session
+        from cadalign.annotate.opening import open_session
         from cadalign.annotate.server import listen, make_app, serve
 
         console = new_console()

@@ -92,14 +92,14 @@ def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
 
 def test_rays_are_checked() -> None:
     model = CadModel(Mesh(SQUARE, [[0, 1, 2]]))
-    with pytest.raises(InputError, match=r"^direction: is zero$"):
+    with pytest.raises(InputError, match=r"^direction: the vector is zero$"):
         model.pick([0, 0, 1], [0, 0, 0])
     with pytest.raises(InputError, match=r"^origin: NaN or infinite"):
         model.pick([0, 0, np.nan], [0, 0, 1])
 
 
 def test_a_model_without_extent_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^dot: all its vertices are in one place$"):
+    with pytest.raises(InputError, match=r"^dot: all vertices of the mesh coincide$"):
         CadModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
 
 
@@ -230,5 +230,5 @@ def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> No
     points = read_given_keypoints(file, annotated.mesh_path, mesh)
     assert [point.semantic_id for point in points] == annotated.keypoints.semantic_ids.tolist()
     np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
-    with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
+    with pytest.raises(DataError, match="the annotations contain no model whose id occurs in"):
         read_given_keypoints(file, Path("other.ply"), mesh)

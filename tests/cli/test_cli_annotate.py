@@ -52,8 +52,8 @@ def test_port_in_use(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
         port = listener.getsockname()[1]
         message = refusal(capsys, "--image", case.photo, "--model", case.model, "--port", port)
     assert message == (
-        f"--port: port {port} cannot be listened on (Address already in use); "
-        "leave --port away to get a free one"
+        f"--port: port {port} cannot be opened (Address already in use); "
+        "omit --port to use a free one"
     )
 
 

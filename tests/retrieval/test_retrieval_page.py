@@ -349,7 +349,7 @@ def test_a_page_shows_the_matches_side_by_side(
             page.on("console", lambda message, to=problems: to.append(message.text))
             page.on("pageerror", lambda error, to=problems: to.append(str(error)))
             page.goto((out / "index.html").as_uri())
-            cards = page.locator("li.retrieved")
+            cards = page.locator("li.match")
             assert cards.count() == 4
             assert case.model_id in cards.first.inner_text()
             assert "100.0 %" in cards.first.inner_text()
@@ -357,7 +357,7 @@ def test_a_page_shows_the_matches_side_by_side(
             assert page.locator("img").first.evaluate(loaded) == 640
             overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert page.evaluate(overflow) == 0
-            bar = page.locator(".retrieved-score i").first.bounding_box()
+            bar = page.locator(".score i").first.bounding_box()
             assert bar is not None
             assert bar["width"] > 100
             assert 3 < bar["height"] < 12

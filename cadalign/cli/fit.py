@@ -13,7 +13,7 @@ import tyro
 from cadalign.cli.output import make_folder, new_console
 
 if TYPE_CHECKING:
-    from cadalign.fitting.noise import Sigma
+    from cadalign.fitting.options import Sigma
     from cadalign.io.observation import Observation
 
 
@@ -48,7 +48,7 @@ class Fit:
         """Run the fit; returns the exit code."""
         from cadalign.fitting.fit import fit
         from cadalign.fitting.focal.prior import FocalPrior
-        from cadalign.fitting.robust import RansacOptions
+        from cadalign.fitting.options import RansacOptions
         from cadalign.io.images import write_image
         from cadalign.io.observation import Observation
         from cadalign.render.drawing.fit_overlay import draw_observation

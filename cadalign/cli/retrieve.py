@@ -13,7 +13,7 @@ from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json
 
 if TYPE_CHECKING:
-    from cadalign.fitting.noise import Sigma
+    from cadalign.fitting.options import Sigma
     from cadalign.io.observation import Observation
     from cadalign.retrieval import Match
 

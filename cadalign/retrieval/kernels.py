@@ -13,7 +13,8 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
-from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
+from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts

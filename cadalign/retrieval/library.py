@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy.typing as npt
 
 from cadalign.errors import DataError, InputError
-from cadalign.fitting.noise import Sigma
+from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.candidates import gather_field, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library

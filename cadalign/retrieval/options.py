@@ -32,8 +32,7 @@ import math
 from dataclasses import dataclass, field
 
 from cadalign.errors import InputError
-from cadalign.fitting.noise import Sigma
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import FitOptions, Sigma
 
 METHODS = ("optimal", "epnp")
 
@@ -62,7 +61,7 @@ class RetrievalOptions:
     missing_prob: float = 0.5
     spurious: float = 0.01
     exhaustive: bool = False
-    fitting: Options = field(init=False, compare=False)
+    fitting: FitOptions = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -95,7 +94,7 @@ class RetrievalOptions:
                 fix="use the method 'optimal', or leave these options alone",
             )
         stretch = "none" if self.method == "epnp" else self.stretch
-        options = Options(
+        options = FitOptions(
             loss=self.loss,
             loss_scale=self.loss_scale,
             stretch=stretch,

@@ -30,7 +30,7 @@ from cadalign.retrieval.kernels import search_all
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.solvers.minimal import POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
 
 _FIRST_BATCH = 64
 _LARGEST_BATCH = 4096

@@ -47,14 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Runs (evaluate, simulate) exit with 3 if they are finished but some of their rows failed.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    command = tyro.cli(
-        Command,
-        prog="cadalign",
-        description="Align CAD models to photos from keypoints.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
     try:
+        command = tyro.cli(
+            Command,
+            prog="cadalign",
+            description="Align CAD models to photos from keypoints.",
+            args=arguments,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+        )
         return command.run()
     except CadalignError as error:
         sys.stderr.write(f"cadalign: {error}\n")

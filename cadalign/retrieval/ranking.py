@@ -92,7 +92,7 @@ def rank(
     if workers == -1:
         workers = os.cpu_count() or 1
     if workers < 1:
-        raise InputError(f"{workers} is not a number of threads", where="workers", fix="or -1")
+        raise InputError(f"must be >= 1, or -1 for all cores, not {workers}", where="workers")
     found = _Found(field)
     if options.method == "epnp":
         _search_in_order(found, options, lambda some: _search_unstretched(field, observed, some))

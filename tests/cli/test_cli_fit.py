@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +17,7 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import FitResult, fit
+from cadalign import FitResult, RansacOptions, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
@@ -90,6 +92,54 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["fit", str(path)]) == 0
     expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, sigma=sigma)
     assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_options_of_fit_are_those_of_the_function(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json", sigma=np.linspace(0.2, 5, 10))
+    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--scale-prior-sigma", "0.3"]
+    assert main(["fit", str(path), *flags]) == 0
+    expected = fit(
+        PROBLEM.points_3d,
+        PROBLEM.points_2d,
+        PROBLEM.camera,
+        sigma=2.0,
+        loss="cauchy",
+        stretch="y",
+        scale_prior_sigma=0.3,
+    )
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_options_of_ransac_need_no_prefix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    flags = ["--robust", "--max-reproj-error", "6", "--seed", "3", "--no-refine"]
+    assert main(["fit", str(path), *flags]) == 0
+    ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_full_disk_is_reported_and_leaves_earlier_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path)]) == 0
+    written = tmp_path / "chair_fit" / "fit.json"
+    before = written.read_bytes()
+    capsys.readouterr()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp").startswith(
+        f"{written}: cannot be written (No space left on device); "
+    )
+    assert written.read_bytes() == before
 
 
 def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
@@ -191,7 +241,17 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     assert refusal_line(capsys, "fit", str(path), "--method", "best") == (
-        "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+        "--method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+    )
+
+
+def test_given_and_estimated_sigma_exclude_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert refusal_line(capsys, "fit", str(path), "--sigma", "2", "--similar") == (
+        "--sigma: --similar estimates the standard deviation, which --sigma gives; "
+        "give one of the two options"
     )
 
 

@@ -23,8 +23,8 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.mask_files import read_opacity
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.pictures import read_opacity
 from cadalign.retrieval.query import read_query
 
 
@@ -239,10 +239,27 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
 def test_matches_as_json_are_those_of_the_library(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--robust", "--json"]
+    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--loss", "cauchy", "--json"]
     assert main(["retrieve", *case.arguments, *options]) == 0
     expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
     assert json.loads(capsys.readouterr().out) == [match.to_dict() for match in expected]
+
+
+def test_robust_search_is_an_option_of_fit_alone(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--robust") == (
+        "--robust: the robust search (RANSAC) is an option of `cadalign fit` only; "
+        "use --loss cauchy"
+    )
+
+
+def test_refused_options_are_named_as_they_are_typed(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--max-stretch", "0.5") == (
+        "--max-stretch: must be between 1 and 1000, not 0.5"
+    )
 
 
 def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,20 +41,7 @@ def open_session(
 ) -> Session:
     """Open an annotation session.
 
-    Parameters
-    ----------
-    image : Path
-        A photo, or a folder of photos.
-    model : Path
-        The mesh file.
-    observation : Path, optional
-        Observation file of a single photo.
-    camera : Path, optional
-        The calibrated camera of the photos.
-    keypoints : Path, optional
-        The model's keypoints.
-    out : Path, optional
-        Folder to write to; by default that of the observation, or of the photos.
+    The parameters are the options of `cadalign annotate`.
 
     Raises
     ------

@@ -49,7 +49,7 @@ class Fit:
     Prints the alignment; writes fit.json and overlay.png.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional]
+    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image and model."""
     out: Path | None = None
     """Folder to write to; by default <observation>_fit beside the file."""

@@ -41,7 +41,7 @@ class Retrieve:
     match, and index.html, which shows them side by side.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional]
+    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image."""
     library: Path
     """File that `cadalign library build` wrote."""

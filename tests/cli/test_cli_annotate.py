@@ -72,7 +72,8 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
     file = case.folder / "file"
     file.write_text("")
     message = refusal(capsys, "--image", case.photo, "--model", case.model, "--out", file / "out")
-    assert message == f"{file / 'out'}: cannot be made (Not a directory); choose another --out"
+    reason = "the folder cannot be created (Not a directory); choose another --out"
+    assert message == f"{file / 'out'}: {reason}"
 
 
 def test_folder_of_the_observation_is_made(

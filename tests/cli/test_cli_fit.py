@@ -306,7 +306,9 @@ def test_output_folder_that_cannot_be_made(
     path = write_observation(tmp_path / "chair.json")
     (tmp_path / "out").write_text("a file in the way")
     line = refusal_line(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
-    assert line == f"{tmp_path / 'out'}: cannot be made (File exists); choose another --out"
+    assert line == (
+        f"{tmp_path / 'out'}: the folder cannot be created (File exists); choose another --out"
+    )
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ class TestSilhouettes:
         def retrieve(**options: Any) -> None:
             twins.retrieve(pixels, np.arange(7), CAMERA, **options)
 
-        with pytest.raises(InputError, match="mask: it shows no pixel of the object"):
+        with pytest.raises(InputError, match="mask: contains no pixel of the object"):
             retrieve(mask=np.zeros((480, 640), dtype=bool))
         with pytest.raises(InputError, match=r"mask: shape \(640, 480\), but .* 480 high and 640"):
             retrieve(mask=np.zeros((640, 480), dtype=bool))
@@ -462,7 +462,7 @@ def test_what_the_library_refuses_is_one_line(
     path = tmp_path / "blind.json"
     replace(case.observation, image=None).save(path)
     blind = refusal_line(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
-    assert blind.startswith("--silhouette: the observation names no image; give its image, or")
+    assert blind.startswith("--silhouette: the observation names no image; add the image")
     assert "no such folder" in refusal_line(capsys, "library", "build", str(tmp_path / "none"))
     (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
     assert "not a library file" in refusal_line(capsys, "library", "show", str(tmp_path / "lib"))

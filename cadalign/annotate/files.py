@@ -17,27 +17,46 @@ import numpy as np
 from cadalign.annotate.document import Document, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.annotations import parse_entry, read_entries
 from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_json, writing
-from cadalign.io.json_file import (
-    as_index,
-    as_numbers,
-    as_object,
-    as_path,
+from cadalign.io.documents import Document as JsonDocument
+from cadalign.io.documents import (
+    Index,
+    PathText,
+    Point2,
+    convert,
     in_file,
+    path_from,
+    read_document,
     read_json,
-    refuse_unknown,
 )
+from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 
 _UNFINISHED = "cadalign unfinished pairs"
 SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
+
+
+class _Half(JsonDocument):
+    """Pair with only the photo half or the model half."""
+
+    uv: Point2 | None = None
+    semantic_id: Index | None = None
+
+    def __post_init__(self) -> None:
+        if self.uv is None and self.semantic_id is None:
+            raise InputError("uv and semantic_id are both missing")
+
+
+class _Unfinished(JsonDocument):
+    """File of the pairs with only one half placed."""
+
+    pairs: list[_Half]
+    format: str = ""
 
 
 @dataclass(frozen=True)
@@ -141,10 +160,9 @@ class AnnotationFiles:
             # All pairs were deleted; the camera is kept, and unfinished pairs belong to the model.
             with in_file(self.observation):
                 camera = Camera.from_dict(data["camera"])
-                named = data.get("model")
-                if named is not None:
-                    named = as_path(named, folder=self.observation.parent, where="model")
-            observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=named)
+                named: str | None = convert(data.get("model"), PathText | None, where="model")
+            model = None if named is None else path_from(named, self.observation.parent)
+            observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=model)
         else:
             observation = Observation.load(self.observation)
         refuse_other_model(observation.model, self.model, where=self.observation)
@@ -202,28 +220,7 @@ def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeyp
     DataError
         If the file has another format, or no keypoints of this model.
     """
-    if isinstance(read_json(path), dict):
-        return ModelKeypoints.load(path, mesh=mesh).keypoints
-    places = {part.split(".")[0] for part in model.absolute().parts}
-    for entry in read_entries(path):
-        if isinstance(entry, dict) and entry.get("model_id") in places:
-            keypoints = parse_entry(entry, where=f"{path}, {entry['model_id']}").keypoints
-            rows = zip(
-                keypoints.semantic_ids.tolist(),
-                keypoints.xyz.tolist(),
-                keypoints.face_index.tolist(),
-                keypoints.barycentric.tolist(),
-                strict=True,
-            )
-            return tuple(
-                ModelKeypoint(f"keypoint {number}", tuple(xyz), number, face, tuple(weights))
-                for number, xyz, face, weights in rows
-            )
-    raise DataError(
-        f"the annotations contain no model whose id occurs in {model}",
-        where=str(path),
-        fix="give the annotations of the model's category",
-    )
+    return ModelKeypoints.load(path, mesh=mesh, model=model).keypoints
 
 
 def keypoints_file(model: Path, folder: Path) -> Path:
@@ -294,27 +291,16 @@ def _registered(
 
 
 def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> Document:
-    data = as_object(read_json(path), where=str(path))
-    refuse_unknown(data, {"format", "pairs"}, where=str(path))
-    entries = data.get("pairs")
-    if data.get("format") != _UNFINISHED or not isinstance(entries, list):
+    data = read_document(path, _Unfinished)
+    if data.format != _UNFINISHED:
         raise DataError(
             f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to start without them"
         )
-    for row, entry in enumerate(entries):
-        where = f"{path}, pairs[{row}]"
-        entry = as_object(entry, where=where)
-        refuse_unknown(entry, {"uv", "semantic_id"}, where=where)
-        pair = Pair(document.next_number)
-        if "uv" in entry:
-            u, v = as_numbers(entry["uv"], 2, where=f"{where}.uv")
-            pair = replace(pair, uv=(u, v))
-        elif "semantic_id" in entry:
-            keypoint = as_index(entry["semantic_id"], where=f"{where}.semantic_id")
-            if keypoint not in registry or keypoint in document.keypoints:
+    for half in data.pairs:
+        pair = Pair(document.next_number, uv=half.uv)
+        if half.uv is None:
+            if half.semantic_id not in registry or half.semantic_id in document.keypoints:
                 continue  # its other half was saved, or the keypoints file was deleted
-            pair = replace(pair, keypoint=keypoint)
-        else:
-            raise DataError("uv and semantic_id are both missing", where=where)
+            pair = replace(pair, keypoint=half.semantic_id)
         document = _with(document, pair)
     return document

@@ -11,7 +11,7 @@ from cadalign.annotate.photos import Photo
 from cadalign.errors import DataError
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.geometry.camera import Camera
-from cadalign.io.json_file import in_file, read_json
+from cadalign.io.documents import in_file, read_json
 from cadalign.render.views.camera_files import read_camera_views
 
 _DEFAULT_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from cadalign.annotate.actions import Outcome
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
-from cadalign.annotate.session import Outcome, PhotoState, Session
+from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.annotate.wireframe import box_lines
 from cadalign.arrays import FloatArray

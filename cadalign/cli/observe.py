@@ -83,8 +83,8 @@ class Observe:
         """
         from cadalign.errors import DataError
         from cadalign.geometry.camera import Camera
+        from cadalign.io.documents import in_file, read_json
         from cadalign.io.images import photo_size
-        from cadalign.io.json_file import in_file, read_json
 
         sizes: dict[str, tuple[int, int]] = {}
         camera = None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.io.json_file import read_json
+from cadalign.io.documents import read_json
 from cadalign.io.observation import Observation
 
 _ORIGIN = [0.0, 0.0, 0.0]

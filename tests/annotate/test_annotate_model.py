@@ -230,5 +230,5 @@ def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> No
     points = read_given_keypoints(file, annotated.mesh_path, mesh)
     assert [point.semantic_id for point in points] == annotated.keypoints.semantic_ids.tolist()
     np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
-    with pytest.raises(DataError, match="the annotations contain no model whose id occurs in"):
+    with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
         read_given_keypoints(file, Path("other.ply"), mesh)

@@ -20,7 +20,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.retrieval.labelings import mirrored_labelings
 
 if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel, Symmetries
+    from cadalign.datasets import AnnotatedModel, Circle, Symmetries
     from cadalign.geometry.mesh import Mesh
 
 ModelKey = tuple[str, str]
@@ -243,17 +243,8 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     xyz = model.xyz[order]
     labelings = mirrored_labelings(xyz, reflections)
     rotations = [
-        {
-            "keypoints": [int(place[row]) for row in rotation.keypoints],
-            "circle": None
-            if rotation.circle is None
-            else [
-                rotation.circle.center.tolist(),
-                rotation.circle.radius,
-                rotation.circle.normal.tolist(),
-            ],
-        }
-        for rotation in symmetries.rotations
+        {"keypoints": [int(place[row]) for row in each.keypoints], "circle": _written(each.circle)}
+        for each in symmetries.rotations
     ]
     return {
         "category": model.category,
@@ -267,26 +258,27 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     }
 
 
+def _written(circle: Circle | None) -> list[Any] | None:
+    return (
+        None if circle is None else [circle.center.tolist(), circle.radius, circle.normal.tolist()]
+    )
+
+
 def _symmetries_from(text: str) -> Symmetries:
     from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
+    def read_circle(written: list[Any] | None) -> Circle | None:
+        if written is None:
+            return None
+        center, radius, normal = written
+        return Circle(np.array(center), radius, np.array(normal))
+
     data = json.loads(text)
-    return Symmetries(
-        reflections=tuple((first, second) for first, second in data["reflections"]),
-        rotations=tuple(
-            RotationalSymmetry(
-                keypoints=tuple(rotation["keypoints"]),
-                circle=None
-                if rotation["circle"] is None
-                else Circle(
-                    np.array(rotation["circle"][0]),
-                    rotation["circle"][1],
-                    np.array(rotation["circle"][2]),
-                ),
-            )
-            for rotation in data["rotations"]
-        ),
+    rotations = (
+        RotationalSymmetry(tuple(each["keypoints"]), read_circle(each["circle"]))
+        for each in data["rotations"]
     )
+    return Symmetries(tuple(map(tuple, data["reflections"])), tuple(rotations))
 
 
 def _no_symmetries() -> Symmetries:

@@ -174,7 +174,7 @@ def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
     assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: NaN or infinite values in row 0; remove or repair these"
+        f"{path}: keypoints[4].uv[0]: nan is not a finite number"
     )
 
 
@@ -182,7 +182,7 @@ def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
     assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: shape (3,), expected (2)"
+        f"{path}: keypoints[4].uv: [1, 2, 3] is not a list of 2"
     )
 
 

@@ -122,7 +122,8 @@ def place_twenty(session: Session, case: Case) -> None:
                 case.instance.cam_from_model.apply([point.xyz])
             )
             noise = rng.normal(size=2)
-            place(session, session.registry.add(point), [u + noise[0], v + noise[1]])
+            u, v = float(u + noise[0]), float(v + noise[1])
+            place(session, session.registry.add(point), [u, v])
 
 
 @contextmanager

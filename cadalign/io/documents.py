@@ -97,7 +97,9 @@ def parse_json(text: str | bytes) -> Any:
         raise DataError("not valid JSON: nested too deeply") from None
 
 
-def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | Any:
+def convert(
+    data: Any, kind: type[T] | Any, *, where: str | None = None, strict: bool = True
+) -> T | Any:
     """Convert parsed JSON to a declared type.
 
     Parameters
@@ -107,6 +109,8 @@ def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | 
         A `Document`, or any type of which its fields can be.
     where : str, optional
         The place of ``data``, which the fields' paths are appended to.
+    strict : bool
+        False reads numbers out of text, as in CSV files.
 
     Raises
     ------
@@ -114,14 +118,14 @@ def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | 
         If a field is missing, unknown or invalid; ``where`` is its path, as ``keypoints[3].uv``.
     """
     try:
-        return msgspec.convert(data, kind)
+        return msgspec.convert(data, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise _located(error, data, kind, where or "") from None
 
 
 @contextmanager
-def in_file(path: Path) -> Iterator[None]:
-    """Let errors about a file's content name the file."""
+def in_file(path: Path | str) -> Iterator[None]:
+    """Let errors about a file's content name the file, or the file and a line."""
     try:
         yield
     except CadalignError as error:
@@ -193,12 +197,15 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
     if field:
-        known = _known_fields(msgspec.inspect.type_info(kind), path or "$")
+        known = sorted(each.encode_name for each in _type_at(kind, path).fields)
         return DataError(
             f"unknown field {quote(field[2])}",
             where=where or "top level",
-            fix=f"known are {', '.join(sorted(known))}",
+            fix=f"known are {', '.join(known)}",
         )
+    if text.startswith("Invalid enum value"):
+        allowed = ", ".join(map(repr, _type_at(kind, path).values))
+        return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
     return DataError(f"{quote(value)} is not {_wanted(text)}", where=where or None)
 
 
@@ -228,15 +235,16 @@ def _wanted(text: str) -> str:
     return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
 
 
-def _known_fields(kind: Any, path: str) -> set[str]:
-    """The fields of the declared type at a path."""
-    for step in _STEP.finditer(path[1:]):
+def _type_at(kind: Any, path: str | None) -> Any:
+    """The declared type at a path."""
+    kind = msgspec.inspect.type_info(kind)
+    for step in _STEP.finditer((path or "$")[1:]):
         kind = _without_none(kind)
         if isinstance(kind, msgspec.inspect.StructType):
             kind = next(each.type for each in kind.fields if each.encode_name == step["name"])
         else:
             kind = kind.value_type if step["row"] == "..." else kind.item_type
-    return {each.encode_name for each in _without_none(kind).fields}
+    return _without_none(kind)
 
 
 def _without_none(kind: Any) -> Any:

@@ -37,13 +37,18 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    path = Path(path)
     try:
+        # Waiting for the other end of a pipe could take for ever, and images need random access.
+        if path.exists() and not path.is_file():
+            raise OSError("not a regular file")
         with Image.open(path) as image:
             yield image
     except FileNotFoundError:
         raise DataError("no such file", where=str(path)) from None
     except (
         OSError,
+        ValueError,  # a NUL in the path
         SyntaxError,  # Pillow's word for a broken PNG
         UnidentifiedImageError,
         Image.DecompressionBombError,
@@ -106,6 +111,7 @@ def write_image(path: Path, image: ByteImage) -> None:
     DataError
         If the file cannot be written.
     """
+
     colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     encoded, data = cv2.imencode(".png", cv2.cvtColor(image, colors))
     if not encoded:

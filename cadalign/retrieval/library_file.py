@@ -20,7 +20,9 @@ import os
 import struct
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from cadalign.errors import DataError
 from cadalign.io.files import write_whole
@@ -84,8 +86,51 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
             where=where,
             fix=f"copy it again, or {_AGAIN}",
         )
-    with pa.ipc.open_file(pa.BufferReader(payload)) as reader:
-        return ModelTable(reader.read_all())
+    try:
+        with pa.ipc.open_file(pa.BufferReader(payload)) as reader:
+            table = reader.read_all()
+        _check_table(table)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise DataError(
+            f"the library file is invalid: {str(error)[:200]}", where=where, fix=_AGAIN
+        ) from None
+    return ModelTable(table)
+
+
+def _check_table(table: pa.Table) -> None:
+    """Refuse a table whose indices could lead out of its memory, whatever its checksum.
+
+    Raises
+    ------
+    ValueError or pyarrow.ArrowException
+        If columns, offsets, row numbers or coordinates are invalid.
+    """
+    if not table.schema.equals(SCHEMA):
+        raise ValueError("it has other columns")
+    table.validate(full=True)
+    for name in table.column_names:
+        column = table[name]
+        while column is not None:
+            if column.null_count and name != "mesh":
+                raise ValueError(f"{name} is missing for a model")
+            is_nested = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+            column = pc.list_flatten(column) if is_nested else None
+    counts = pc.list_value_length(table["semantic_ids"]).to_numpy()
+    if (pc.list_value_length(table["keypoints"]).to_numpy() != counts).any():
+        raise ValueError("keypoints and semantic_ids differ in length")
+    labels = pc.list_value_length(table["labelings"]).to_numpy()
+    if (labels % np.maximum(counts, 1)).any():
+        raise ValueError("labelings are not rows of all keypoints")
+    rows = pc.list_flatten(table["labelings"]).to_numpy()
+    if ((rows < 0) | (rows >= np.repeat(counts, labels))).any():
+        raise ValueError("a labeling names a keypoint that does not exist")
+    for numbers in (pc.list_flatten(pc.list_flatten(table["keypoints"])), table["bounds"]):
+        values = numbers if pa.types.is_floating(numbers.type) else pc.list_flatten(numbers)
+        if not np.isfinite(values.to_numpy()).all():
+            raise ValueError("a coordinate is NaN or infinite")
+    keys = list(zip(table["category"].to_pylist(), table["model_id"].to_pylist(), strict=True))
+    if keys != sorted(set(keys)):
+        raise ValueError("models are not sorted by category and id")
 
 
 def fingerprint(models: ModelTable) -> str:

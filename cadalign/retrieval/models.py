@@ -225,7 +225,9 @@ class ModelTable:
             xyz=self.xyz[own],
             semantic_ids=self.semantic_ids[own],
             bounds=self.bounds[row],
-            symmetries=_symmetries_from(self.table["symmetries"][row].as_py()),
+            symmetries=_symmetries_from(
+                self.table["symmetries"][row].as_py(), own.stop - own.start
+            ),
             mesh_path=None if path is None else Path(path),
         )
 
@@ -264,7 +266,20 @@ def _written(circle: Circle | None) -> list[Any] | None:
     )
 
 
-def _symmetries_from(text: str) -> Symmetries:
+def _symmetries_from(text: str, count: int) -> Symmetries:
+    """Read a model's symmetries and check their rows of its ``count`` keypoints."""
+    try:
+        symmetries = _parse_symmetries(text)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
+    rows = [row for pair in symmetries.reflections for row in pair]
+    rows += [row for rotation in symmetries.rotations for row in rotation.keypoints]
+    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
+        raise DataError("names a keypoint that does not exist", where="symmetries")
+    return symmetries
+
+
+def _parse_symmetries(text: str) -> Symmetries:
     from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
     def read_circle(written: list[Any] | None) -> Circle | None:
@@ -278,7 +293,8 @@ def _symmetries_from(text: str) -> Symmetries:
         RotationalSymmetry(tuple(each["keypoints"]), read_circle(each["circle"]))
         for each in data["rotations"]
     )
-    return Symmetries(tuple(map(tuple, data["reflections"])), tuple(rotations))
+    reflections = ((first, second) for first, second in data["reflections"])
+    return Symmetries(tuple(reflections), tuple(rotations))
 
 
 def _no_symmetries() -> Symmetries:

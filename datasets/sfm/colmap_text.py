@@ -54,9 +54,9 @@ def read_points_text(path: Path) -> ColmapPoints:
     for number, line in _entries(path):
         words = line.split(maxsplit=4)
         try:
-            ids.append(int(words[0]))
+            ids.append(np.int64(int(words[0])))
             xyz.append((float(words[1]), float(words[2]), float(words[3])))
-        except (IndexError, ValueError):
+        except (IndexError, ValueError, OverflowError):
             raise _malformed(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
     return ColmapPoints(
         ids=np.array(ids, dtype=np.int64), xyz=np.array(xyz, dtype=float).reshape(-1, 3)

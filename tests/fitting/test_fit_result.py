@@ -102,6 +102,10 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
             f"fit result: inliers: 1 entries, but points_3d has {len(MADE.points_3d)}",
         ),
         (
+            json.dumps(MADE.to_dict() | {"known_axis": "q"}),
+            "fit result: known_axis: 'q' is not one of 'x', 'y', 'z'",
+        ),
+        (
             json.dumps(MADE.to_dict() | {"sigma": "1"}),
             "fit result: sigma: '1' is not a finite number",
         ),

@@ -13,7 +13,8 @@ from page_watch import Opened, scroll_through, watched
 from playwright.sync_api import Browser, expect
 from report_payloads import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
-from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet
+from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import write_report
 from cadalign.web import asset
@@ -298,8 +299,10 @@ def test_paper_gets_tables_plots_and_a_few_cards(
 @pytest.mark.slow
 def test_a_real_run_makes_a_page(opened: Opened, sample_root: Path, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
-    options = KeypointNetOptions(render="overlay", max_models=1, methods=("optimal", "limit"))
-    run_keypointnet(sample_root, options, folder, workers=0)
+    options = KeypointNetOptions(
+        sample_root, render="overlay", max_models=1, methods=("optimal", "limit")
+    )
+    do_run(options, folder, workers=0)
     for assets in (False, True):
         written = write_report([folder.path], tmp_path / "page.html", assets=assets)
         page = opened(written.path.as_uri())

@@ -1,4 +1,4 @@
-"""A model in few triangles and lines: light enough for a page, true enough to recognise it."""
+"""Mesh previews: models in few triangles and lines, light enough for a page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CREASE_DEG = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sketch:
+class MeshPreview:
     """A simplified model.
 
     Parameters
@@ -42,7 +42,7 @@ class Sketch:
     edges: IntArray
 
     def to_dict(self) -> dict[str, Any]:
-        """The sketch for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
+        """The preview for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
         placed = self.vertices if len(self.vertices) else np.zeros((1, 3))
         low = placed.min(axis=0)
         step = np.maximum(np.ptp(placed, axis=0), 1e-12) / (2 * _FINEST - 1)
@@ -58,7 +58,9 @@ class Sketch:
         }
 
 
-def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES) -> Sketch:
+def preview_of(
+    mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
+) -> MeshPreview:
     """Simplify a mesh by merging the vertices in each cell of a grid.
 
     The finest grid is taken that leaves few enough triangles; a mesh that has few is kept as it is.
@@ -67,13 +69,13 @@ def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_ED
     ----------
     mesh : Mesh
     max_faces, max_edges : int
-        How many triangles and lines at most.
+        Largest numbers of triangles and lines.
 
     Examples
     --------
     >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    >>> sketch = sketch_of(square)
-    >>> len(sketch.faces), len(sketch.edges)  # the diagonal is no crease
+    >>> preview = preview_of(square)
+    >>> len(preview.faces), len(preview.edges)  # the diagonal is no crease
     (2, 4)
     """
     vertices, faces, wires = _merged(mesh.vertices, mesh.faces, _FINEST)
@@ -85,18 +87,18 @@ def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_ED
     largest = np.argsort(-np.linalg.norm(_normals(vertices, faces), axis=1), kind="stable")
     faces = faces[np.sort(largest[:max_faces])]
     edges = np.concatenate([wires, _feature_edges(vertices, faces)])
-    return Sketch(vertices, faces, edges[:max_edges])
+    return MeshPreview(vertices, faces, edges[:max_edges])
 
 
-def write_sketch(path: Path, mesh: Mesh) -> None:
-    """Write a model's sketch as JSON.
+def write_preview(path: Path, mesh: Mesh) -> None:
+    """Write a preview of a mesh as JSON.
 
     Raises
     ------
     DataError
         If the file cannot be written.
     """
-    write_text(path, dense_json(sketch_of(mesh).to_dict()))
+    write_text(path, dense_json(preview_of(mesh).to_dict()))
 
 
 def _merged(

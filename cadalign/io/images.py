@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -105,6 +104,8 @@ def write_image(path: Path, image: ByteImage) -> None:
     DataError
         If the file cannot be written.
     """
+    import cv2
+
     encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     try:
         if not encoded:

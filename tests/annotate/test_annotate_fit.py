@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
 from cadalign.annotate.advice import Advice, best_next, unknown_name, updated_variances
@@ -16,15 +17,11 @@ from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.prediction import projection_jacobian
 from cadalign.annotate.words import advice_text, facts_of, notes_of
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation.problems import Problem
 
 KNOWN = FocalChoice(known=True)
 UNKNOWN = FocalChoice(known=False)
 LENS_CAMERA = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.2, 0.05, 0.003, -0.002))
-
-
-def problem_of(seed: int, points: int, *, noise_px: float = 1.0) -> Problem:
-    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
 
 
 def live_of(
@@ -43,7 +40,7 @@ def live_of(
 
 
 def test_is_what_fit_finds() -> None:
-    problem = problem_of(0, 9)
+    problem = problem_of(0, points=9, noise_px=1.0)
     live = live_of(problem)
     expected = fit(problem.points_3d, problem.points_2d, problem.camera)
     assert live.result is not None
@@ -60,7 +57,7 @@ def test_is_what_fit_finds() -> None:
     ],
 )
 def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
-    problem = problem_of(0, 6)
+    problem = problem_of(0, points=6, noise_px=1.0)
     few = Problem(
         problem.points_3d[:points], problem.points_2d[:points], problem.camera, problem.alignment
     )
@@ -70,7 +67,7 @@ def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
 
 
 def test_deviations_go_by_the_residuals() -> None:
-    problem = problem_of(3, 12, noise_px=8.0)
+    problem = problem_of(3, points=12, noise_px=8.0)
     live = live_of(problem)
     assert live.result is not None
     assert live.cautious is not None
@@ -78,11 +75,11 @@ def test_deviations_go_by_the_residuals() -> None:
     np.testing.assert_allclose(live.cautious.covariance, live.result.covariance * live.sigma**2)
     similar = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=None)
     assert similar.sigma == pytest.approx(live.sigma, rel=1e-6)
-    assert live_of(problem_of(3, 12, noise_px=0.01)).sigma == 1.0
+    assert live_of(problem_of(3, points=12, noise_px=0.01)).sigma == 1.0
 
 
 def test_pairs_in_one_plane_give_a_provisional_alignment_that_says_so() -> None:
-    problem = problem_of(1, 6)
+    problem = problem_of(1, points=6, noise_px=1.0)
     flat = problem.points_3d * [1, 1, 0]
     points_2d = problem.camera.project(problem.alignment.apply(flat))
     live = align(flat, points_2d, None, Lens(problem.camera, calibrated=True), KNOWN)
@@ -99,7 +96,7 @@ def test_coinciding_pairs_give_no_alignment() -> None:
         np.zeros((5, 3)),
         np.full((5, 2), 100.0),
         None,
-        Lens(problem_of(0, 4).camera, calibrated=True),
+        Lens(problem_of(0, points=4, noise_px=1.0).camera, calibrated=True),
         KNOWN,
     )
     assert live.result is None
@@ -107,7 +104,7 @@ def test_coinciding_pairs_give_no_alignment() -> None:
 
 
 def test_unknown_focal_length_is_estimated_from_the_fifth_pair_on() -> None:
-    problem = problem_of(5, 12, noise_px=0.3)
+    problem = problem_of(5, points=12, noise_px=0.3)
     lens = Lens(problem.camera.with_focal(500.0), calibrated=False)
     live = align(problem.points_3d, problem.points_2d, None, lens, UNKNOWN)
     assert live.camera is not None
@@ -142,7 +139,7 @@ def test_typed_focal_length_is_used() -> None:
 
 @pytest.mark.parametrize("wrong", [(4,), (0, 7), (1, 5, 9)])
 def test_wrong_pairs_are_named_with_how_far_they_are_off(wrong: tuple[int, ...]) -> None:
-    problem = problem_of(2, 14)
+    problem = problem_of(2, points=14, noise_px=1.0)
     points_2d = problem.points_2d.copy()
     for k, row in enumerate(wrong):
         points_2d[row] += [(37, 5), (-30, 25), (10, -45)][k]
@@ -159,7 +156,7 @@ def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
     seeds = 60 if choice.known else 15
     for seed in range(seeds):
         for points, noise in ((6, 1.0), (10, 3.0), (20, 6.0)):
-            live = live_of(problem_of(seed, points, noise_px=noise), choice=choice)
+            live = live_of(problem_of(seed, points=points, noise_px=noise), choice=choice)
             suspected += len(live.contradictions)
     assert suspected <= 0.005 * seeds * 36
 
@@ -167,7 +164,7 @@ def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
 def test_one_wrong_pair_is_found_among_few() -> None:
     found = alone = 0
     for seed in range(40):
-        problem = problem_of(seed, 8)
+        problem = problem_of(seed, points=8, noise_px=1.0)
         points_2d = problem.points_2d.copy()
         points_2d[3] += [0, 60]
         contradictions = live_of(problem, points_2d=points_2d).contradictions
@@ -178,7 +175,7 @@ def test_one_wrong_pair_is_found_among_few() -> None:
 
 
 def test_too_few_pairs_accuse_nobody() -> None:
-    problem = problem_of(0, 5)
+    problem = problem_of(0, points=5, noise_px=1.0)
     points_2d = problem.points_2d + [[90, 0], *[[0, 0]] * 4]
     assert live_of(problem, points_2d=points_2d).contradictions == {}
 
@@ -203,7 +200,7 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
 @given(st.integers(0, 10_000))
 @settings(max_examples=15)
 def test_advice_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
-    problem = problem_of(seed, 9, noise_px=0.5)
+    problem = problem_of(seed, points=9, noise_px=0.5)
     result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
     assert result.covariance is not None
     rng = np.random.default_rng(seed + 1)
@@ -222,7 +219,7 @@ def test_advice_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
 
 
 def test_advice_looks_at_the_least_known_unknown() -> None:
-    problem = problem_of(4, 10)
+    problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 1e-4, 0.04])
     advice = best_next(problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0)
@@ -240,7 +237,7 @@ def test_advice_looks_at_the_least_known_unknown() -> None:
 
 
 def test_equally_good_candidates_give_the_first() -> None:
-    problem = problem_of(4, 10)
+    problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     same = np.repeat(problem.points_3d[:1], 5, axis=0)
     advice = best_next(same, problem.camera, result.alignment, result.covariance, sigma=1.0)
@@ -294,7 +291,7 @@ def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
 
 
 def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
-    problem = problem_of(7, 15)
+    problem = problem_of(7, points=15, noise_px=1.0)
     facts = {fact.label: fact for fact in facts_of(live_of(problem))}
     assert list(facts) == [
         "Stretch along y",
@@ -317,16 +314,19 @@ def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
 
 
 def test_estimated_focal_length_has_a_deviation() -> None:
-    facts = {fact.label: fact for fact in facts_of(live_of(problem_of(7, 15), choice=UNKNOWN))}
+    facts = {
+        fact.label: fact
+        for fact in facts_of(live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN))
+    }
     assert " ± " in facts["Focal length"].value
     assert facts["Focal length"].note == "estimated"
 
 
 def test_notes_name_alternatives_and_weak_stretches() -> None:
-    problem = problem_of(0, 4, noise_px=0.0)
+    problem = problem_of(0, points=4, noise_px=0.0)
     notes = notes_of(live_of(problem))
     assert any("one more pair tells them apart" in note for note in notes)
-    weak = problem_of(7, 12, noise_px=15.0)
+    weak = problem_of(7, points=12, noise_px=15.0)
     assert any("is known only to ± " in note for note in notes_of(live_of(weak)))
     assert notes_of(LiveAlignment(message="wait")) == ()
 

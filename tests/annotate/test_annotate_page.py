@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from annotating import Case, make_case, place_all, place_twenty, served
 from playwright.sync_api import Browser, Page
+from support.annotating import Case, place_all, place_twenty, served
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.session import Session
@@ -36,16 +35,6 @@ COUNT_COLOR = """color => {
     }
     return count;
 }"""
-
-
-@pytest.fixture(scope="module")
-def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return make_case(sample_root, tmp_path_factory.mktemp("page"))
-
-
-@pytest.fixture
-def case(original: Case, tmp_path: Path) -> Case:
-    return original.copied_to(tmp_path / "photos")
 
 
 class Driver:

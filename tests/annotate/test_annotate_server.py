@@ -6,10 +6,9 @@ import http.client
 import json
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from annotating import Case, make_case, served
+from support.annotating import Case, served
 
 from cadalign.annotate.guard import MAX_BODY, Access
 from cadalign.annotate.server import listen
@@ -19,13 +18,8 @@ UNDO = json.dumps({"do": "undo"})
 
 
 @pytest.fixture(scope="module")
-def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return make_case(sample_root, tmp_path_factory.mktemp("served"))
-
-
-@pytest.fixture(scope="module")
-def access(case: Case) -> Iterator[Access]:
-    with served(case.open()) as opened:
+def access(original: Case) -> Iterator[Access]:
+    with served(original.open()) as opened:
         yield opened
 
 

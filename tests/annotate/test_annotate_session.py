@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from annotating import Case, make_case, place, place_all, place_twenty
 from PIL import Image
+from support.annotating import Case, place, place_all, place_twenty
+from support.refusals import refusal_text
 
 from cadalign import Camera, FitResult, fit
 from cadalign.annotate.photos import Photo, find_photos
@@ -21,28 +21,11 @@ from cadalign.annotate.session import Session
 from cadalign.annotate.state import state_of
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import DataError, InputError
 from cadalign.io.observation import Observation
 
 # Down onto the seat, in the page's coordinates.
 FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
-
-
-@pytest.fixture(scope="module")
-def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return make_case(sample_root, tmp_path_factory.mktemp("annotate"))
-
-
-@pytest.fixture
-def case(original: Case, tmp_path: Path) -> Case:
-    """A copy in a folder of its own."""
-    return original.copied_to(tmp_path / "photos")
-
-
-def refusal(act: Callable[[], object]) -> str:
-    with pytest.raises(CadalignError) as error:
-        act()
-    return str(error.value)
 
 
 def comparable(state: dict[str, Any]) -> dict[str, Any]:
@@ -317,22 +300,22 @@ def test_bad_actions_are_refused_and_change_nothing(
     original: Case, action: dict[str, Any], message: str
 ) -> None:
     session = open_session(image=original.photo, model=original.model, keypoints=original.keypoints)
-    assert refusal(lambda: session.act(0, action)).startswith(message)
+    assert refusal_text(lambda: session.act(0, action)).startswith(message)
     assert session.slides[0].document.pairs == ()
     assert not original.observation.exists()
 
 
 def test_unknown_photo_is_refused(original: Case) -> None:
     session = open_session(image=original.photo, model=original.model)
-    assert refusal(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
-    assert refusal(lambda: state_of(session, -1)) == "image: there is no photo 0"
+    assert refusal_text(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
+    assert refusal_text(lambda: state_of(session, -1)) == "image: there is no photo 0"
 
 
 def test_name_needs_a_model_point(case: Case) -> None:
     session = case.open()
     session.act(0, {"do": "place_uv", "uv": [1, 2]})
     act = {"do": "rename", "pair": 1, "name": "x"}
-    assert refusal(lambda: session.act(0, act)) == "pair: this pair has no model point yet"
+    assert refusal_text(lambda: session.act(0, act)) == "pair: this pair has no model point yet"
 
 
 # --- focal length ----------------------------------------------------------------------------
@@ -444,31 +427,33 @@ def test_orientation_that_does_not_exist_is_ignored(case: Case) -> None:
 def test_what_is_not_a_photo_is_refused(case: Case) -> None:
     text = case.folder / "text.jpg"
     text.write_text("no photo")
-    assert refusal(lambda: case.open(image=text)).startswith(
+    assert refusal_text(lambda: case.open(image=text)).startswith(
         f"{text}: not an image that can be read ("
     )
     cut = case.folder / "cut.png"
     cut.write_bytes(case.photo.read_bytes()[:3000])
-    assert refusal(lambda: case.open(image=cut, camera=None)).startswith(
+    assert refusal_text(lambda: case.open(image=cut, camera=None)).startswith(
         f"{cut}: not an image that can be read ("
     )
     missing = case.folder / "none.png"
-    assert refusal(lambda: case.open(image=missing)) == f"{missing}: no such file or folder"
-    assert refusal(lambda: case.open(model=missing.with_suffix(".obj"))).endswith(
+    assert refusal_text(lambda: case.open(image=missing)) == f"{missing}: no such file or folder"
+    assert refusal_text(lambda: case.open(model=missing.with_suffix(".obj"))).endswith(
         "no such mesh file"
     )
 
 
 def test_photo_and_camera_must_have_the_same_size(case: Case) -> None:
     case.camera.write_text(json.dumps(Camera.from_fov(100, 80, fov_x=50).to_dict()))
-    assert refusal(case.open) == (
+    assert refusal_text(case.open) == (
         f"{case.photo}: the photo is 640 x 480, the camera 100 x 80; give the camera of this photo"
     )
 
 
 def test_camera_file_is_checked(case: Case) -> None:
     case.camera.write_text('{"params": [1]}')
-    assert refusal(case.open).startswith(f"{case.camera}: camera: missing model, width, height")
+    assert refusal_text(case.open).startswith(
+        f"{case.camera}: camera: missing model, width, height"
+    )
 
 
 def test_photos_of_a_folder_come_in_turn_each_with_its_file(
@@ -511,7 +496,7 @@ def test_folder_without_photos_is_refused(tmp_path: Path) -> None:
 
 
 def test_observation_goes_with_one_photo(case: Case) -> None:
-    assert refusal(lambda: case.open(image=case.folder, observation=case.observation)) == (
+    assert refusal_text(lambda: case.open(image=case.folder, observation=case.observation)) == (
         "--observation: names the file of a single photo; "
         "with a folder of photos, or --out, leave it away"
     )
@@ -522,12 +507,14 @@ def test_observation_goes_with_one_photo(case: Case) -> None:
 
 def test_files_of_others_are_never_overwritten(case: Case) -> None:
     case.observation.write_text('{"images": []}')
-    assert refusal(case.open).startswith(f"{case.observation}: top level: unknown field 'images'")
+    assert refusal_text(case.open).startswith(
+        f"{case.observation}: top level: unknown field 'images'"
+    )
     assert case.observation.read_text() == '{"images": []}'
     case.observation.unlink()
     unfinished = case.folder / "photo.unfinished.json"
     unfinished.write_text('{"pairs": []}')
-    assert refusal(case.open) == (
+    assert refusal_text(case.open) == (
         f"{unfinished}: not a file of cadalign unfinished pairs; delete it to go on without"
     )
 
@@ -537,7 +524,7 @@ def test_observation_of_another_model_is_refused(case: Case) -> None:
     Observation(
         instance.points_3d, instance.points_2d, instance.camera, model=case.folder / "table.ply"
     ).save(case.observation)
-    assert refusal(case.open) == (
+    assert refusal_text(case.open) == (
         f"{case.observation}: belongs to the model table.ply, not sample_chair_000.ply; "
         "give another --observation or --out"
     )
@@ -558,10 +545,10 @@ def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
     kept = case.observation.read_bytes(), book.read_bytes()
     ours = f"belongs to the model {case.model.resolve()}, not {other.resolve()}; "
     advice = "give another --observation or --out"
-    assert refusal(lambda: case.open(model=other)) == f"{book}: {ours}{advice}"
+    assert refusal_text(lambda: case.open(model=other)) == f"{book}: {ours}{advice}"
     assert (case.observation.read_bytes(), book.read_bytes()) == kept
     book.unlink()  # the observation is refused without its help
-    assert refusal(lambda: case.open(model=other)) == f"{case.observation}: {ours}{advice}"
+    assert refusal_text(lambda: case.open(model=other)) == f"{case.observation}: {ours}{advice}"
     assert case.observation.read_bytes() == kept[0]
     state_of(case.open(), 0)
 
@@ -570,7 +557,7 @@ def test_halves_of_pairs_of_a_namesake_are_refused(case: Case) -> None:
     case.open().act(0, {"do": "place_keypoint", "keypoint": 0})
     (case.folder / "sample_chair_000.keypoints.json").unlink()
     other = namesake(case)
-    assert refusal(lambda: case.open(model=other)).startswith(
+    assert refusal_text(lambda: case.open(model=other)).startswith(
         f"{case.observation}: belongs to the model {case.model.resolve()}, not "
     )
 

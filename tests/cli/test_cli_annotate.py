@@ -10,7 +10,8 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from annotating import Case, make_case
+from support.annotating import Case, make_case
+from support.refusals import refusal_line
 
 from cadalign.annotate.server import listen
 from cadalign.cli import main
@@ -22,10 +23,7 @@ def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert main(["annotate", *map(str, arguments), "--no-open"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    return captured.err.strip().splitlines()[-1].removeprefix("cadalign: ")
+    return refusal_line(capsys, "annotate", *arguments, "--no-open")
 
 
 def test_it_serves_until_interrupted(case: Case) -> None:

@@ -12,6 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from support.files import TETRAHEDRON
+from support.refusals import refusal_line
 
 from cadalign import FitResult, fit
 from cadalign.cli import main
@@ -19,7 +21,6 @@ from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 
 
 def write_observation(path: Path, problem: Problem = PROBLEM, **fields: Any) -> Path:
@@ -42,17 +43,6 @@ def colors_in(path: Path) -> np.ndarray:
 
 def has_color(path: Path, color: tuple[int, int, int]) -> bool:
     return bool((np.abs(colors_in(path) - color).max(axis=1) < 12).any())
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that is to be refused; its one line on standard error."""
-    assert main(list(arguments)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("cadalign: ")
-    assert captured.err.count("\n") == 1
-    assert captured.err.endswith("\n")
-    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
 
 
 # --- what it does ----------------------------------------------------------------------------
@@ -119,19 +109,21 @@ def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
 
 def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nothing.json"
-    assert refusal(capsys, "fit", str(path)) == f"{path}: no such file"
+    assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
 
 
 def test_malformed_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "chair.json"
     path.write_text('{"camera": \n {"model": }')
-    assert refusal(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
+    assert (
+        refusal_line(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
+    )
 
 
 def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{path}: keypoints[4].uv: NaN or infinite values in row 0; remove or repair these"
     )
 
@@ -139,7 +131,7 @@ def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{path}: keypoints[4].uv: shape (3,), expected (2)"
     )
 
@@ -147,7 +139,7 @@ def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_camera_without_focal_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["camera"].update(params=[0, 150, 320, 240]))
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels"
     )
 
@@ -177,7 +169,7 @@ def test_too_few_keypoints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, count: int, text: str
 ) -> None:
     path = write_observation(tmp_path / "chair.json", first_of(count))
-    assert refusal(capsys, "fit", str(path), "--method", method) == text
+    assert refusal_line(capsys, "fit", str(path), "--method", method) == text
 
 
 def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,11 +178,11 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
     points_2d = PROBLEM.camera.project(PROBLEM.alignment.apply(points_3d))
     flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
     path = write_observation(tmp_path / "chair.json", flat)
-    assert refusal(capsys, "fit", str(path), "--method", "aepnp") == (
+    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp") == (
         "points_3d: the points lie in the plane z = 0.1; "
         "a linear solver needs keypoints that span a volume"
     )
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         "points_3d: the scale s_z is not determined: the points lie in the plane z = 0.1; "
         "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
     )
@@ -198,20 +190,20 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
-    assert refusal(capsys, "fit", str(path), "--method", "best") == (
+    assert refusal_line(capsys, "fit", str(path), "--method", "best") == (
         "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
     )
 
 
 def test_missing_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
+    assert refusal_line(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
 
 
 def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((10, 20, 3), dtype=np.uint8))
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{tmp_path / 'photo.png'}: the image is 20 x 10, the camera 640 x 480; "
         "give the camera of this image"
     )
@@ -220,7 +212,7 @@ def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_photo_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photo.png").write_text("not a picture")
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)).startswith(
+    assert refusal_line(capsys, "fit", str(path)).startswith(
         f"{tmp_path / 'photo.png'}: not an image that can be read ("
     )
 
@@ -242,7 +234,7 @@ def test_model_that_cannot_be_used(
     if content is not None:
         model.write_text(content)
     path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
-    line = refusal(capsys, "fit", str(path))
+    line = refusal_line(capsys, "fit", str(path))
     assert line.startswith(str(model))
     if text is not None:
         assert line == f"{model}: {text}"
@@ -253,7 +245,7 @@ def test_output_folder_that_cannot_be_made(
 ) -> None:
     path = write_observation(tmp_path / "chair.json")
     (tmp_path / "out").write_text("a file in the way")
-    line = refusal(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
+    line = refusal_line(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
     assert line == f"{tmp_path / 'out'}: cannot be made (File exists); choose another --out"
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support import replaced
+from support.files import replaced, write_json
 
 from cadalign import Camera
 from cadalign.datasets import (
@@ -53,13 +52,8 @@ ANNOTATIONS: dict[str, Any] = {
 CSV = "image,name,u,v,score\na.jpg,nose,100.5,200.25,0.9\na.jpg,left ear,80,120,0.4\n"
 
 
-def write(path: Path, data: Any) -> Path:
-    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
-    return path
-
-
 def read(tmp_path: Path, data: Any, name: str = "keypoints.json") -> list[ImageKeypoints]:
-    return read_image_keypoints(write(tmp_path / name, data))
+    return read_image_keypoints(write_json(tmp_path / name, data))
 
 
 def changed(path: str, value: Any) -> dict[str, Any]:
@@ -268,7 +262,7 @@ def test_flags_are_told_from_scores(
     ],
 )
 def test_malformed_json_is_refused_by_file_and_field(tmp_path: Path, data: Any, text: str) -> None:
-    path = write(tmp_path / "keypoints.json", data)
+    path = write_json(tmp_path / "keypoints.json", data)
     with pytest.raises(DataError) as caught:
         read_image_keypoints(path)
     assert text.format(path=path) in str(caught.value)
@@ -331,7 +325,7 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
 def test_malformed_csv_is_refused_by_file_and_line(
     tmp_path: Path, text: str, expected: str
 ) -> None:
-    path = write(tmp_path / "keypoints.csv", text)
+    path = write_json(tmp_path / "keypoints.csv", text)
     with pytest.raises(DataError) as caught:
         read_image_keypoints(path)
     assert str(caught.value).startswith(expected.format(path=path))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import os
 import pickle
@@ -12,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.files import TETRAHEDRON, write_json
 
 from cadalign.datasets import KeypointNet, load_mesh
 from cadalign.errors import DataError, InputError
 
 CHAIR, MUG = "03001627", "03797390"
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 FACES = [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)]
 
@@ -48,11 +47,6 @@ def entry(model_id: str, class_id: str = CHAIR) -> dict:
             ],
         },
     }
-
-
-def write_json(path: Path, value: object) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(value))
 
 
 def write_obj(path: Path) -> Path:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.files import TETRAHEDRON, write_json
 
 from cadalign import Mesh
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints, load_mesh
 from cadalign.errors import DataError
 
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 DATA: dict[str, Any] = {
     "format": "cadalign model keypoints",
     "version": 1,
@@ -33,9 +33,8 @@ DATA: dict[str, Any] = {
 
 
 def write(path: Path, data: Any = DATA) -> Path:
-    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
     (path.parent / "tetrahedron.obj").write_text(TETRAHEDRON)
-    return path
+    return write_json(path, data)
 
 
 def changed(row: int, **fields: Any) -> dict[str, Any]:

@@ -7,20 +7,12 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.problems import fit_problem, problem_of
 
-from cadalign import Alignment, FitResult, FocalPrior, fit
+from cadalign import Alignment, FitResult, FocalPrior
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
 from cadalign.fitting.result import Alternative, FitStats
-
-
-def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5) -> Problem:
-    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
-
-
-def fit_problem(problem: Problem, **options: object) -> FitResult:
-    return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
-
 
 MADE = FitResult(
     alignment=Alignment(

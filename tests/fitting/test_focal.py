@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support import LENS, assert_same, moved, problem_of
+from support.problems import LENS, assert_same, moved, problem_of
 
 from cadalign import Alignment, Camera, FitResult, FocalPrior, RansacOptions, fit, fit_batch
 from cadalign.datasets import Bundler, Colmap

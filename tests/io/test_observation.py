@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replaced
+from support.files import replaced, write_json
 
 from cadalign import Camera
 from cadalign.errors import DataError, InputError
@@ -34,11 +34,6 @@ def changed(path: str, value: Any) -> dict[str, Any]:
     return replaced(DATA, path, value)
 
 
-def write(path: Path, data: Any) -> Path:
-    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
-    return path
-
-
 def test_fields_arrive() -> None:
     observation = Observation.from_dict(DATA)
     assert observation.points_3d.tolist() == [k["xyz"] for k in DATA["keypoints"]]
@@ -53,10 +48,10 @@ def test_fields_arrive() -> None:
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
-    observation = Observation.load(write(tmp_path / "chair.json", DATA))
+    observation = Observation.load(write_json(tmp_path / "chair.json", DATA))
     assert observation.image == tmp_path / "photo.png"
     assert observation.model == tmp_path / "models" / "chair.obj"
-    absolute = write(tmp_path / "chair.json", DATA | {"image": "/elsewhere/photo.png"})
+    absolute = write_json(tmp_path / "chair.json", DATA | {"image": "/elsewhere/photo.png"})
     assert Observation.load(absolute).image == Path("/elsewhere/photo.png")
 
 
@@ -156,7 +151,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
 def test_malformed_files_are_refused_by_file_and_field(
     tmp_path: Path, data: Any, text: str
 ) -> None:
-    path = write(tmp_path / "observation.json", data)
+    path = write_json(tmp_path / "observation.json", data)
     with pytest.raises(DataError) as caught:
         Observation.load(path)
     assert str(caught.value) == text.format(path=path)
@@ -164,7 +159,7 @@ def test_malformed_files_are_refused_by_file_and_field(
 
 def test_file_cut_short_is_refused_with_its_line(tmp_path: Path) -> None:
     whole = json.dumps(DATA, indent=1)
-    path = write(tmp_path / "observation.json", whole[: len(whole) // 2])
+    path = write_json(tmp_path / "observation.json", whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"observation\.json, line \d+: not valid JSON: "):
         Observation.load(path)
 
@@ -207,7 +202,7 @@ def test_saved_paths_still_name_the_same_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("photos").mkdir()
-    write(Path("photos/first.json"), DATA)
+    write_json(Path("photos/first.json"), DATA)
     loaded = Observation.load("photos/first.json")
     for again in ("photos/second.json", "third.json"):
         loaded.save(again)
@@ -256,7 +251,7 @@ def test_save_cut_short_leaves_the_file_as_it_was(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    path = write(tmp_path / "p.json", DATA)
+    path = write_json(tmp_path / "p.json", DATA)
     before = path.read_bytes()
     with monkeypatch.context() as patched:
         patched.setattr("os.replace", full)

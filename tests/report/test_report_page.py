@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from page_watch import Opened, scroll_through, watched
-from playwright.sync_api import Browser, expect
-from report_payloads import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
+from playwright.sync_api import expect
+from support.pages import Opened, scroll_through
+from support.reports import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
@@ -21,17 +20,6 @@ from cadalign.web import asset
 
 # Contrast that WCAG 2 asks of text (AA), and of what is drawn.
 _TEXT, _DRAWN = 4.5, 3.0
-
-
-@pytest.fixture
-def opened(browser: Browser) -> Iterator[Opened]:
-    with watched(browser) as open_page:
-        yield open_page
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
 
 
 def test_everything_of_a_run_is_there(opened: Opened, plain: str) -> None:

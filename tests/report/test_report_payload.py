@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from support.pages import embedded_payload
 
 from cadalign import Alignment, Box, Camera, Library
 from cadalign.datasets import KeypointNet
@@ -40,25 +41,13 @@ METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
 HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
 
 
-def payload_of(page: Path) -> dict[str, Any]:
-    text = page.read_text(encoding="utf-8")
-    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.S)
-    assert found is not None
-    payload: dict[str, Any] = json.loads(found[1], parse_constant=refuse)
-    return payload
-
-
-def refuse(constant: str) -> None:
-    raise AssertionError(f"{constant} is no JSON")
-
-
 def evaluate(root: Path, out: Path, **options: Any) -> Path:
     do_run(KeypointNetOptions(root, **options), RunFolder(out), workers=0)
     return out
 
 
 def report(tmp_path: Path, *runs: Path, **options: Any) -> dict[str, Any]:
-    return payload_of(write_report(runs, tmp_path / "report.html", **options).path)
+    return embedded_payload(write_report(runs, tmp_path / "report.html", **options).path)
 
 
 def annotations(folder: Path, names: list[str], *, points: int = 12) -> Path:
@@ -327,7 +316,7 @@ def test_with_assets_everything_large_is_in_a_folder(
     page = tmp_path / "a b#c%.html"
     written = write_report([drawn], page, assets=True)
     assert written.assets == tmp_path / "a b#c%_assets"
-    outside = payload_of(page)
+    outside = embedded_payload(page)
     assert "exhibits" not in outside
     assert outside["tables"] == payload["tables"]
     urls = [*outside["pictures"].values(), *outside["thumbs"].values()]
@@ -374,7 +363,7 @@ def test_texts_cannot_leave_their_place(tmp_path: Path) -> None:
     assert "<img" not in text.split("</noscript>")[0]
     inside = text.split('id="payload">')[1].split("</script>")[0]
     assert not set("<>&\u2028") & set(inside)
-    found = payload_of(page)
+    found = embedded_payload(page)
     strings, instances, _ = columns(found)
     assert {strings[place] for place in instances["model"]} == set(names)
     assert found["title"] == HOSTILE

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser
+from support.files import write_json
+from support.refusals import refusal_line
 
 from cadalign import Library, Match, Mesh
 from cadalign.cli import main
@@ -70,15 +72,6 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     )
     observation.save(folder / "seen.json")
     return Case(folder, library, model.model_id, frame, observation)
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(list(arguments)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("cadalign: ")
-    assert captured.err.count("\n") == 1
-    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
 
 
 # --- silhouettes -----------------------------------------------------------------------------
@@ -325,7 +318,7 @@ def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
     assert main(["retrieve", *arguments]) == 0
     assert case.model_id in capsys.readouterr().out
     for option in (["--out", str(tmp_path / "out")], ["--silhouette"]):
-        text = refusal(capsys, "retrieve", *arguments, *option)
+        text = refusal_line(capsys, "retrieve", *arguments, *option)
         assert text == f"{gone}: no such file"
     assert not (tmp_path / "out").exists()
 
@@ -399,11 +392,6 @@ def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
 # --- refusals --------------------------------------------------------------------------------
 
 
-def write_json(path: Path, value: Any) -> str:
-    path.write_text(json.dumps(value))
-    return str(path)
-
-
 def test_a_query_needs_no_model_points_but_semantic_ids(case: Case, tmp_path: Path) -> None:
     data = json.loads((case.folder / "seen.json").read_text())
     for keypoint in data["keypoints"]:
@@ -427,7 +415,7 @@ def test_malformed_queries_are_refused(
     path = tmp_path / "query.json"
 
     def refused(value: Any) -> str:
-        text = refusal(capsys, "retrieve", write_json(path, value), *library)
+        text = refusal_line(capsys, "retrieve", write_json(path, value), *library)
         assert text.startswith(f"{path}: ")
         return text.removeprefix(f"{path}: ")
 
@@ -439,8 +427,8 @@ def test_malformed_queries_are_refused(
     assert "keypoints[0]" in refused({"camera": camera, "keypoints": [3]})
     assert "'uvw'" in refused({"camera": camera, "keypoints": [{**keypoint, "uvw": 1}]})
     path.write_text("{")
-    assert "not valid JSON" in refusal(capsys, "retrieve", str(path), *library)
-    missing = refusal(capsys, "retrieve", str(tmp_path / "no.json"), *library)
+    assert "not valid JSON" in refusal_line(capsys, "retrieve", str(path), *library)
+    missing = refusal_line(capsys, "retrieve", str(tmp_path / "no.json"), *library)
     assert missing == f"{tmp_path / 'no.json'}: no such file"
 
 
@@ -448,16 +436,16 @@ def test_what_the_library_refuses_is_one_line(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = case.arguments[0]
-    nowhere = refusal(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
+    nowhere = refusal_line(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
     assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it again, with")
-    unknown = refusal(capsys, "retrieve", *case.arguments, "--category", "chiar")
+    unknown = refusal_line(capsys, "retrieve", *case.arguments, "--category", "chiar")
     assert "did you mean 'chair'" in unknown
-    masked = refusal(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
+    masked = refusal_line(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
     assert masked == f"{tmp_path / 'no.png'}: no such file"
     path = tmp_path / "blind.json"
     replace(case.observation, image=None).save(path)
-    blind = refusal(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
+    blind = refusal_line(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
     assert blind.startswith("--silhouette: the observation names no image; give its image, or")
-    assert "no such folder" in refusal(capsys, "library", "build", str(tmp_path / "none"))
+    assert "no such folder" in refusal_line(capsys, "library", "build", str(tmp_path / "none"))
     (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
-    assert "not a library file" in refusal(capsys, "library", "show", str(tmp_path / "lib"))
+    assert "not a library file" in refusal_line(capsys, "library", "show", str(tmp_path / "lib"))

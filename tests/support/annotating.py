@@ -1,4 +1,4 @@
-"""What the tests of the annotator share: a rendered photo of a sample chair, ready to annotate."""
+"""A rendered photo of a sample chair, ready to annotate, and an annotator served on a free port."""
 
 from __future__ import annotations
 

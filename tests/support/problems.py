@@ -1,8 +1,7 @@
-"""What tests share: random problems, steps of the unknowns, comparisons, edited files."""
+"""Random alignment problems, steps of the unknowns, and comparisons of alignments."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,6 +17,7 @@ LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003)
 
 
 def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5, **options: Any) -> Problem:
+    """A synthetic problem, the same for the same seed."""
     return simulate_problem(
         np.random.default_rng(seed), points=points, noise_px=noise_px, **options
     )
@@ -54,17 +54,3 @@ def assert_drawn_stretches_are_recovered(images: Iterable[Correspondences]) -> N
         found = fit(image.points_3d / scale, image.points_2d, image.camera, method="aepnp")
         np.testing.assert_allclose(found.alignment.scale, scale, rtol=0.01)
         assert rotation_error(est=found.alignment, gt=image.cam_from_world) < 0.5
-
-
-def replaced(data: Any, path: str, value: Any) -> Any:
-    """The data with the entry at a dotted path replaced; removed where the value is `...`."""
-    data = copy.deepcopy(data)
-    *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-    place: Any = data
-    for part in parents:
-        place = place[part]
-    if value is ...:
-        del place[last]
-    else:
-        place[last] = value
-    return data

@@ -1,10 +1,12 @@
-"""Pages opened in a browser that may not complain, nor ask for anything but files."""
+"""The report pages: their embedded payload, and the pages in a browser, watched for errors."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import Browser, Locator, Page, expect
@@ -13,9 +15,22 @@ Opened = Callable[..., Page]
 """Opens an address: ``script`` runs before the page's, console errors with ``allowed`` pass."""
 
 
+def embedded_payload(page: Path) -> dict[str, Any]:
+    """The payload that a page embeds, read as strict JSON."""
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.S)
+    assert found is not None
+    payload: dict[str, Any] = json.loads(found[1], parse_constant=_refuse)
+    return payload
+
+
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
 @contextmanager
 def watched(browser: Browser) -> Iterator[Opened]:
-    """A way to open pages; at the end they are closed, and none may have complained."""
+    """Yield a function that opens pages; in the end close them and assert that none complained."""
     contexts, complaints = [], []
 
     def open_page(

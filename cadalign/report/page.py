@@ -17,27 +17,8 @@ from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
 from cadalign.report.payload import payload_of
 from cadalign.report.runs import all_methods, read_runs
 from cadalign.report.text import title_of
-from cadalign.web import asset
+from cadalign.web import asset, fill
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta name="generator" content="cadalign">
-<link rel="icon" href="data:,">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<noscript>This page needs JavaScript. The same tables without it: cadalign report --format md
-</noscript>
-<script type="application/json" id="payload">{payload}</script>
-<script>{script}</script>
-</body>
-</html>
-"""
 # JSON may have these escaped anywhere they can stand; HTML must not see them.
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -116,7 +97,8 @@ def write_report(
 
 def render_page(payload: dict[str, Any]) -> str:
     """The HTML of a payload; texts in it cannot become part of the page."""
-    return _PAGE.format(
+    return fill(
+        "report.html",
         title=escape(str(payload["title"])),
         style=asset("report.css"),
         payload=dense_json(payload).translate(_ESCAPES),

@@ -341,7 +341,11 @@ class TestRows:
         paper, epnp = CorrespondenceExperiment(options).evaluate([task]).rows
         assert (paper["status"], epnp["status"]) == ("failed", "ok")
         assert "5" in paper["reason"]
-        assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (5, False, None)
+        assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (
+            5,
+            False,
+            None,
+        )
 
 
 class TestBrokenImages:

@@ -17,7 +17,7 @@ from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, same_shapes
-from cadalign.evaluation.retrieval.options import RetrievalOptions
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.spec import SPEC
 from cadalign.evaluation.retrieval.summary import summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, retrieval_tasks
@@ -28,7 +28,7 @@ from cadalign.geometry.metrics import box_iou
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.shape import distances
 
-QUICK = RetrievalOptions(Path(), noises_px=(1.0,), keypoints=(6, 8))
+QUICK = RetrievalRunOptions(Path(), noises_px=(1.0,), keypoints=(6, 8))
 
 
 def make_model(number: int, *, keypoints: int = 12, category: str = "box") -> LibraryModel:
@@ -96,7 +96,7 @@ class TestQueries:
     def test_tasks_are_the_models_with_enough_keypoints(self) -> None:
         models = [make_model(1), make_model(2, keypoints=7), make_model(3, category="can")]
         library = Library.from_models(models)
-        options = RetrievalOptions(Path(), noises_px=(5, 1), keypoints=(9, 6))
+        options = RetrievalRunOptions(Path(), noises_px=(5, 1), keypoints=(9, 6))
         found = [(t.model_id, t.noise_px, t.keypoints) for t in retrieval_tasks(library, options)]
         cases = [(1, 6), (1, 9), (5, 6), (5, 9)]
         expected = [("001", *case) for case in cases] + [("002", 1, 6), ("002", 5, 6)]
@@ -371,7 +371,7 @@ class TestCommand:
 
 @pytest.mark.slow
 def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path: Path) -> None:
-    options = RetrievalOptions(
+    options = RetrievalRunOptions(
         real_data / "keypointnet",
         categories=("chair",),
         noises_px=(1.0,),

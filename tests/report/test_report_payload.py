@@ -27,7 +27,7 @@ from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
-from cadalign.evaluation.retrieval.options import RetrievalOptions
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
@@ -530,7 +530,7 @@ def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
         for keypoint, point in zip(entry["keypoints"], xyz, strict=True):
             keypoint["xyz"] = point
     file.write_text(json.dumps(entries))
-    options = RetrievalOptions(root, keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
+    options = RetrievalRunOptions(root, keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
     do_run(options, RunFolder(tmp_path / "run"), workers=0)
     found = report(tmp_path, tmp_path / "run")
     assert found["title"] == "Retrieval on data"
@@ -554,7 +554,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
         for k, xyz in enumerate(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 9, 3)))
     ]
     Library.from_models(models).save(file)
-    options = RetrievalOptions(file, keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
+    options = RetrievalRunOptions(file, keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
 
     def stop(progress: Progress) -> None:
         if progress.done:

@@ -21,7 +21,7 @@ from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.bounds import error_bound
 from cadalign.retrieval.candidates import gather_field, observe
-from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.options import RetrievalRunOptions
 from cadalign.retrieval.ranking import rank
 from cadalign.retrieval.shape import is_same_shape, shape_distance
 
@@ -375,7 +375,7 @@ def test_no_pose_has_errors_below_the_bound(
     if own_sigmas:
         factors = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
         covariances = factors @ factors.transpose(0, 2, 1)
-    options = RetrievalOptions(sigma=covariances)
+    options = RetrievalRunOptions(sigma=covariances)
     model = LibraryModel("box", "1", xyz, np.arange(count), np.zeros((2, 3)))
     field = gather_field(
         Library.from_models([model])._table,
@@ -405,7 +405,7 @@ def test_the_bound_is_the_eigenvalue_over_the_largest_leverage() -> None:
 
 def test_the_bound_spares_most_of_the_work() -> None:
     pixels = view(MODELS[3], pose_of(3), noise_px=1.0)
-    options = RetrievalOptions(top=1)
+    options = RetrievalRunOptions(top=1)
     many = Library.from_models([make_model(number) for number in range(2000)])
     observed = observe(pixels, IDS, CAMERA, options)
     ranking = rank(gather_field(many._table, observed, options), observed, options)

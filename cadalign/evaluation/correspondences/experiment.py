@@ -30,7 +30,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -77,17 +77,10 @@ class CorrespondenceExperiment:
         Of which those on methods, the search for inliers and the seed are used.
     """
 
+    columns: ClassVar[Columns] = COLUMNS
+    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+
     options: CorrespondenceOptions
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table."""
-        return COLUMNS
-
-    @property
-    def timing_columns(self) -> Columns:
-        """The input, the method, and the seconds of its call."""
-        return (*_NAMES, ("seconds", float))
 
     def warm_up(self) -> None:
         """Compile the solvers."""

@@ -33,7 +33,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -90,26 +90,16 @@ class KeypointNetExperiment:
         pictures must exist.
     """
 
+    columns: ClassVar[Columns] = COLUMNS
+    # A method's share of the seconds that its chunk took.
+    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    record_columns: ClassVar[Columns] = RECORD_COLUMNS
+
     methods: tuple[str, ...]
     noise_px: float = 1.0
     min_visible: int = 6
     seed: int = 0
     drawn_in: RunFolder | None = None
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table."""
-        return COLUMNS
-
-    @property
-    def timing_columns(self) -> Columns:
-        """The instance, the method, and its share of the seconds that its chunk took."""
-        return (*_NAMES, ("seconds", float))
-
-    @property
-    def record_columns(self) -> Columns:
-        """Columns of the instance records; see `cadalign.evaluation.instances.record`."""
-        return RECORD_COLUMNS
 
     def warm_up(self) -> None:
         """Compile solvers and metrics."""

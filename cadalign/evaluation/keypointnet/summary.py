@@ -37,10 +37,8 @@ class CategorySummary:
         Their number, and that of those that failed.
     keypoints : float
         Mean number of keypoints of those that didn't fail.
-    rotation_error_deg, translation_error, scale_y_error, scale_z_error, box_iou : float
-        Medians over those that didn't fail; the scale errors are fractions. NaN where all failed.
-    sym_rotation_error_deg, sym_translation_error, sym_box_iou : float
-        The same, from the nearest truth that looks the same.
+    rotation_error_deg to sym_box_iou : float
+        Medians of the result table's columns over those that didn't fail; NaN where all failed.
     success_5deg_5pct, success_10deg_10pct : float
         Share of all instances, failed ones too, with symmetry-aware rotation error, translation
         error in diagonals of the model's box and both relative scale errors at most this.

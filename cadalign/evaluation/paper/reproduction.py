@@ -29,26 +29,20 @@ _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCAL
 
 @dataclass(frozen=True)
 class PaperPlan:
-    """Runs for the paper's tables and figures.
+    """Runs for the paper's tables and figures."""
 
-    Parameters
-    ----------
-    out : Path
-        The folder for everything.
-    root : Path, optional
-        A dataset in KeypointNet's layout, besides the sample dataset.
-    quick : bool
-        A pass of about two minutes, with fewer problems.
-    seed, workers : int
-    dask : str, optional
-    """
-
-    out: Path
+    out: Path = Path("paper")
+    """Folder to write to."""
     root: Path | None = None
+    """Dataset in KeypointNet's layout, besides the sample dataset."""
     quick: bool = False
+    """Few problems: about two minutes."""
     seed: int = 0
+    """Seed of everything random."""
     workers: int = -1
+    """Processes; -1 for all cores."""
     dask: str | None = None
+    """Address of a Dask scheduler to use instead."""
 
 
 Announce = Callable[[str], Callable[[Progress], object]]
@@ -178,18 +172,10 @@ def _table_rows(summaries: Sequence[CategorySummary]) -> list[list[str]]:
             rows.append([category, name, *summary.texts()[:5], ratio])
         stated = PAPER_TABLE.get(category) if category != ALL else None
         if stated is not None:
-            rows.append(
-                [
-                    category,
-                    STATED,
-                    f"{stated.keypoints:.0f}",
-                    f"{stated.rotation_error_deg:.3f}",
-                    f"{stated.translation_error:.3f}",
-                    f"{100 * stated.scale_y_error:.1f}",
-                    f"{100 * stated.scale_z_error:.1f}",
-                    "",
-                ]
-            )
+            # With the digits that the paper prints.
+            errors = f"{stated.rotation_error_deg:.3f}", f"{stated.translation_error:.3f}"
+            scales = f"{100 * stated.scale_y_error:.1f}", f"{100 * stated.scale_z_error:.1f}"
+            rows.append([category, STATED, f"{stated.keypoints:.0f}", *errors, *scales, ""])
     return rows
 
 

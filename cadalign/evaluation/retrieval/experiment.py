@@ -33,7 +33,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.outcome import FAILED, Outcome, overlap, reason_of
-from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalOptions
+from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
@@ -85,21 +85,14 @@ class RetrievalExperiment:
     ----------
     library : str
         The library's file, which all workers map into memory.
-    options : RetrievalOptions
+    options : RetrievalRunOptions
     """
 
+    columns: ClassVar[Columns] = COLUMNS
+    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+
     library: str
-    options: RetrievalOptions
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table."""
-        return COLUMNS
-
-    @property
-    def timing_columns(self) -> Columns:
-        """The cells that name the row, and the seconds of the retrieval."""
-        return (*_NAMES, ("seconds", float))
+    options: RetrievalRunOptions
 
     def warm_up(self) -> None:
         """Compile the kernels."""

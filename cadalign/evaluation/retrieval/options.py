@@ -21,7 +21,7 @@ METHODS = ("optimal", "optimal-unstretched", "epnp")
 
 
 @dataclass(frozen=True)
-class RetrievalOptions(ModelOptions):
+class RetrievalRunOptions(ModelOptions):
     """Evaluate the retrieval of CAD models.
 
     Each model is stretched by factors from 0.5 to 2 along y and z and seen from a random view; some
@@ -72,4 +72,4 @@ class RetrievalOptions(ModelOptions):
         self.check_least(shape_sigma=0)
 
 
-OPTIONS = RetrievalOptions
+OPTIONS = RetrievalRunOptions

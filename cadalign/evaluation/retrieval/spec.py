@@ -7,7 +7,7 @@ from functools import partial
 
 from cadalign.evaluation.metrics import QUERIES
 from cadalign.evaluation.retrieval.experiment import RetrievalExperiment
-from cadalign.evaluation.retrieval.options import RetrievalOptions
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.summary import HEADLINE, console_table, lines, plots, summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, retrieval_tasks
 from cadalign.evaluation.runs.folder import RunFolder
@@ -19,7 +19,7 @@ from cadalign.retrieval.library import Library
 _CHUNK = 16
 
 
-def plan(options: RetrievalOptions, folder: RunFolder) -> Plan[RetrievalTask]:
+def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]:
     """Plan a run over the models of a library, which the folder gets as ``library.cadalign``."""
     library = _library_of(options)
     tasks = retrieval_tasks(library, options)
@@ -40,7 +40,7 @@ def plan(options: RetrievalOptions, folder: RunFolder) -> Plan[RetrievalTask]:
     return Plan(RetrievalExperiment(str(file.absolute()), options), tasks, config, _CHUNK)
 
 
-def _library_of(options: RetrievalOptions) -> Library:
+def _library_of(options: RetrievalRunOptions) -> Library:
     """The library at a place, or one of the data set there."""
     from cadalign.datasets import KeypointNet
 
@@ -56,7 +56,7 @@ def _describe(run: Run) -> str:
 
 
 SPEC = Spec(
-    options=RetrievalOptions,
+    options=RetrievalRunOptions,
     plan=plan,
     columns=HEADLINE,
     summarize=summarize,

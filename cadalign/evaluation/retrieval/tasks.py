@@ -11,7 +11,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
-from cadalign.evaluation.retrieval.options import RetrievalOptions
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -36,7 +36,7 @@ class RetrievalTask:
         return {**asdict(self), "protocol": protocol, "method": method}
 
 
-def retrieval_tasks(library: Library, options: RetrievalOptions) -> list[RetrievalTask]:
+def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
     """Every model with every noise and number of keypoints that it has, those of a model together.
 
     Raises

@@ -150,6 +150,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
 def print_table(table: ConsoleTable) -> None:
     """Print a table on standard output."""
     from rich import box
+    from rich.markup import escape
     from rich.table import Table
 
     style: dict[str, Any] = {}
@@ -157,14 +158,15 @@ def print_table(table: ConsoleTable) -> None:
         style = {"box": box.SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0)}
     shown = Table(title=table.title, **style)
     for name in table.labels:
-        shown.add_column(name, no_wrap=True)
+        shown.add_column(escape(name), no_wrap=True)
     for name in table.heads:
-        shown.add_column(name, justify="right", no_wrap=not table.wraps)
+        shown.add_column(escape(name), justify="right", no_wrap=not table.wraps)
     previous = None
     for first, *rest in table.rows:
         if table.grouped and previous not in (None, first):
             shown.add_section()
-        shown.add_row("" if table.grouped and first == previous else first, *rest)
+        label = "" if table.grouped and first == previous else first
+        shown.add_row(*map(escape, (label, *rest)))
         previous = first
     console = new_console(stderr=False)
     console.print(shown)

@@ -24,7 +24,7 @@ test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, renderers and retrieval
 	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
-	$(BIN)/python -m pytest tests/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
+	$(BIN)/python -m pytest tests/fitting/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/benchmark_focal.py
 	$(BIN)/python scripts/benchmark_render.py
 ifneq ($(CADALIGN_DATA),)

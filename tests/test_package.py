@@ -14,17 +14,24 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
+    "OpenGL",
     "PIL",
     "cv2",
     "dask",
     "embreex",
+    "joblib",
+    "matplotlib",
     "numba",
     "open3d",
+    "pandas",
+    "pyarrow",
     "pyrender",
     "rich",
     "scipy",
+    "starlette",
     "trimesh",
     "tyro",
+    "uvicorn",
 }
 SHARED = "../" + "shared"
 
@@ -169,6 +176,30 @@ def test_everything_that_is_promised_is_there() -> None:
     assert "False" not in python(code)
     code = "from cadalign import *; print(fit, fit_batch, Camera, Alignment, Box, FitResult)"
     assert "function fit" in python(code)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["datasets.KeypointNet", "solvers.aepnp", "render.RaycastRenderer", "metrics.rotation_error"],
+)
+def test_names_resolve_after_a_bare_import(name: str) -> None:
+    code = f"import cadalign; print(cadalign.{name}.__name__)"
+    assert python(code).strip() == name.partition(".")[2]
+
+
+def test_listing_names_what_is_public_and_nothing_foreign() -> None:
+    code = """
+import json, cadalign
+origins = {}
+for name in set(dir(cadalign)) - {"__version__"}:
+    value = getattr(cadalign, name)
+    origins[name] = getattr(value, "__module__", None) or value.__name__
+print(json.dumps([dir(cadalign), cadalign.__all__, origins]))
+"""
+    listed, public, origins = json.loads(python(code))
+    assert listed == sorted([*public, "__version__"])
+    assert {"datasets", "fit", "metrics", "render", "solvers"} <= set(listed)
+    assert {origin.split(".")[0] for origin in origins.values()} == {"cadalign"}
 
 
 def test_unknown_name_is_an_attribute_error() -> None:

@@ -15,7 +15,10 @@ MAX_SOLUTIONS = 8
 
 _TOUCHING = 1e-7
 _POLISH_STEPS = 5
-_EXACT = 1e-7  # largest cosine between axes of a solution that counts as one
+_EXACT = 1e-7  # largest value of a quadric, over its summands, at an intersection
+# Largest cosine between columns of a rotation. Columns that nearly cancel can be far from
+# orthogonal where the quadrics, which are relative to their summands, look exact.
+_ORTHOGONAL = 1e-4
 _SAME = 1e-6  # relative difference of depths below which two solutions are one
 
 
@@ -427,7 +430,7 @@ def _pose_from_depths(
     depths: FloatArray,
     pose: FloatArray,
 ) -> bool:
-    """Pack rotation, translation and scale; False for a mirrored solution."""
+    """Pack rotation, translation and scale; False for a mirrored or inexact solution."""
     columns = np.zeros((3, 3))
     for j in range(3):
         for i in range(4):
@@ -440,6 +443,12 @@ def _pose_from_depths(
         lengths[j] = np.sqrt(columns[0, j] ** 2 + columns[1, j] ** 2 + columns[2, j] ** 2)
         for c in range(3):
             columns[c, j] /= lengths[j]
+    for j in range(3):
+        cosine = 0.0
+        for c in range(3):
+            cosine += columns[c, j] * columns[c, (j + 1) % 3]
+        if not abs(cosine) < _ORTHOGONAL:
+            return False
     rotation = np.empty((3, 3))
     polish_rotation(columns, rotation)
     for j in range(3):

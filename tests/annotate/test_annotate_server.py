@@ -6,10 +6,9 @@ import http.client
 import json
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from annotating import Case, make_case, served
+from support.annotating import Case, served
 
 from cadalign.annotate.guard import MAX_BODY, Access
 from cadalign.annotate.server import listen
@@ -19,13 +18,8 @@ UNDO = json.dumps({"do": "undo"})
 
 
 @pytest.fixture(scope="module")
-def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return make_case(sample_root, tmp_path_factory.mktemp("served"))
-
-
-@pytest.fixture(scope="module")
-def access(case: Case) -> Iterator[Access]:
-    with served(case.open()) as opened:
+def access(original: Case) -> Iterator[Access]:
+    with served(original.open()) as opened:
         yield opened
 
 
@@ -234,8 +228,8 @@ def test_port_in_use_is_an_error_in_words() -> None:
         with pytest.raises(InputError) as error:
             listen(port)
     assert str(error.value) == (
-        f"--port: port {port} cannot be listened on (Address already in use); "
-        "leave --port away to get a free one"
+        f"--port: port {port} cannot be opened (Address already in use); "
+        "omit --port to use a free one"
     )
-    with pytest.raises(InputError, match=r"^--port: port 99999 cannot be listened on"):
+    with pytest.raises(InputError, match=r"^--port: port 99999 cannot be opened"):
         listen(99999)

@@ -10,7 +10,8 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from annotating import Case, make_case
+from support.annotating import Case, make_case
+from support.refusals import refusal_line
 
 from cadalign.annotate.server import listen
 from cadalign.cli import main
@@ -22,10 +23,7 @@ def case(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert main(["annotate", *map(str, arguments), "--no-open"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    return captured.err.strip().splitlines()[-1].removeprefix("cadalign: ")
+    return refusal_line(capsys, "annotate", *arguments, "--no-open")
 
 
 def test_it_serves_until_interrupted(case: Case) -> None:
@@ -52,8 +50,8 @@ def test_port_in_use(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
         port = listener.getsockname()[1]
         message = refusal(capsys, "--image", case.photo, "--model", case.model, "--port", port)
     assert message == (
-        f"--port: port {port} cannot be listened on (Address already in use); "
-        "leave --port away to get a free one"
+        f"--port: port {port} cannot be opened (Address already in use); "
+        "omit --port to use a free one"
     )
 
 
@@ -74,7 +72,8 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
     file = case.folder / "file"
     file.write_text("")
     message = refusal(capsys, "--image", case.photo, "--model", case.model, "--out", file / "out")
-    assert message == f"{file / 'out'}: cannot be made (Not a directory); choose another --out"
+    reason = "the folder cannot be created (Not a directory); choose another --out"
+    assert message == f"{file / 'out'}: {reason}"
 
 
 def test_folder_of_the_observation_is_made(

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from support.pages import embedded_payload
 
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, load_mesh
@@ -29,14 +30,6 @@ def run(root: Path, out: Path, *options: str) -> int:
 def rows_of(out: Path) -> list[dict[str, str]]:
     with (out / "results.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
-
-
-def payload_of(out: Path) -> dict[str, Any]:
-    page = (out / "index.html").read_text(encoding="utf-8")
-    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', page, re.S)
-    assert found is not None
-    payload: dict[str, Any] = json.loads(found[1])
-    return payload
 
 
 def picture_of(out: Path, row: dict[str, str]) -> Path:
@@ -95,7 +88,7 @@ def test_every_overlay_shows_both_boxes_over_a_rendered_model(out: Path) -> None
 
 
 def test_page_holds_every_instance_with_its_picture_and_model(out: Path) -> None:
-    payload = payload_of(out)
+    payload = embedded_payload(out / "index.html")
     instances = payload["tables"]["instances"]
     assert [payload["tables"]["strings"][k] for k in instances["category"]] == CATEGORIES
     assert payload["title"] == "cadalign demo"
@@ -255,7 +248,7 @@ def test_bad_instance_becomes_a_failed_row_and_the_rest_goes_on(
     assert float(car["seconds"]) >= 0
     assert not picture_of(out, car).exists()
     assert picture_of(out, bottle).exists()
-    payload = payload_of(out)
+    payload = embedded_payload(out / "index.html")
     assert car["reason"] in payload["tables"]["strings"]
     assert payload["tables"]["rows"]["status"] == [0, 1, 0]
     assert len(payload["pictures"]) == len(payload["thumbs"]) == 2
@@ -285,7 +278,7 @@ def test_page_escapes_what_files_say(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert run(root, out, "--categories", "car") == 0
     assert name not in (out / "index.html").read_text(encoding="utf-8")
-    payload = payload_of(out)
+    payload = embedded_payload(out / "index.html")
     assert name in payload["tables"]["strings"]
     assert len(payload["pictures"]) == 1
     (row,) = rows_of(out)
@@ -298,10 +291,10 @@ def test_page_escapes_what_files_say(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["--per-category", "0"], "--per-category: 0 is not positive"),
+        (["--per-category", "0"], "--per-category: 0 is less than 1"),
         (["--noise-px", "-1"], "--noise-px: -1.0 is not a noise level"),
         (["--noise-px", "nan"], "--noise-px: nan is not a noise level"),
-        (["--seed", "-1"], "--seed: -1 is negative"),
+        (["--seed", "-1"], "--seed: -1 is less than 0"),
         (
             ["--root", "/nowhere/at/all"],
             "/nowhere/at/all: no such folder; give KeypointNet's root",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,14 +14,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from support.files import TETRAHEDRON
+from support.refusals import refusal_line
 
-from cadalign import FitResult, fit
+from cadalign import FitResult, RansacOptions, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 
 
 def write_observation(path: Path, problem: Problem = PROBLEM, **fields: Any) -> Path:
@@ -42,17 +45,6 @@ def colors_in(path: Path) -> np.ndarray:
 
 def has_color(path: Path, color: tuple[int, int, int]) -> bool:
     return bool((np.abs(colors_in(path) - color).max(axis=1) < 12).any())
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Run a command that is to be refused; its one line on standard error."""
-    assert main(list(arguments)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("cadalign: ")
-    assert captured.err.count("\n") == 1
-    assert captured.err.endswith("\n")
-    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
 
 
 # --- what it does ----------------------------------------------------------------------------
@@ -102,6 +94,54 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+def test_options_of_fit_are_those_of_the_function(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json", sigma=np.linspace(0.2, 5, 10))
+    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--scale-prior-sigma", "0.3"]
+    assert main(["fit", str(path), *flags]) == 0
+    expected = fit(
+        PROBLEM.points_3d,
+        PROBLEM.points_2d,
+        PROBLEM.camera,
+        sigma=2.0,
+        loss="cauchy",
+        stretch="y",
+        scale_prior_sigma=0.3,
+    )
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_options_of_ransac_need_no_prefix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    flags = ["--robust", "--max-reproj-error", "6", "--seed", "3", "--no-refine"]
+    assert main(["fit", str(path), *flags]) == 0
+    ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_full_disk_is_reported_and_leaves_earlier_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path)]) == 0
+    written = tmp_path / "chair_fit" / "fit.json"
+    before = written.read_bytes()
+    capsys.readouterr()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp").startswith(
+        f"{written}: cannot be written (No space left on device); "
+    )
+    assert written.read_bytes() == before
+
+
 def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
     blue = np.full((480, 640, 3), (200, 90, 40), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), blue)
@@ -119,35 +159,37 @@ def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
 
 def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nothing.json"
-    assert refusal(capsys, "fit", str(path)) == f"{path}: no such file"
+    assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
 
 
 def test_malformed_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "chair.json"
     path.write_text('{"camera": \n {"model": }')
-    assert refusal(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
+    assert (
+        refusal_line(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
+    )
 
 
 def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
-    assert refusal(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: NaN or infinite values in row 0; remove or repair these"
+    assert refusal_line(capsys, "fit", str(path)) == (
+        f"{path}: keypoints[4].uv[0]: nan is not a finite number"
     )
 
 
 def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
-    assert refusal(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: shape (3,), expected (2)"
+    assert refusal_line(capsys, "fit", str(path)) == (
+        f"{path}: keypoints[4].uv: [1, 2, 3] is not a list of 2"
     )
 
 
 def test_camera_without_focal_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["camera"].update(params=[0, 150, 320, 240]))
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels"
     )
 
@@ -177,7 +219,7 @@ def test_too_few_keypoints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, count: int, text: str
 ) -> None:
     path = write_observation(tmp_path / "chair.json", first_of(count))
-    assert refusal(capsys, "fit", str(path), "--method", method) == text
+    assert refusal_line(capsys, "fit", str(path), "--method", method) == text
 
 
 def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,11 +228,11 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
     points_2d = PROBLEM.camera.project(PROBLEM.alignment.apply(points_3d))
     flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
     path = write_observation(tmp_path / "chair.json", flat)
-    assert refusal(capsys, "fit", str(path), "--method", "aepnp") == (
+    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp") == (
         "points_3d: the points lie in the plane z = 0.1; "
         "a linear solver needs keypoints that span a volume"
     )
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         "points_3d: the scale s_z is not determined: the points lie in the plane z = 0.1; "
         "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
     )
@@ -198,20 +240,30 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
-    assert refusal(capsys, "fit", str(path), "--method", "best") == (
-        "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+    assert refusal_line(capsys, "fit", str(path), "--method", "best") == (
+        "--method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+    )
+
+
+def test_given_and_estimated_sigma_exclude_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert refusal_line(capsys, "fit", str(path), "--sigma", "2", "--similar") == (
+        "--sigma: --similar estimates the standard deviation, which --sigma gives; "
+        "give one of the two options"
     )
 
 
 def test_missing_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
+    assert refusal_line(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
 
 
 def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((10, 20, 3), dtype=np.uint8))
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)) == (
+    assert refusal_line(capsys, "fit", str(path)) == (
         f"{tmp_path / 'photo.png'}: the image is 20 x 10, the camera 640 x 480; "
         "give the camera of this image"
     )
@@ -220,7 +272,7 @@ def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_photo_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photo.png").write_text("not a picture")
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal(capsys, "fit", str(path)).startswith(
+    assert refusal_line(capsys, "fit", str(path)).startswith(
         f"{tmp_path / 'photo.png'}: not an image that can be read ("
     )
 
@@ -242,7 +294,7 @@ def test_model_that_cannot_be_used(
     if content is not None:
         model.write_text(content)
     path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
-    line = refusal(capsys, "fit", str(path))
+    line = refusal_line(capsys, "fit", str(path))
     assert line.startswith(str(model))
     if text is not None:
         assert line == f"{model}: {text}"
@@ -253,8 +305,10 @@ def test_output_folder_that_cannot_be_made(
 ) -> None:
     path = write_observation(tmp_path / "chair.json")
     (tmp_path / "out").write_text("a file in the way")
-    line = refusal(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
-    assert line == f"{tmp_path / 'out'}: cannot be made (File exists); choose another --out"
+    line = refusal_line(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
+    assert line == (
+        f"{tmp_path / 'out'}: the folder cannot be created (File exists); choose another --out"
+    )
 
 
 @pytest.mark.parametrize(

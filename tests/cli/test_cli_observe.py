@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera, FitResult, FocalPrior, fit
 from cadalign.cli import main
@@ -48,19 +48,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def observing(folder: Path, *options: str) -> list[str]:
+    found, model = folder / "found.json", folder / "model.keypoints.json"
+    return ["observe", str(found), str(model), *options]
+
+
 def observe(folder: Path, *options: str) -> int:
-    return main(
-        ["observe", str(folder / "found.json"), str(folder / "model.keypoints.json"), *options]
-    )
-
-
-def refusal(capsys: pytest.CaptureFixture[str], run: Callable[[], int]) -> str:
-    """What is to be refused; its one line on standard error."""
-    assert run() == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
+    return main(observing(folder, *options))
 
 
 def fitted(folder: Path, name: str, *options: str) -> FitResult:
@@ -92,7 +86,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     result = fitted(folder, "found.observation")
     captured = capsys.readouterr()
     focal = 34 / np.hypot(36, 24) * 800
-    assert f"Focal length by the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
+    assert f"Focal length from the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(
@@ -185,7 +179,7 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], "{folder}/found.json: [0]: the photo's size is not known; give --image or --camera"),
+        ([], "{folder}/found.json: [0]: the photo's size is unknown; give --image or --camera"),
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
@@ -203,7 +197,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
 ) -> None:
     given = [option.format(folder=folder) for option in options]
-    line = refusal(capsys, lambda: observe(folder, *given))
+    line = refusal_line(capsys, *observing(folder, *given))
     assert line.startswith(text.format(folder=folder))
 
 
@@ -236,8 +230,8 @@ def test_photo_and_camera_of_different_sizes_are_refused(
     camera.write_text(json.dumps(Camera(100, 50, 60.0, 60.0, 50.0, 25.0).to_dict()))
     photo = folder / "photo.jpg"
     options = ("--image", str(photo), "--camera", str(camera))
-    text = refusal(capsys, lambda: observe(folder, *options))
+    text = refusal_line(capsys, *observing(folder, *options))
     assert text == (
         f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
-        "give what belongs together"
+        "give keypoints, photo and camera of one image"
     )

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support import assert_drawn_stretches_are_recovered
+from support.files import exact
+from support.problems import assert_drawn_stretches_are_recovered
 
 from cadalign.datasets import Bundler
 from cadalign.errors import DataError, InputError
@@ -52,17 +53,13 @@ class Model:
     def write(self, folder: Path, name: str = "bundle.out") -> Path:
         lines = ["# Bundle file v0.3", f"{len(self.cameras)} {len(self.points)}"]
         for focal, k1, k2, rotation, translation in self.cameras:
-            lines += [join([focal, k1, k2]), *(join(row) for row in rotation), join(translation)]
+            lines += [exact([focal, k1, k2]), *(exact(row) for row in rotation), exact(translation)]
         for xyz, views in zip(self.points, self.views, strict=True):
-            listed = " ".join(f"{camera} {key} {join(xy)}" for camera, key, *xy in views)
-            lines += [join(xyz), "255 0 17", f"{len(views)} {listed}"]
+            listed = " ".join(f"{camera} {key} {exact(xy)}" for camera, key, *xy in views)
+            lines += [exact(xyz), "255 0 17", f"{len(views)} {listed}"]
         folder.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("\n".join(lines) + "\n")
         return folder / name
-
-
-def join(values) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 def write_photo(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import assert_drawn_stretches_are_recovered
+from support.files import exact
+from support.problems import assert_drawn_stretches_are_recovered
 
 from cadalign.datasets import Colmap, Correspondences
 from cadalign.errors import DataError, InputError
@@ -70,13 +71,13 @@ class Model:
         folder.mkdir(parents=True, exist_ok=True)
         cameras = ["# Camera list"]
         for number, (model, width, height, params) in self.cameras.items():
-            cameras.append(f"{number} {model} {width} {height} {join(params)}")
+            cameras.append(f"{number} {model} {width} {height} {exact(params)}")
         images = ["# Image list"]
         for number, quat, translation, camera_id, name, observations in reversed(self.images):
-            images.append(f"{number} {join(quat)} {join(translation)} {camera_id} {name}")
+            images.append(f"{number} {exact(quat)} {exact(translation)} {camera_id} {name}")
             images.append(" ".join(f"{x!r} {y!r} {i}" for x, y, i in observations))
         points = ["# 3D point list"]
-        points += [f"{i} {join(xyz)} 1 2 3 0.5 1 2 3 4" for i, xyz in self.points.items()]
+        points += [f"{i} {exact(xyz)} 1 2 3 0.5 1 2 3 4" for i, xyz in self.points.items()]
         for stem, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
             (folder / f"{stem}.txt").write_text("\n".join(lines) + "\n")
         return folder
@@ -101,10 +102,6 @@ class Model:
             data += struct.pack("<IIII", 1, 2, 3, 4)
         (folder / "points3D.bin").write_bytes(data)
         return folder
-
-
-def join(values) -> str:
-    return " ".join(repr(float(value)) for value in values)
 
 
 WRITERS = [Model.write_text, Model.write_binary]

@@ -10,22 +10,19 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from support.renderers import renderer_or_skip
 from trimesh.visual.material import PBRMaterial
 
 from cadalign import Camera
 from cadalign.datasets import load_mesh
 from cadalign.render import Scene, frame_object, look_at, make_renderer
-from cadalign.render.probe import probe_renderer
 
 CAMERA = Camera.from_fov(320, 240, fov_x=45)
 
 
 @pytest.fixture(params=["raycast", "open3d", "pyrender"])
 def renderer(request):
-    found = probe_renderer(request.param)
-    if not found.works:
-        pytest.skip(f"{request.param} does not work here: {found.detail}")
-    return make_renderer(request.param)
+    return renderer_or_skip(request.param)
 
 
 def _moved(x, y, z, *, turn=0.0, mirror=False):

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.files import TETRAHEDRON, write_json
 
 from cadalign import Mesh
 from cadalign.datasets import KeypointNet, ModelKeypoint, ModelKeypoints, load_mesh
 from cadalign.errors import DataError
 
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 DATA: dict[str, Any] = {
     "format": "cadalign model keypoints",
     "version": 1,
@@ -33,9 +33,8 @@ DATA: dict[str, Any] = {
 
 
 def write(path: Path, data: Any = DATA) -> Path:
-    path.write_text(data if isinstance(data, str) else json.dumps(data), encoding="utf-8")
     (path.parent / "tetrahedron.obj").write_text(TETRAHEDRON)
-    return path
+    return write_json(path, data)
 
 
 def changed(row: int, **fields: Any) -> dict[str, Any]:
@@ -103,7 +102,11 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        ([1], "{path}: expected an object, got list"),
+        (
+            [1],
+            "{path}: a list, not an object of model keypoints; "
+            "give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
+        ),
         (
             DATA | {"format": "other"},
             "{path}: format: 'other' is not 'cadalign model keypoints'; "
@@ -118,8 +121,8 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             "{path}: top level: unknown field 'points'; "
             "known are format, keypoints, model, version",
         ),
-        (DATA | {"keypoints": {}}, "{path}: keypoints: expected a list"),
-        (DATA | {"model": 3}, "{path}: model: 3 is not a path"),
+        (DATA | {"keypoints": {}}, "{path}: keypoints: {{}} is not a list"),
+        (DATA | {"model": 3}, "{path}: model: 3 is not a text"),
         (changed(1, name=...), "{path}: keypoints[1].name: missing"),
         (changed(1, name=""), "{path}: keypoints[1].name: '' is not a text"),
         (changed(1, name=4), "{path}: keypoints[1].name: 4 is not a text"),
@@ -139,10 +142,10 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             changed(0, xyz=...),
             "{path}: keypoints[0].xyz: missing; or give face_index and barycentric",
         ),
-        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: shape (2,), expected (3)"),
+        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: [1, 2] is not a list of 3"),
         (
             changed(0, xyz=[1, 2, None]),
-            "{path}: keypoints[0].xyz: NaN or infinite values in row 2; remove or repair these",
+            "{path}: keypoints[0].xyz[2]: None is not a finite number",
         ),
         (
             changed(1, barycentric=...),
@@ -166,7 +169,7 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             "{path}: keypoints[0]: unknown field 'colour'; "
             "known are barycentric, face_index, name, semantic_id, xyz",
         ),
-        (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: expected an object, got int"),
+        (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: 3 is not an object"),
         (
             {name: value for name, value in DATA.items() if name != "model"},
             "{path}: keypoints[2]: neither xyz nor a model that the face belongs to; "

@@ -13,15 +13,12 @@ import cv2
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
+from support.problems import problem_of
 
 from cadalign import Box, RansacOptions, fit, fit_batch
-from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
+from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import box_iou
 from cadalign.solvers import aepnp, aepnp_paper, ap4p
-
-
-def problem_of(points: int, noise_px: float = 1.0) -> Problem:
-    return simulate_problem(np.random.default_rng(points), points=points, noise_px=noise_px)
 
 
 @pytest.mark.parametrize("points", [10, 1024])
@@ -29,32 +26,32 @@ def problem_of(points: int, noise_px: float = 1.0) -> Problem:
 def test_linear_solvers(
     benchmark: BenchmarkFixture, solver: Callable[..., object], points: int
 ) -> None:
-    problem = problem_of(points)
+    problem = problem_of(points, points=points, noise_px=1.0)
     benchmark(solver, problem.points_3d, problem.camera.normalize(problem.points_2d))
 
 
 def test_minimal_solver(benchmark: BenchmarkFixture) -> None:
-    problem = problem_of(4, noise_px=0.0)
+    problem = problem_of(4, points=4, noise_px=0.0)
     benchmark(ap4p, problem.points_3d, problem.camera.normalize(problem.points_2d))
 
 
 @pytest.mark.parametrize("points", [6, 10, 100, 1024])
 @pytest.mark.parametrize("method", ["optimal", "aepnp"])
 def test_fit(benchmark: BenchmarkFixture, method: str, points: int) -> None:
-    problem = problem_of(points)
+    problem = problem_of(points, points=points, noise_px=1.0)
     benchmark(fit, problem.points_3d, problem.points_2d, problem.camera, method=method)
 
 
 @pytest.mark.parametrize("workers", [1, -1])
 def test_fit_batch(benchmark: BenchmarkFixture, workers: int) -> None:
-    problem = problem_of(10)
+    problem = problem_of(10, points=10, noise_px=1.0)
     points_3d = np.tile(problem.points_3d, (1000, 1, 1))
     points_2d = np.tile(problem.points_2d, (1000, 1, 1))
     benchmark(fit_batch, points_3d, points_2d, problem.camera, method="aepnp", workers=workers)
 
 
 def test_robust_fit(benchmark: BenchmarkFixture) -> None:
-    problem = problem_of(200)
+    problem = problem_of(200, points=200, noise_px=1.0)
     points_2d = problem.points_2d.copy()
     points_2d[::2] = np.random.default_rng(0).uniform(0, 480, (100, 2))
     benchmark(fit, problem.points_3d, points_2d, problem.camera, ransac=RansacOptions(), sigma=1.0)
@@ -89,7 +86,7 @@ def ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> float:
 def test_times_over_opencv(
     points: int, solver_limit: float, linear_limit: float, optimal_limit: float
 ) -> None:
-    problem = problem_of(points)
+    problem = problem_of(points, points=points, noise_px=1.0)
     x, uv, camera = problem.points_3d, problem.points_2d, problem.camera
     rays, matrix = camera.normalize(uv), camera.matrix
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from support import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
+from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
 from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from support import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
+from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
 from cadalign import Alignment, Camera, fit
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.problems import problem_of
 
 from cadalign import Alignment, Camera, FitResult, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
+from cadalign.evaluation.simulation.problems import Problem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
 COUNTS = st.integers(7, 60)
 METHODS = pytest.mark.parametrize("method", ["optimal", "aepnp"])
 UNITS = st.sampled_from([1e-6, 1e-3, 1e3, 1e6])
-
-
-def problem_of(seed: int, points: int, noise_px: float = 0.0, **options: Any) -> Problem:
-    rng = np.random.default_rng(seed)
-    return simulate_problem(rng, points=points, noise_px=noise_px, **options)
 
 
 def assert_aligned(result: FitResult, expected: Alignment, tolerance: float = 1e-6) -> None:
@@ -47,7 +41,7 @@ def assert_explains(result: FitResult, problem: Problem, tolerance_px: float = 1
 @METHODS
 @given(seed=SEEDS, points=COUNTS)
 def test_recovery_without_noise(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     assert_aligned(result, problem.alignment)
 
@@ -56,7 +50,7 @@ def test_recovery_without_noise(method: str, seed: int, points: int) -> None:
 @given(seed=SEEDS, points=COUNTS)
 def test_recovery_of_a_far_object_through_a_long_lens(method: str, seed: int, points: int) -> None:
     camera = Camera(640, 480, 6000.0, 6000.0, 319.5, 239.5)
-    problem = problem_of(seed, points, camera=camera, depth=(60.0, 100.0))
+    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(60.0, 100.0))
     result = fit(problem.points_3d, problem.points_2d, camera, method=method)
     assert_explains(result, problem, 1e-6)
     assert_aligned(result, problem.alignment, 1e-5)
@@ -69,7 +63,7 @@ def test_recovery_of_an_object_so_far_that_perspective_is_lost(
 ) -> None:
     # A thousand sizes away: depths differ by a thousandth, and pixels are exact to 1e-13.
     camera = Camera(640, 480, 1e5, 1e5, 319.5, 239.5)
-    problem = problem_of(seed, points, camera=camera, depth=(900.0, 1100.0))
+    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(900.0, 1100.0))
     result = fit(problem.points_3d, problem.points_2d, camera, method=method)
     assert_explains(result, problem, 1e-5)
     assert_aligned(result, problem.alignment, 1e-4)
@@ -81,7 +75,7 @@ def test_recovery_of_a_near_object_seen_at_a_wide_angle(
     method: str, seed: int, points: int
 ) -> None:
     camera = Camera.from_fov(640, 480, fov_x=120.0)
-    problem = problem_of(seed, points, camera=camera, depth=(2.0, 3.0))
+    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(2.0, 3.0))
     result = fit(problem.points_3d, problem.points_2d, camera, method=method)
     assert_aligned(result, problem.alignment)
 
@@ -91,7 +85,7 @@ def test_recovery_of_a_near_object_seen_at_a_wide_angle(
 def test_recovery_of_keypoints_near_a_plane(
     method: str, seed: int, points: int, axis: int, thickness: float
 ) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     factor = np.ones(3)
     factor[axis] = thickness
     points_3d = problem.points_3d * factor
@@ -105,7 +99,7 @@ def test_recovery_of_keypoints_near_a_plane(
 def test_recovery_in_spite_of_duplicated_points(
     method: str, seed: int, points: int, repeated: int
 ) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     rows = np.concatenate([np.arange(points), np.zeros(repeated, dtype=int)])
     result = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera, method=method)
     assert_aligned(result, problem.alignment)
@@ -114,7 +108,7 @@ def test_recovery_in_spite_of_duplicated_points(
 @METHODS
 @given(seed=SEEDS, points=COUNTS, unit=UNITS)
 def test_recovery_in_huge_and_tiny_units(method: str, seed: int, points: int, unit: float) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     result = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
     gt = problem.alignment
     assert_aligned(result, Alignment(gt.rotation, unit * gt.translation, gt.scale))
@@ -125,7 +119,7 @@ def test_recovery_in_huge_and_tiny_units(method: str, seed: int, points: int, un
 def test_recovery_of_a_model_far_from_its_own_origin(
     method: str, seed: int, points: int, size: float
 ) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     shift = size * np.array([1.0, -0.5, 0.7])
     result = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
     gt = problem.alignment
@@ -143,7 +137,7 @@ def in_front(alignment: Alignment, points_3d: np.ndarray) -> bool:
 @METHODS
 @given(seed=SEEDS, points=COUNTS)
 def test_equivariance_under_camera_motion(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3)).as_matrix()
     motion = Alignment(turn, rng.uniform(-0.5, 0.5, 3), np.ones(3))
@@ -161,7 +155,7 @@ def test_equivariance_under_camera_motion(method: str, seed: int, points: int) -
 def test_equivariance_under_turning_the_image(
     method: str, seed: int, points: int, angle: float
 ) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
     center = np.array([problem.camera.cx, problem.camera.cy])
     points_2d = (problem.points_2d - center) @ turn[:2, :2].T + center
@@ -173,7 +167,7 @@ def test_equivariance_under_turning_the_image(
 
 @given(seed=SEEDS, points=COUNTS)
 def test_optimum_is_equivariant_under_stretching_the_model(seed: int, points: int) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     factor = np.array([1.0, *np.random.default_rng(seed).uniform(0.3, 3, 2)])
     before = fit(problem.points_3d, problem.points_2d, problem.camera)
     after = fit(problem.points_3d * factor, problem.points_2d, problem.camera)
@@ -186,7 +180,7 @@ def test_optimum_is_equivariant_under_stretching_the_model(seed: int, points: in
 def test_linear_solver_is_equivariant_under_stretching_without_noise(
     seed: int, points: int
 ) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     factor = np.array([1.0, *np.random.default_rng(seed).uniform(0.3, 3, 2)])
     result = fit(problem.points_3d * factor, problem.points_2d, problem.camera, method="aepnp")
     gt = problem.alignment
@@ -196,7 +190,7 @@ def test_linear_solver_is_equivariant_under_stretching_without_noise(
 @METHODS
 @given(seed=SEEDS, points=COUNTS)
 def test_equivariance_under_shifting_the_model(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     shift = np.random.default_rng(seed).uniform(-5, 5, 3)
     before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method).alignment
     after = fit(problem.points_3d + shift, problem.points_2d, problem.camera, method=method)
@@ -209,7 +203,7 @@ def test_equivariance_under_shifting_the_model(method: str, seed: int, points: i
 def test_equivariance_under_a_change_of_the_models_unit(
     method: str, seed: int, points: int, unit: float
 ) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     after = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
     old = before.alignment
@@ -226,7 +220,7 @@ def test_equivariance_under_a_change_of_the_models_unit(
 def test_invariance_to_the_images_resolution(
     method: str, seed: int, points: int, resolution: float
 ) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     camera = problem.camera
     scaled = Camera(
         6400,
@@ -246,7 +240,7 @@ def test_invariance_to_the_images_resolution(
 @METHODS
 @given(seed=SEEDS, points=COUNTS)
 def test_invariance_to_the_points_order(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     order = np.random.default_rng(seed).permutation(points)
     before = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     after = fit(problem.points_3d[order], problem.points_2d[order], problem.camera, method=method)
@@ -256,7 +250,7 @@ def test_invariance_to_the_points_order(method: str, seed: int, points: int) -> 
 
 @given(seed=SEEDS, points=COUNTS)
 def test_duplicating_every_point_halves_the_variance(seed: int, points: int) -> None:
-    problem = problem_of(seed, points, noise_px=0.5)
+    problem = problem_of(seed, points=points, noise_px=0.5)
     once = fit(problem.points_3d, problem.points_2d, problem.camera)
     rows = np.tile(np.arange(points), 2)
     twice = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera)
@@ -284,7 +278,7 @@ def assert_valid(alignment: Alignment, points_3d: np.ndarray) -> None:
 def test_every_result_is_a_valid_alignment(
     method: str, seed: int, points: int, noise: float
 ) -> None:
-    problem = problem_of(seed, points, noise_px=noise)
+    problem = problem_of(seed, points=points, noise_px=noise)
     try:
         result = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     except DegenerateError:
@@ -304,7 +298,7 @@ def test_every_result_is_a_valid_alignment(
 @example(seed=0, points=4)
 @given(seed=SEEDS, points=st.integers(4, 5))
 def test_every_result_of_few_points_is_a_valid_alignment(seed: int, points: int) -> None:
-    problem = problem_of(seed, points)
+    problem = problem_of(seed, points=points, noise_px=0.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     assert_explains(result, problem)
     for alignment in [result.alignment, *(other.alignment for other in result.alternatives)]:
@@ -314,7 +308,7 @@ def test_every_result_of_few_points_is_a_valid_alignment(seed: int, points: int)
 @METHODS
 @given(seed=SEEDS, points=st.integers(10, 20))
 def test_fit_of_the_same_input_is_the_same(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points, noise_px=2.0)
+    problem = problem_of(seed, points=points, noise_px=2.0)
     first = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     second = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
     assert first.alignment == second.alignment

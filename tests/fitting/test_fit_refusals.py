@@ -6,15 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.problems import problem_of
+from support.refusals import refusal
 
 from cadalign import Camera, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-
-
-def problem_of(seed: int, *, points: int, noise_px: float) -> Problem:
-    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
-
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
 METHODS = ["optimal", "aepnp", "aepnp-paper", "epnp"]
@@ -24,10 +20,8 @@ SIGMA_FIX = (
 SPAN_FIX = "a linear solver needs keypoints that span a volume"
 
 
-def refusal(points_3d: Any, points_2d: Any, camera: Any, **options: Any) -> CadalignError:
-    with pytest.raises(CadalignError) as caught:
-        fit(points_3d, points_2d, camera, **options)
-    return caught.value
+def fit_refusal(points_3d: Any, points_2d: Any, camera: Any, **options: Any) -> CadalignError:
+    return refusal(lambda: fit(points_3d, points_2d, camera, **options))
 
 
 @pytest.mark.parametrize(
@@ -64,7 +58,7 @@ def refusal(points_3d: Any, points_2d: Any, camera: Any, **options: Any) -> Cada
     ],
 )
 def test_too_few_points_are_refused(method: str, count: int, text: str) -> None:
-    error = refusal(GOOD.points_3d[:count], GOOD.points_2d[:count], GOOD.camera, method=method)
+    error = fit_refusal(GOOD.points_3d[:count], GOOD.points_2d[:count], GOOD.camera, method=method)
     assert isinstance(error, DegenerateError)
     assert str(error) == text
 
@@ -107,14 +101,14 @@ def with_value(array: np.ndarray, row: int, value: float) -> np.ndarray:
 def test_points_that_are_none_are_refused(
     method: str, points_3d: Any, points_2d: Any, text: str
 ) -> None:
-    error = refusal(points_3d, points_2d, GOOD.camera, method=method)
+    error = fit_refusal(points_3d, points_2d, GOOD.camera, method=method)
     assert isinstance(error, InputError)
     assert str(error) == text
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_something_else_than_a_camera_is_refused(method: str) -> None:
-    error = refusal(GOOD.points_3d, GOOD.points_2d, np.eye(3), method=method)
+    error = fit_refusal(GOOD.points_3d, GOOD.points_2d, np.eye(3), method=method)
     assert str(error) == "camera: expected a cadalign.Camera, got ndarray"
 
 
@@ -129,7 +123,7 @@ def in_plane(axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_linear_solver_refuses_points_in_a_plane_along_the_axes(axis: int) -> None:
-    error = refusal(*in_plane(axis), GOOD.camera, method="aepnp")
+    error = fit_refusal(*in_plane(axis), GOOD.camera, method="aepnp")
     assert isinstance(error, DegenerateError)
     assert str(error) == f"points_3d: the points lie in the plane {'xyz'[axis]} = 0.1; {SPAN_FIX}"
 
@@ -137,7 +131,7 @@ def test_linear_solver_refuses_points_in_a_plane_along_the_axes(axis: int) -> No
 def test_linear_solver_names_the_normal_of_an_oblique_plane() -> None:
     points_3d = GOOD.points_3d.copy()
     points_3d[:, 2] = points_3d[:, 1]
-    error = refusal(points_3d, GOOD.points_2d, GOOD.camera, method="aepnp")
+    error = fit_refusal(points_3d, GOOD.points_2d, GOOD.camera, method="aepnp")
     normals = ["(0, -0.707, 0.707)", "(0, 0.707, -0.707)"]
     normals += [text.replace("(0,", "(-0,") for text in normals]
     assert str(error) in [
@@ -148,7 +142,7 @@ def test_linear_solver_names_the_normal_of_an_oblique_plane() -> None:
 
 @pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
 def test_linear_solvers_refuse_points_in_a_plane(method: str) -> None:
-    error = refusal(*in_plane(2), GOOD.camera, method=method)
+    error = fit_refusal(*in_plane(2), GOOD.camera, method=method)
     assert isinstance(error, DegenerateError)
     assert str(error) == f"points_3d: the points lie in the plane z = 0.1; {SPAN_FIX}"
 
@@ -156,13 +150,13 @@ def test_linear_solvers_refuse_points_in_a_plane(method: str) -> None:
 @pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
 def test_linear_solvers_refuse_points_on_a_line(method: str) -> None:
     points_3d = GOOD.points_3d * [1, 0, 0]
-    error = refusal(points_3d, GOOD.points_2d, GOOD.camera, method=method)
+    error = fit_refusal(points_3d, GOOD.points_2d, GOOD.camera, method=method)
     assert str(error) == f"points_3d: the points lie on one line; {SPAN_FIX}"
 
 
 @pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
 def test_linear_solvers_refuse_points_that_are_all_one(method: str) -> None:
-    error = refusal(np.full((8, 3), 0.3), GOOD.points_2d, GOOD.camera, method=method)
+    error = fit_refusal(np.full((8, 3), 0.3), GOOD.points_2d, GOOD.camera, method=method)
     assert str(error) == f"points_3d: all points are the same; {SPAN_FIX}"
 
 
@@ -173,7 +167,7 @@ def test_optimum_says_which_stretch_a_plane_leaves_open(axis: int) -> None:
         points_3d = problem.points_3d.copy()
         points_3d[:, axis] = 0.1
         points_2d = problem.camera.project(problem.alignment.apply(points_3d))
-        error = refusal(points_3d, points_2d, problem.camera)
+        error = fit_refusal(points_3d, points_2d, problem.camera)
         assert isinstance(error, DegenerateError)
         assert str(error) == (
             f"points_3d: the scale s_{'xyz'[axis]} is not determined: "
@@ -190,7 +184,7 @@ def test_optimum_says_which_stretch_a_plane_leaves_open(axis: int) -> None:
 )
 def test_optimum_says_why_nothing_is_determined(points_3d: np.ndarray, reason: str) -> None:
     points_2d = GOOD.camera.project(GOOD.alignment.apply(points_3d))
-    error = refusal(points_3d, points_2d, GOOD.camera)
+    error = fit_refusal(points_3d, points_2d, GOOD.camera)
     assert isinstance(error, DegenerateError)
     assert reason in str(error)
     assert error.fix == OPTIMAL_FIX
@@ -217,7 +211,7 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.4, 0.0, 0.0, 0.0))
     points_2d = GOOD.points_2d.copy()
     points_2d[5] = [5000, 240]
-    assert str(refusal(GOOD.points_3d, points_2d, camera)) == (
+    assert str(fit_refusal(GOOD.points_3d, points_2d, camera)) == (
         "points_2d: the lens distortion cannot be undone at 1 of 8 pixels, the first is point 5; "
         "these lie outside the area in which the lens model is valid; drop them"
     )
@@ -277,13 +271,13 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
     ],
 )
 def test_wrong_options_are_refused(options: dict[str, Any], text: str) -> None:
-    error = refusal(GOOD.points_3d, GOOD.points_2d, GOOD.camera, **options)
+    error = fit_refusal(GOOD.points_3d, GOOD.points_2d, GOOD.camera, **options)
     assert isinstance(error, InputError)
     assert str(error) == text
 
 
 def test_noise_of_keypoints_that_always_fit_cannot_be_estimated() -> None:
-    error = refusal(GOOD.points_3d[:4], GOOD.points_2d[:4], GOOD.camera, sigma=None)
+    error = fit_refusal(GOOD.points_3d[:4], GOOD.points_2d[:4], GOOD.camera, sigma=None)
     assert isinstance(error, DegenerateError)
     assert str(error) == (
         "sigma: 4 keypoints fit exactly, so their noise cannot be estimated; "

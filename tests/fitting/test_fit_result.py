@@ -7,20 +7,12 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.problems import fit_problem, problem_of
 
-from cadalign import Alignment, FitResult, FocalPrior, fit
+from cadalign import Alignment, FitResult, FocalPrior
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
 from cadalign.fitting.result import Alternative, FitStats
-
-
-def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5) -> Problem:
-    return simulate_problem(np.random.default_rng(seed), points=points, noise_px=noise_px)
-
-
-def fit_problem(problem: Problem, **options: object) -> FitResult:
-    return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
-
 
 MADE = FitResult(
     alignment=Alignment(
@@ -95,17 +87,32 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
     ("text", "expected"),
     [
         ("{", "fit result: not valid JSON: "),
-        ("[]", "fit result: malformed ("),
-        ("{}", "fit result: missing 'covariance'"),
+        ("[]", "fit result: [] is not an object"),
+        ("{}", "fit result: alignment: missing"),
         (
             json.dumps(MADE.to_dict() | {"alignment": {"scale": [1, 1, 1]}}),
-            "alignment: missing rotation, translation",
+            "fit result: alignment: missing rotation, translation",
         ),
         (
             json.dumps(MADE.to_dict() | {"residuals": [[1, 2, 3]]}),
-            "residuals: shape (1, 3), expected (n, 2)",
+            "fit result: residuals[0]: [1, 2, 3] is not a list of 2",
         ),
-        (json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}), "fit result: malformed ("),
+        (
+            json.dumps(MADE.to_dict() | {"inliers": [True]}),
+            f"fit result: inliers: 1 entries, but points_3d has {len(MADE.points_3d)}",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"known_axis": "q"}),
+            "fit result: known_axis: 'q' is not one of 'x', 'y', 'z'",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"sigma": "1"}),
+            "fit result: sigma: '1' is not a finite number",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}),
+            "fit result: stats.iterations: missing",
+        ),
     ],
 )
 def test_malformed_json_is_refused(text: str, expected: str) -> None:

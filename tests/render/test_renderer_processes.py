@@ -9,20 +9,13 @@ import sys
 
 import pytest
 import trimesh
+from support.renderers import renderer_or_skip
 
 from cadalign import Camera, Mesh
 from cadalign.errors import RenderError
-from cadalign.render import Scene, look_at, make_renderer
-from cadalign.render.probe import probe_renderer
+from cadalign.render import Scene, look_at
 
 CAMERA = Camera.from_fov(160, 120, fov_x=50)
-
-
-def _renderer_or_skip(name):
-    found = probe_renderer(name)
-    if not found.works:
-        pytest.skip(f"{name} does not work here: {found.detail}")
-    return make_renderer(name)
 
 
 _POOL_SCRIPT = """
@@ -47,7 +40,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
-    _renderer_or_skip("pyrender")
+    renderer_or_skip("pyrender")
     script = tmp_path / "pool.py"
     script.write_text(_POOL_SCRIPT)
     done = subprocess.run(
@@ -62,7 +55,7 @@ def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_process_is_refused_not_hung():
-    renderer = _renderer_or_skip("pyrender")
+    renderer = renderer_or_skip("pyrender")
     shape = trimesh.creation.icosphere(subdivisions=2)
     scene = Scene(Mesh(shape.vertices, shape.faces))
     view = look_at(azimuth=0, elevation=20, distance=5)
@@ -109,7 +102,7 @@ print(resident() - before)
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs /proc")
 @pytest.mark.parametrize("name", ["raycast", "open3d", "pyrender"])
 def test_memory_stays_flat_over_500_frames(name):
-    _renderer_or_skip(name)
+    renderer_or_skip(name)
     done = subprocess.run(
         [sys.executable, "-c", _MEMORY_SCRIPT, name],
         capture_output=True,

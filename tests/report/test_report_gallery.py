@@ -5,26 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from page_watch import Opened, card_names, open_first, scroll_through, watched
-from playwright.sync_api import Browser, expect
-from report_payloads import Recipe, listed, payload_of, write_page
-
-
-@pytest.fixture
-def opened(browser: Browser) -> Iterator[Opened]:
-    with watched(browser) as open_page:
-        yield open_page
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
+from playwright.sync_api import expect
+from support.pages import Opened, card_names, open_first, scroll_through
+from support.reports import Recipe, listed, payload_of, write_page
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,13 @@ import base64
 import io
 import itertools
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import pytest
-from page_watch import Opened, card_names, open_first, watched
 from PIL import Image
-from playwright.sync_api import Browser, Locator, expect
-from report_payloads import METHODS, WARNING, Recipe, listed, payload_of, write_page
+from playwright.sync_api import Locator, expect
+from support.pages import Opened, card_names, open_first
+from support.reports import METHODS, WARNING, Recipe, listed, payload_of
 
 from cadalign import Alignment
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -25,17 +23,6 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
     return kind.startsWith("webgl") ? null : real.call(this, kind, ...rest);
 };
 """
-
-
-@pytest.fixture
-def opened(browser: Browser) -> Iterator[Opened]:
-    with watched(browser) as open_page:
-        yield open_page
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
 
 
 def look(canvas: Locator) -> np.ndarray:

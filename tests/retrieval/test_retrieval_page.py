@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser
+from support.files import write_json
+from support.refusals import refusal_line
 
 from cadalign import Library, Match, Mesh
 from cadalign.cli import main
@@ -21,8 +23,8 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.mask_files import read_opacity
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.pictures import read_opacity
 from cadalign.retrieval.query import read_query
 
 
@@ -70,15 +72,6 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     )
     observation.save(folder / "seen.json")
     return Case(folder, library, model.model_id, frame, observation)
-
-
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(list(arguments)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("cadalign: ")
-    assert captured.err.count("\n") == 1
-    return captured.err.removeprefix("cadalign: ").removesuffix("\n")
 
 
 # --- silhouettes -----------------------------------------------------------------------------
@@ -158,7 +151,7 @@ class TestSilhouettes:
         def retrieve(**options: Any) -> None:
             twins.retrieve(pixels, np.arange(7), CAMERA, **options)
 
-        with pytest.raises(InputError, match="mask: it shows no pixel of the object"):
+        with pytest.raises(InputError, match="mask: contains no pixel of the object"):
             retrieve(mask=np.zeros((480, 640), dtype=bool))
         with pytest.raises(InputError, match=r"mask: shape \(640, 480\), but .* 480 high and 640"):
             retrieve(mask=np.zeros((640, 480), dtype=bool))
@@ -246,10 +239,27 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
 def test_matches_as_json_are_those_of_the_library(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--robust", "--json"]
+    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--loss", "cauchy", "--json"]
     assert main(["retrieve", *case.arguments, *options]) == 0
     expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
     assert json.loads(capsys.readouterr().out) == [match.to_dict() for match in expected]
+
+
+def test_robust_search_is_an_option_of_fit_alone(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--robust") == (
+        "--robust: the robust search (RANSAC) is an option of `cadalign fit` only; "
+        "use --loss cauchy"
+    )
+
+
+def test_refused_options_are_named_as_they_are_typed(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--max-stretch", "0.5") == (
+        "--max-stretch: must be between 1 and 1000, not 0.5"
+    )
 
 
 def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
@@ -325,7 +335,7 @@ def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
     assert main(["retrieve", *arguments]) == 0
     assert case.model_id in capsys.readouterr().out
     for option in (["--out", str(tmp_path / "out")], ["--silhouette"]):
-        text = refusal(capsys, "retrieve", *arguments, *option)
+        text = refusal_line(capsys, "retrieve", *arguments, *option)
         assert text == f"{gone}: no such file"
     assert not (tmp_path / "out").exists()
 
@@ -349,7 +359,7 @@ def test_a_page_shows_the_matches_side_by_side(
             page.on("console", lambda message, to=problems: to.append(message.text))
             page.on("pageerror", lambda error, to=problems: to.append(str(error)))
             page.goto((out / "index.html").as_uri())
-            cards = page.locator("li.retrieved")
+            cards = page.locator("li.match")
             assert cards.count() == 4
             assert case.model_id in cards.first.inner_text()
             assert "100.0 %" in cards.first.inner_text()
@@ -357,7 +367,7 @@ def test_a_page_shows_the_matches_side_by_side(
             assert page.locator("img").first.evaluate(loaded) == 640
             overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert page.evaluate(overflow) == 0
-            bar = page.locator(".retrieved-score i").first.bounding_box()
+            bar = page.locator(".score i").first.bounding_box()
             assert bar is not None
             assert bar["width"] > 100
             assert 3 < bar["height"] < 12
@@ -399,11 +409,6 @@ def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
 # --- refusals --------------------------------------------------------------------------------
 
 
-def write_json(path: Path, value: Any) -> str:
-    path.write_text(json.dumps(value))
-    return str(path)
-
-
 def test_a_query_needs_no_model_points_but_semantic_ids(case: Case, tmp_path: Path) -> None:
     data = json.loads((case.folder / "seen.json").read_text())
     for keypoint in data["keypoints"]:
@@ -427,7 +432,7 @@ def test_malformed_queries_are_refused(
     path = tmp_path / "query.json"
 
     def refused(value: Any) -> str:
-        text = refusal(capsys, "retrieve", write_json(path, value), *library)
+        text = refusal_line(capsys, "retrieve", write_json(path, value), *library)
         assert text.startswith(f"{path}: ")
         return text.removeprefix(f"{path}: ")
 
@@ -439,8 +444,8 @@ def test_malformed_queries_are_refused(
     assert "keypoints[0]" in refused({"camera": camera, "keypoints": [3]})
     assert "'uvw'" in refused({"camera": camera, "keypoints": [{**keypoint, "uvw": 1}]})
     path.write_text("{")
-    assert "not valid JSON" in refusal(capsys, "retrieve", str(path), *library)
-    missing = refusal(capsys, "retrieve", str(tmp_path / "no.json"), *library)
+    assert "not valid JSON" in refusal_line(capsys, "retrieve", str(path), *library)
+    missing = refusal_line(capsys, "retrieve", str(tmp_path / "no.json"), *library)
     assert missing == f"{tmp_path / 'no.json'}: no such file"
 
 
@@ -448,16 +453,16 @@ def test_what_the_library_refuses_is_one_line(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = case.arguments[0]
-    nowhere = refusal(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
+    nowhere = refusal_line(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
     assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it again, with")
-    unknown = refusal(capsys, "retrieve", *case.arguments, "--category", "chiar")
+    unknown = refusal_line(capsys, "retrieve", *case.arguments, "--category", "chiar")
     assert "did you mean 'chair'" in unknown
-    masked = refusal(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
+    masked = refusal_line(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))
     assert masked == f"{tmp_path / 'no.png'}: no such file"
     path = tmp_path / "blind.json"
     replace(case.observation, image=None).save(path)
-    blind = refusal(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
-    assert blind.startswith("--silhouette: the observation names no image; give its image, or")
-    assert "no such folder" in refusal(capsys, "library", "build", str(tmp_path / "none"))
+    blind = refusal_line(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
+    assert blind.startswith("--silhouette: the observation names no image; add the image")
+    assert "no such folder" in refusal_line(capsys, "library", "build", str(tmp_path / "none"))
     (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
-    assert "not a library file" in refusal(capsys, "library", "show", str(tmp_path / "lib"))
+    assert "not a library file" in refusal_line(capsys, "library", "show", str(tmp_path / "lib"))

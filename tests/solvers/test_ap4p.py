@@ -7,17 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.problems import problem_of
 
 from cadalign import Alignment
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.minimal import ap4p
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def problem_of(seed: int) -> Problem:
-    return simulate_problem(np.random.default_rng(seed), points=4, noise_px=0.0)
 
 
 def solutions_of(points_3d: np.ndarray, rays: np.ndarray) -> list[Alignment]:
@@ -40,7 +37,7 @@ def distance(first: Alignment, second: Alignment) -> float:
 
 @given(seed=SEEDS)
 def test_every_solution_reprojects_exactly_with_positive_depths(seed: int) -> None:
-    problem = problem_of(seed)
+    problem = problem_of(seed, points=4, noise_px=0.0)
     rays = problem.camera.normalize(problem.points_2d)
     solutions = solve(problem)
     assert len(solutions) <= 8
@@ -54,7 +51,7 @@ def test_every_solution_reprojects_exactly_with_positive_depths(seed: int) -> No
 
 @given(seed=SEEDS)
 def test_no_solution_comes_twice_and_the_least_stretch_comes_first(seed: int) -> None:
-    solutions = solve(problem_of(seed))
+    solutions = solve(problem_of(seed, points=4, noise_px=0.0))
     for k, first in enumerate(solutions):
         for second in solutions[k + 1 :]:
             assert distance(first, second) > 1e-9
@@ -66,7 +63,7 @@ def test_truth_is_among_the_solutions() -> None:
     """At least 99.8 % of 2,000 random problems, to 1e-4."""
     missed = []
     for seed in range(2000):
-        problem = problem_of(seed)
+        problem = problem_of(seed, points=4, noise_px=0.0)
         solutions = solve(problem)
         if not solutions or min(distance(s, problem.alignment) for s in solutions) > 1e-4:
             missed.append(seed)
@@ -81,7 +78,7 @@ def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     rng = np.random.default_rng(0)
     found = missed = 0
     for seed in range(25):
-        problem = problem_of(seed)
+        problem = problem_of(seed, points=4, noise_px=0.0)
         rays = problem.camera.normalize(problem.points_2d)
         whitening = np.array([[150.0, 0.0, 150.0]])
         objective = keypoint_objective(problem.points_3d, rays, whitening)
@@ -102,7 +99,7 @@ def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
 
 @given(seed=SEEDS)
 def test_directions_of_any_length_are_the_same_rays(seed: int) -> None:
-    problem = problem_of(seed)
+    problem = problem_of(seed, points=4, noise_px=0.0)
     rays = problem.camera.normalize(problem.points_2d)
     lengths = np.random.default_rng(seed).uniform(0.1, 10, (4, 1))
     directions = np.column_stack([rays, np.ones(4)]) * lengths
@@ -115,7 +112,7 @@ def test_directions_of_any_length_are_the_same_rays(seed: int) -> None:
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_unit_of_the_model_does_not_matter(unit: float) -> None:
     for seed in range(20):
-        problem = problem_of(seed)
+        problem = problem_of(seed, points=4, noise_px=0.0)
         rays = problem.camera.normalize(problem.points_2d)
         base = ap4p(problem.points_3d, rays)
         other = ap4p(unit * problem.points_3d, rays)
@@ -126,7 +123,7 @@ def test_unit_of_the_model_does_not_matter(unit: float) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_points_in_a_plane_have_no_solutions(axis: int) -> None:
-    problem = problem_of(0)
+    problem = problem_of(0, points=4, noise_px=0.0)
     points_3d = problem.points_3d.copy()
     points_3d[:, axis] = 0.1
     rotations, translations, scales = ap4p(points_3d, problem.camera.normalize(problem.points_2d))
@@ -136,7 +133,7 @@ def test_points_in_a_plane_have_no_solutions(axis: int) -> None:
 
 
 def test_input_is_not_changed() -> None:
-    problem = problem_of(0)
+    problem = problem_of(0, points=4, noise_px=0.0)
     rays = problem.camera.normalize(problem.points_2d)
     copies = problem.points_3d.copy(), rays.copy()
     ap4p(problem.points_3d, rays)

@@ -1,0 +1,257 @@
+"""Views of an object: cameras placed on a sphere about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.errors import InputError, RenderError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
+from cadalign.render.scene import Scene
+from cadalign.render.views.lens_field import within_lens_field
+from cadalign.render.views.visibility import visible_keypoints
+
+_DISTANCE_STEPS = 50
+_FILL_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera's view of an object.
+
+    Parameters
+    ----------
+    cam_from_model : Alignment
+        The object's pose in the camera frame.
+    visible : (k,) bool
+        Which keypoints are seen.
+    """
+
+    cam_from_model: Alignment
+    visible: npt.NDArray[np.bool_]
+
+
+def look_at(
+    *,
+    azimuth: float,
+    elevation: float,
+    distance: float,
+    target: npt.ArrayLike = (0.0, 0.0, 0.0),
+    roll: float = 0.0,
+    scale: npt.ArrayLike = (1.0, 1.0, 1.0),
+) -> Alignment:
+    """The pose of a model that is looked at from a point of a sphere, its y axis up in the image.
+
+    Parameters
+    ----------
+    azimuth : float
+        Turn about the model's y axis [degrees]: 0 looks from +z, 90 from +x.
+    elevation : float
+        Height above the model's xz plane [degrees], -90 to 90.
+    distance : float
+        From the camera to the target [model units], positive.
+    target : (3,) float
+        The model point, before the stretch, that appears at the principal point.
+    roll : float
+        Turn of the camera about its line of sight [degrees]; positive turns the object
+        counterclockwise in the image.
+    scale : (3,) float
+        The stretch along the model's axes.
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    InputError
+        If a value is not finite, the elevation is out of range, or the distance or a scale is not
+        positive.
+
+    Examples
+    --------
+    >>> pose = look_at(azimuth=0, elevation=0, distance=3)
+    >>> pose.apply([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).tolist()
+    [[0.0, 0.0, 3.0], [1.0, 0.0, 3.0], [0.0, -1.0, 3.0]]
+    """
+    values = as_floats([azimuth, elevation, distance, roll], name="look_at", shape=(4,))
+    if abs(elevation) > 90:
+        raise InputError(f"{elevation:g} is not between -90 and 90 degrees", where="elevation")
+    if distance <= 0:
+        raise InputError(f"{distance:g} is not positive", where="distance")
+    rotation = _looking_rotation(*values[[0, 1, 3]])
+    stretched = as_floats(target, name="target", shape=(3,)) * as_floats(
+        scale, name="scale", shape=(3,)
+    )
+    translation = np.array([0, 0, distance]) - rotation @ stretched
+    return Alignment(rotation, translation, as_floats(scale, name="scale", shape=(3,)))
+
+
+def sample_view(
+    scene: Scene,
+    keypoints: npt.ArrayLike,
+    camera: Camera,
+    *,
+    rng: np.random.Generator,
+    min_visible: int = 6,
+    elevation: tuple[float, float] = (0.0, 60.0),
+    fill: tuple[float, float] = (0.7, 0.95),
+    roll: float = 0.0,
+    scale: npt.ArrayLike = (1.0, 1.0, 1.0),
+    max_attempts: int = 100,
+) -> View:
+    """Draw a view, evenly over the sphere, in which enough keypoints are seen.
+
+    The object's box lies inside the image about its centre.
+
+    Parameters
+    ----------
+    scene : Scene
+        The object.
+    keypoints : (k, 3) float
+        In model coordinates.
+    camera : Camera
+    rng : numpy.random.Generator
+        Where all randomness comes from: the same state gives the same view.
+    min_visible : int
+        How many keypoints must be seen.
+    elevation : tuple of 2 float
+        Lowest and highest elevation [degrees].
+    fill : tuple of 2 float
+        Lowest and highest share of the image, in width or height, that the corners of the
+        object's box reach; 1 touches the border.
+    roll : float
+        Largest turn of the camera about its line of sight [degrees].
+    scale : (3,) float
+        The stretch along the model's axes.
+    max_attempts : int
+        Views to try.
+
+    Returns
+    -------
+    View
+
+    Raises
+    ------
+    RenderError
+        If no view shows enough keypoints; it says how many the best one showed.
+    InputError
+        If an argument is out of its range.
+    """
+    points = as_points(keypoints, name="keypoints", dimension=3)
+    _check_range(elevation, name="elevation", low=-90.0, high=90.0)
+    _check_range(fill, name="fill", low=0.01, high=1.0)
+    if max_attempts < 1:
+        raise InputError(f"{max_attempts} is not positive", where="max_attempts")
+    best = 0
+    attempts = max_attempts if len(points) >= min_visible else 0
+    for _ in range(attempts):
+        azimuth = rng.uniform(-180.0, 180.0)
+        low, high = np.sin(np.radians(elevation))
+        height = np.degrees(np.arcsin(rng.uniform(low, high)))
+        rotation = _looking_rotation(azimuth, height, rng.uniform(-roll, roll))
+        pose = frame_object(
+            scene.bounds, camera, rotation=rotation, fill=rng.uniform(*fill), scale=scale
+        )
+        visible = visible_keypoints(scene, points, camera, pose)
+        if visible.sum() >= min_visible:
+            return View(cam_from_model=pose, visible=visible)
+        best = max(best, int(visible.sum()))
+    found = f"the best of {attempts} views shows {best}" if attempts else "there are no more"
+    raise RenderError(
+        f"{min_visible} of {len(points)} keypoints should be visible, but {found}",
+        where=scene.mesh.source,
+        fix="lower min_visible, widen the range of elevations, or leave this model out",
+    )
+
+
+def frame_object(
+    bounds: npt.ArrayLike,
+    camera: Camera,
+    *,
+    rotation: npt.ArrayLike,
+    fill: float,
+    scale: npt.ArrayLike = (1.0, 1.0, 1.0),
+) -> Alignment:
+    """Move an object of given orientation to where it fills a given share of the image.
+
+    The box's centre appears at the image's centre, so no corner lies farther from it than the
+    share of the way to the border.
+
+    Parameters
+    ----------
+    bounds : (2, 3) float
+        The model's lowest and highest coordinates, before the stretch.
+    camera : Camera
+    rotation : (3, 3) float
+    fill : float
+        Share of half the width or height that the farthest corner reaches.
+    scale : (3,) float
+
+    Returns
+    -------
+    Alignment
+
+    Raises
+    ------
+    RenderError
+        If no distance gives that share, as with a lens that bends too much.
+    """
+    placed = Alignment(
+        as_floats(rotation, name="rotation", shape=(3, 3)),
+        np.zeros(3),
+        as_floats(scale, name="scale", shape=(3,)),
+    )
+    box = Box.from_model(bounds, placed)
+    corners = box.corners - box.center
+    size = float(np.linalg.norm(box.extents)) or 1.0
+    middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    axis = np.append(camera.normalize(middle)[0], 1.0)
+    # Depths of the box's centre: in the first a corner touches the camera's plane.
+    near, far = size / 2, 1e6 * size
+    for _ in range(_DISTANCE_STEPS):
+        depth = float(np.sqrt(near * far))
+        share = _share(corners + depth * axis, camera, middle[0])
+        if abs(share - fill) < _FILL_TOLERANCE * fill:
+            break
+        near, far = (depth, far) if share > fill else (near, depth)
+    else:
+        raise RenderError(
+            f"the object cannot be made to fill {fill:g} of the image", where="camera"
+        )
+    return Alignment(placed.rotation, depth * axis - box.center, placed.scale)
+
+
+def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
+    """Share of the way to the image's border that the farthest corner reaches."""
+    if corners[:, 2].min() <= 0:
+        return np.inf
+    normalized = perspective(corners)
+    if not within_lens_field(camera, normalized).all():
+        return np.inf
+    offset = np.abs(camera.pixels_from_normalized(normalized) - middle)
+    return float((2 * offset / (camera.width, camera.height)).max())
+
+
+def _looking_rotation(azimuth: float, elevation: float, roll: float) -> FloatArray:
+    """Rotation from model to camera axes; angles in degrees."""
+    turn, rise, tilt = np.radians([azimuth, elevation, roll])
+    forward = -np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)])
+    right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
+    upright = np.stack([right, np.cross(forward, right), forward])
+    c, s = np.cos(tilt), np.sin(tilt)
+    return np.asarray(np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ upright)
+
+
+def _check_range(value: tuple[float, float], *, name: str, low: float, high: float) -> None:
+    first, last = as_floats(value, name=name, shape=(2,))
+    if not low <= first <= last <= high:
+        raise InputError(
+            f"{first:g} to {last:g} is not a range within {low:g} to {high:g}", where=name
+        )

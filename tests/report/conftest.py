@@ -1,0 +1,22 @@
+"""A report's page, and a browser that fails the test where a page complains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser
+from support.pages import Opened, watched
+from support.reports import Recipe, write_page
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Opened]:
+    with watched(browser) as open_page:
+        yield open_page
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Address of the page of an ordinary run."""
+    return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())

@@ -1,0 +1,143 @@
+"""A rendered photo of a sample chair, ready to annotate, and an annotator served on a free port."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import uvicorn
+
+from cadalign.annotate.guard import Access
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.server import listen, make_app
+from cadalign.annotate.session import Session
+from cadalign.datasets import KeypointNet, ModelKeypoints
+from cadalign.evaluation.instances.instance import Instance, make_instance
+from cadalign.io.images import write_image
+from cadalign.render import RaycastRenderer, visible_keypoints
+
+
+@dataclass(frozen=True)
+class Case:
+    """A photo of a chair, and the chair's model."""
+
+    folder: Path
+    photo: Path
+    camera: Path
+    model: Path
+    keypoints: Path
+    instance: Instance
+
+    @property
+    def observation(self) -> Path:
+        return self.folder / "photo.json"
+
+    @property
+    def clicks(self) -> list[tuple[int, list[float]]]:
+        """Semantic ids and pixels of the visible keypoints."""
+        ids = self.instance.semantic_ids.tolist()
+        return list(zip(ids, self.instance.points_2d.tolist(), strict=True))
+
+    def copied_to(self, folder: Path) -> Case:
+        """The same with a photo's folder of its own, which can be written to."""
+        shutil.copytree(self.folder, folder)
+        return replace(
+            self,
+            folder=folder,
+            photo=folder / self.photo.name,
+            camera=folder / self.camera.name,
+            keypoints=folder / self.keypoints.name,
+        )
+
+    def open(self, **options: Any) -> Session:
+        """A session with the calibrated camera and the model's keypoints."""
+        defaults: dict[str, Any] = {
+            "image": self.photo,
+            "model": self.model,
+            "camera": self.camera,
+            "keypoints": self.keypoints,
+        }
+        session = open_session(**(defaults | options))
+        session.warm_up()
+        return session
+
+
+def make_case(sample_root: Path, folder: Path) -> Case:
+    """Render the photo and write camera and keypoints."""
+    model = KeypointNet(sample_root)["chair", "sample_chair_000"]
+    instance = make_instance(model, seed=0)
+    assert instance.scene is not None
+    assert model.mesh_path is not None
+    frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
+    case = Case(
+        folder,
+        folder / "photo.png",
+        folder / "camera.json",
+        model.mesh_path,
+        folder / "given.keypoints.json",
+        instance,
+    )
+    write_image(case.photo, frame.composite())
+    case.camera.write_text(json.dumps(instance.camera.to_dict()))
+    ModelKeypoints.of_model(model).save(case.keypoints)
+    return case
+
+
+def place(session: Session, keypoint: int, uv: list[float], *, image: int = 0) -> None:
+    """Place both halves of a pair."""
+    session.act(image, {"do": "place_uv", "uv": uv})
+    session.act(image, {"do": "place_keypoint", "keypoint": keypoint})
+
+
+def place_all(session: Session, case: Case, *, count: int | None = None) -> dict[str, Any]:
+    """Place the first of the visible keypoints; gives the state."""
+    for keypoint, uv in case.clicks[:count]:
+        place(session, keypoint, uv)
+    return page_state(session, 0)
+
+
+def place_twenty(session: Session, case: Case) -> None:
+    """Place all visible keypoints, and corners of the surface up to 20 pairs."""
+    place_all(session, case)
+    rng = np.random.default_rng(0)
+    seen = visible_keypoints(
+        session.model.scene,
+        session.model.sample_points,
+        case.instance.camera,
+        case.instance.cam_from_model,
+    )
+    for point in (p for p, is_seen in zip(session.model.samples, seen, strict=True) if is_seen):
+        if len(session.photos[0].document.pairs) >= 20:
+            return
+        if session.registry.find(point.xyz, tolerance=1e-3) is None:
+            ((u, v),) = case.instance.camera.project(
+                case.instance.cam_from_model.apply([point.xyz])
+            )
+            noise = rng.normal(size=2)
+            u, v = float(u + noise[0]), float(v + noise[1])
+            place(session, session.registry.add(point), [u, v])
+
+
+@contextmanager
+def served(session: Session) -> Iterator[Access]:
+    """Serve a session on a free port as `cadalign annotate` does."""
+    listener = listen(0)
+    access = Access(listener.getsockname()[1])
+    config = uvicorn.Config(make_app(session, access), log_level="warning", lifespan="off")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    try:
+        yield access
+    finally:
+        server.should_exit = True
+        thread.join(timeout=10)
+        listener.close()

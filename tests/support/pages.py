@@ -1,0 +1,87 @@
+"""The report pages: their embedded payload, and the pages in a browser, watched for errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, Locator, Page, expect
+
+Opened = Callable[..., Page]
+"""Opens an address: ``script`` runs before the page's, console errors with ``allowed`` pass."""
+
+
+def embedded_payload(page: Path) -> dict[str, Any]:
+    """The payload that a page embeds, read as strict JSON."""
+    text = page.read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="payload">(.*?)</script>', text, re.S)
+    assert found is not None
+    payload: dict[str, Any] = json.loads(found[1], parse_constant=_refuse)
+    return payload
+
+
+def _refuse(constant: str) -> None:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+@contextmanager
+def watched(browser: Browser) -> Iterator[Opened]:
+    """Yield a function that opens pages; in the end close them and assert that none complained."""
+    contexts, complaints = [], []
+
+    def open_page(
+        address: str, *, allowed: str = "nothing", script: str = "", **options: Any
+    ) -> Page:
+        options = {"viewport": {"width": 1280, "height": 800}, **options}
+        context = browser.new_context(reduced_motion="reduce", **options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(10_000)
+        page.on("pageerror", lambda error: complaints.append(f"error: {error}"))
+        page.on(
+            "console",
+            lambda word: (
+                word.type == "error" and allowed not in word.text and complaints.append(word.text)
+            ),
+        )
+        page.on("dialog", lambda dialog: complaints.append(f"dialog: {dialog.message}"))
+        page.on(
+            "request",
+            lambda asked: (
+                asked.url.startswith(("file:", "data:")) or complaints.append(f"asks {asked.url}")
+            ),
+        )
+        if script:
+            page.add_init_script(script)
+        page.goto(address)
+        page.locator("html[data-ready]").wait_for()
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not complaints
+
+
+def scroll_through(page: Page) -> None:
+    """Bring every plot into view until it is drawn."""
+    for plot in page.locator(".plot").all():
+        plot.scroll_into_view_if_needed()
+        expect(plot).to_have_attribute("data-drawn", re.compile(r"\d"))
+
+
+def card_names(page: Page) -> list[str]:
+    """Model ids of the gallery, in its order, as far as its cards exist."""
+    return page.locator(".card .name").all_inner_texts()
+
+
+def open_first(page: Page) -> Locator:
+    """Open the gallery's first instance; its dialog."""
+    page.locator(".card").first.click()
+    dialog = page.locator("dialog[open]")
+    expect(dialog.locator(".overlay")).to_be_visible()
+    return dialog

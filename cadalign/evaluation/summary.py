@@ -43,7 +43,7 @@ class Line:
 
 
 class Summary(Protocol):
-    """What a summary must tell of itself."""
+    """Interface of a summary."""
 
     def cells(self) -> dict[str, Any]:
         """All numbers by name, flat: a row of ``summary.csv``."""
@@ -91,7 +91,7 @@ class Conclusion:
     counts : dict
         More numbers to be told.
     note : str
-        What is to be said of the failed rows.
+        Remark on the failed rows.
     """
 
     rows: int

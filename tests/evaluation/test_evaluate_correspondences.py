@@ -17,7 +17,7 @@ from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_correspondences
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation import plots
-from cadalign.evaluation.accuracy.methods import fit_with
+from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.experiment import (
     CorrespondenceExperiment,
@@ -33,6 +33,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.summary import Quartiles
+from cadalign.fitting.fit import fit
 from cadalign.fitting.result import FitResult
 from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.alignment import Alignment
@@ -327,11 +328,15 @@ class TestRows:
     def test_options_of_the_search_reach_it(self):
         problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))
         given = (problem.points_3d, problem.points_2d, problem.camera)
-        wide = fit_with("ransac-optimal", *given, ransac=RansacOptions(max_reproj_error=4.0))
-        narrow = fit_with("ransac-optimal", *given, ransac=RansacOptions(max_reproj_error=0.1))
+
+        def fit_with(method, ransac):
+            return fit(*given, **fit_options(method, ransac=ransac))
+
+        wide = fit_with("ransac-optimal", RansacOptions(max_reproj_error=4.0))
+        narrow = fit_with("ransac-optimal", RansacOptions(max_reproj_error=0.1))
         assert narrow.inliers.sum() < wide.inliers.sum() <= 44
         # The method's own minimal solver is taken, whatever the options say.
-        few = fit_with("ransac-aepnp", *given, ransac=RansacOptions(minimal="ap4p", seed=1))
+        few = fit_with("ransac-aepnp", RansacOptions(minimal="ap4p", seed=1))
         assert few.method == "ransac-aepnp"
 
     def test_too_few_points_become_a_failed_row_with_the_reason(self):

@@ -1,4 +1,4 @@
-"""The model as the page gets it: triangles, normals and colours in one block of bytes."""
+"""Encoding of the displayed model: triangles, normals and colours in one block of bytes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 import numpy as np
 
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.simplify import simplify
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import simplify
 from cadalign.render.drawing.color import bytes_from_linear
 from cadalign.render.raycast.caster import FaceArray
 from cadalign.render.scene import Scene
@@ -17,7 +17,7 @@ MOST_FACES = 150_000
 
 
 def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
-    """The model for display, with at most so many triangles.
+    """Encode the model for display, simplified to at most ``max_faces`` triangles.
 
     Returns
     -------

@@ -14,10 +14,10 @@ from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.display import display_bytes
 from cadalign.annotate.files import read_given_keypoints
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.simplify import simplify
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.datasets import KeypointNet, load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.simplify import simplify
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 
@@ -92,14 +92,14 @@ def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
 
 def test_rays_are_checked() -> None:
     model = CadModel(Mesh(SQUARE, [[0, 1, 2]]))
-    with pytest.raises(InputError, match=r"^direction: is zero$"):
+    with pytest.raises(InputError, match=r"^direction: the vector is zero$"):
         model.pick([0, 0, 1], [0, 0, 0])
     with pytest.raises(InputError, match=r"^origin: NaN or infinite"):
         model.pick([0, 0, np.nan], [0, 0, 1])
 
 
 def test_a_model_without_extent_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^dot: all its vertices are in one place$"):
+    with pytest.raises(InputError, match=r"^dot: all vertices of the mesh coincide$"):
         CadModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
 
 

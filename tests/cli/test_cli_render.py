@@ -18,10 +18,11 @@ from PIL import Image
 from cadalign import Camera
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.render import Render
+from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at
-from cadalign.render.probe import Probe
+from cadalign.render.probe import Probe, probe_renderer
 from cadalign.render.views.camera_files import CameraView, write_open3d
 
 
@@ -37,6 +38,21 @@ def _run(model, *arguments, renderer="raycast"):
     """Run the command as the command line does."""
     command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
     return command.run()
+
+
+def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
+    if not probe_renderer("pyrender").works:
+        pytest.skip("pyrender does not work here")
+    names = {}
+    for opacity in (255, 90):
+        box = trimesh.creation.box((0.4, 0.8, 0.6))
+        box.visual.vertex_colors = [180, 40, 40, opacity]
+        path = tmp_path / f"box{opacity}.ply"
+        box.export(path)
+        out = tmp_path / f"box{opacity}.png"
+        assert _run(path, "--out", out, "--size", "64x48", renderer="pyrender") == 0
+        names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
+    assert names == {255: "pyrender", 90: "raycast"}
 
 
 def _pixels(path):
@@ -125,6 +141,17 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         ],
     }
     (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
+    named = {"name": "corner", "face_index": 0, "barycentric": [0.5, 0.25, 0.25]}
+    mesh = load_mesh(model)
+    xyz = mesh.surface_points([0], [[0.5, 0.25, 0.25]])[0].tolist()
+    own = {"format": "cadalign model keypoints", "version": 1, "keypoints": [named]}
+    (tmp_path / "parts.keypoints.json").write_text(json.dumps(own))
+    (tmp_path / "same.json").write_text(json.dumps([xyz]))
+    pictures = []
+    for name in ("parts.keypoints.json", "same.json"):
+        _run(model, "--out", tmp_path / "k.png", "--keypoints", tmp_path / name)
+        pictures.append(_pixels(tmp_path / "k.png").astype(int))
+    np.testing.assert_array_equal(*pictures)
     drawn = []
     for name in ("points.json", "chair.json"):
         out = tmp_path / "k.png"

@@ -34,8 +34,8 @@ from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.summary import Quartiles
 from cadalign.fitting.fit import fit
+from cadalign.fitting.options import RansacOptions
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.progress import (
@@ -50,7 +49,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
                 "rows": found.rows,
                 "failed": found.failed,
                 **found.counts,
-                "summary": [asdict(summary) for summary in summaries],
+                "summary": [summary.to_dict() for summary in summaries],
             }
         )
     else:

@@ -15,6 +15,7 @@ from cadalign.evaluation.api import run
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import SPEC as KEYPOINTNET
 from cadalign.evaluation.keypointnet.summary import texts
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.paper.table import PAPER_TABLE, PERCENT_NOTE, STATED
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -27,8 +28,8 @@ from cadalign.io.files import write_text, writing
 _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
 
 
-@dataclass(frozen=True)
-class PaperPlan:
+@dataclass(frozen=True, kw_only=True)
+class PaperPlan(RunOptions):
     """Runs for the paper's tables and figures."""
 
     out: Path = Path("paper")
@@ -37,12 +38,8 @@ class PaperPlan:
     """Dataset in KeypointNet's layout, besides the sample dataset."""
     quick: bool = False
     """Few problems: about two minutes."""
-    seed: int = 0
+    seed: int = ExperimentOptions.seed
     """Seed of everything random."""
-    workers: int = -1
-    """Processes; -1 for all cores."""
-    dask: str | None = None
-    """Address of a Dask scheduler to use instead."""
 
 
 Announce = Callable[[str], Callable[[Progress], object]]

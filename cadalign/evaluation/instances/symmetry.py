@@ -59,7 +59,7 @@ class SymmetryGroup:
 
     @property
     def is_trivial(self) -> bool:
-        """Whether the identity is the only symmetry."""
+        """True where the identity is the only symmetry."""
         return self.axis is None and len(self.rotations) == 1
 
     def __str__(self) -> str:
@@ -120,7 +120,7 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
     xyz : (k, 3) float
         The model's keypoints.
     symmetries : Symmetries
-        What is annotated of them.
+        The annotated ones.
     """
     trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
@@ -168,7 +168,7 @@ def _axis_of_revolution(
 
 
 def _equivalent(count: int, symmetries: Symmetries) -> npt.NDArray[np.bool_]:
-    """Which keypoints a rotation may take to one another, (k, k) bool."""
+    """Mask (k, k) of the keypoints that a rotation may take to one another."""
     orbits = np.arange(count)
     for first, second in symmetries.reflections:
         orbits[orbits == orbits[second]] = orbits[first]
@@ -191,7 +191,7 @@ def _candidates() -> FloatArray:
 def _map_onto_themselves(
     centered: FloatArray, equivalent: npt.NDArray[np.bool_], tolerance: float
 ) -> npt.NDArray[np.bool_]:
-    """Which of the candidates are symmetries, (g,) bool."""
+    """Mask (g,) of the candidates that are symmetries."""
     count = len(centered)
     moved = centered @ _candidates().transpose(0, 2, 1)
     squares = (centered**2).sum(axis=1)

@@ -43,7 +43,7 @@ class Arguments:
     problems: int = 1000
     """Random problems per row of accuracy."""
     robust_problems: int = 40
-    """Random problems per share of wrong keypoints."""
+    """Random problems per share of outliers."""
     seed: int = 0
     """Seed of the problems."""
 

@@ -40,9 +40,9 @@ class Arguments:
     out: Path = Path("bench/ransac.json")
     """JSON file to write."""
     draws: int = 20
-    """How often scales and outliers are drawn for each image."""
+    """Draws of scales and outliers for each image."""
     outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
-    """Shares of wrong image points."""
+    """Shares of outliers among the image points."""
 
 
 def main(arguments: Arguments) -> None:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import reprlib
+from typing import Any
+
+_QUOTED_LENGTH = 200
+
 
 class CadalignError(Exception):
     """Base class of every error that cadalign raises on purpose.
@@ -9,11 +14,11 @@ class CadalignError(Exception):
     Parameters
     ----------
     what : str
-        What is wrong, in words a user understands.
+        Description of the problem, in the user's terms.
     where : str, optional
-        The argument, file, model id or field that it is wrong in.
+        The argument, file, model id or field concerned.
     fix : str, optional
-        What to do about it.
+        Remedy.
 
     Examples
     --------
@@ -47,18 +52,18 @@ class InputError(CadalignError, ValueError):
 
 
 class DegenerateError(CadalignError):
-    """The keypoints do not determine the alignment: too few, in one plane, all the same."""
+    """The keypoints do not determine the alignment: too few, coplanar or coincident."""
 
 
 class NoConsensusError(CadalignError):
-    """No alignment has more keypoints to support it than chance gives.
+    """No alignment has more supporting keypoints than expected by chance.
 
     Attributes
     ----------
     score : float
-        The best truncated score that was reached, sum of squared errors [px^2].
+        The best truncated score reached, a sum of squared errors [px^2].
     inliers : int
-        How many keypoints supported it.
+        Number of keypoints that supported it.
     """
 
     def __init__(
@@ -85,3 +90,23 @@ class DataError(CadalignError):
 
 class RenderError(CadalignError):
     """Something cannot be drawn: an empty mesh, an image size out of bounds, no view found."""
+
+
+def quote(value: Any) -> str:
+    """Quote a value for a message, in at most 200 characters.
+
+    Examples
+    --------
+    >>> len(quote("a" * 300))
+    200
+    >>> quote([1, None])
+    '[1, None]'
+    """
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = short.maxlong = _QUOTED_LENGTH
+    short.maxlist = short.maxtuple = short.maxdict = 12
+    try:
+        text = short.repr(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = f"a {type(value).__name__} of thousands of digits"
+    return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."

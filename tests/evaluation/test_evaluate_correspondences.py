@@ -36,8 +36,8 @@ from cadalign.evaluation.correspondences.outcome import CorrespondenceOutcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.fitting.options import RansacOptions
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

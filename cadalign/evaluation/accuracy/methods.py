@@ -12,9 +12,8 @@ import numpy.typing as npt
 from cadalign.errors import InputError
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.fit import fit, fit_batch
-from cadalign.fitting.options import METHODS
+from cadalign.fitting.options import METHODS, RansacOptions
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.camera import Camera
 
 LIMIT = "limit"

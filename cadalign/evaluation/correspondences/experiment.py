@@ -26,7 +26,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
 from cadalign.evaluation.runs.work import Columns, Result, reason_of
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.fitting.robust import RansacOptions
+from cadalign.fitting.options import RansacOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng

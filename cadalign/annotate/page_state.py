@@ -1,4 +1,4 @@
-"""What the page shows, as plain data."""
+"""State of one photo as the page shows it, as plain data for JSON."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from typing import Any
 
 import numpy as np
 
+from cadalign.annotate.actions import Outcome
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.session import Outcome, Session, Slide
+from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
+from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.annotate.wireframe import box_lines
-from cadalign.annotate.words import advice_text, facts_of, notes_of
 from cadalign.arrays import FloatArray
 
 
-def state_of(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
-    """Everything that the page shows of a photo.
+def page_state(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
+    """Collect everything that the page shows of a photo.
 
     Parameters
     ----------
     session : Session
     number : int
-        The photo, counted from 0.
+        Number of the photo, counted from 0.
     outcome : Outcome, optional
-        Of the action that led to it.
+        Outcome of the last action.
 
     Raises
     ------
@@ -33,75 +34,75 @@ def state_of(session: Session, number: int, outcome: Outcome | None = None) -> d
     """
     outcome = outcome or Outcome()
     with session.lock:
-        slide = session.slide(number)
-        live, suggestion = session.live(slide)
+        state = session.photo_state(number)
+        live, suggestion = session.live(state)
         return {
-            "image": _image(session, number, slide),
+            "image": _image(session, number, state),
             "saved": {
-                "path": slide.sheet.observation.name,
-                "at": slide.saved_at,
-                "trouble": slide.trouble,
+                "path": state.files.observation.name,
+                "at": state.saved_at,
+                "trouble": state.save_error,
             },
             "selected": outcome.selected,
             "message": outcome.message,
-            "can_undo": slide.history.can_undo,
-            "can_redo": slide.history.can_redo,
-            "focal": _focal(slide),
-            "pairs": _pairs(session, slide, live),
-            "keypoints": _keypoints(session, slide),
+            "can_undo": state.history.can_undo,
+            "can_redo": state.history.can_redo,
+            "focal": _focal(state),
+            "pairs": _pairs(session, state, live),
+            "keypoints": _keypoints(session, state),
             "alignment": _alignment(session, live),
             "suggestion": _suggestion(session, suggestion),
         }
 
 
-def _image(session: Session, number: int, slide: Slide) -> dict[str, Any]:
-    photo = slide.photo
+def _image(session: Session, number: int, state: PhotoState) -> dict[str, Any]:
+    photo = state.photo
     return {
         "number": number,
-        "count": len(session.slides),
+        "count": len(session.photos),
         "name": photo.path.name,
         "width": photo.width,
         "height": photo.height,
-        "model": slide.sheet.model.name,
+        "model": state.files.model.name,
     }
 
 
-def _focal(slide: Slide) -> dict[str, Any]:
-    choice = slide.document.focal
+def _focal(state: PhotoState) -> dict[str, Any]:
+    choice = state.document.focal
     return {
         "known": choice.known,
-        "pixels": round(slide.lens.with_focal(choice).fx, 2),
+        "pixels": round(state.intrinsics.with_focal(choice).fx, 2),
         "typed": choice.pixels,
-        "note": slide.lens.note,
+        "note": state.intrinsics.note,
     }
 
 
-def _pairs(session: Session, slide: Slide, live: LiveAlignment) -> list[dict[str, Any]]:
+def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
     pairs, row = [], 0
-    for position, pair in enumerate(slide.document.pairs, start=1):
+    for position, pair in enumerate(state.document.pairs, start=1):
         entry: dict[str, Any] = {
             "pair": pair.number,
             "position": position,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
-            "name": "" if pair.keypoint is None else session.book[pair.keypoint].name,
+            "name": "" if pair.keypoint is None else session.registry[pair.keypoint].name,
             "xyz": None,
             "residual": None,
             "off": None,
         }
         if pair.keypoint is not None:
-            entry["xyz"] = session.model.to_display(session.book[pair.keypoint].xyz).tolist()
+            entry["xyz"] = session.model.to_display(session.registry[pair.keypoint].xyz).tolist()
         if pair.complete:
             if live.result is not None:
                 entry["residual"] = _finite(live.result.residuals[row])
-                entry["off"] = live.contradictions.get(row)
+                entry["off"] = live.outliers.get(row)
             row += 1
         pairs.append(entry)
     return pairs
 
 
-def _keypoints(session: Session, slide: Slide) -> list[dict[str, Any]]:
-    used = slide.document.keypoints
+def _keypoints(session: Session, state: PhotoState) -> list[dict[str, Any]]:
+    used = state.document.keypoints
     return [
         {
             "keypoint": number,
@@ -109,17 +110,15 @@ def _keypoints(session: Session, slide: Slide) -> list[dict[str, Any]]:
             "xyz": session.model.to_display(point.xyz).tolist(),
             "used": number in used,
         }
-        for number, point in session.book
+        for number, point in session.registry
     ]
 
 
 def _alignment(session: Session, live: LiveAlignment) -> dict[str, Any]:
-    result, camera = live.result, live.camera
-    if result is None or camera is None:
-        return {
-            "status": "none" if session.ready else "preparing",
-            "message": live.message,
-        }
+    result = live.result
+    if result is None:
+        return {"status": "none" if session.ready else "preparing", "message": live.message}
+    camera = result.camera
     return {
         "status": "done",
         "message": "",
@@ -143,7 +142,7 @@ def _suggestion(session: Session, suggestion: Suggestion | None) -> dict[str, An
         "keypoint": point.semantic_id,
         "xyz": session.model.to_display(point.xyz).tolist(),
         "uv": suggestion.uv,
-        "text": advice_text(suggestion.advice, name),
+        "text": next_best_text(suggestion.next_best, name),
     }
 
 

@@ -1,4 +1,4 @@
-"""The model's keypoints: those that came with it, and those that were placed by clicking."""
+"""Registry of the model's keypoints: those given with it, and those placed by clicking."""
 
 from __future__ import annotations
 
@@ -14,23 +14,18 @@ from cadalign.errors import InputError
 _LONGEST_NAME = 80
 
 
-class KeypointBook:
-    """Keypoints by semantic id; points are added and renamed, never moved or taken out.
+class KeypointRegistry:
+    """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
     Parameters
     ----------
     given : iterable of ModelKeypoint
-        Those that came with the model.
-
-    Attributes
-    ----------
-    given : frozenset of int
-        Their semantic ids.
+        Keypoints given with the model; the attribute ``given`` holds their semantic ids.
     """
 
     def __init__(self, given: Iterable[ModelKeypoint] = ()) -> None:
         self._points: dict[int, ModelKeypoint] = {}
-        # Those with an id first, so that the others don't take theirs.
+        # Points with an id come first, so that new ids differ from theirs.
         ordered = sorted(given, key=lambda point: point.semantic_id is None)
         self.given = frozenset(self.add(point) for point in ordered)
 
@@ -56,13 +51,7 @@ class KeypointBook:
         return np.array([self[number].xyz for number in semantic_ids], dtype=float).reshape(-1, 3)
 
     def add(self, point: ModelKeypoint) -> int:
-        """Add a point; without a semantic id it gets the next one, without a name "point <id>".
-
-        Returns
-        -------
-        int
-            Its semantic id.
-        """
+        """Add a point and return its semantic id; missing ids and names are assigned."""
         number = point.semantic_id
         if number is None:
             number = 1 + max(self._points, default=0)
@@ -70,11 +59,11 @@ class KeypointBook:
         self._points[number] = replace(point, semantic_id=number, name=name)
         return number
 
-    def take_in(self, points: Iterable[ModelKeypoint], *, tolerance: float) -> None:
-        """Take in points of an earlier session, which count as given from now on.
+    def merge(self, points: Iterable[ModelKeypoint], *, tolerance: float) -> None:
+        """Add points of an earlier session, which then count as given.
 
-        Where a point has the id and, to the tolerance [model units], the place of one that is
-        there already, it is that one, and its name counts.
+        A point with the id and, within the tolerance [model units], the position of a registered
+        one renames that one.
         """
         for point in points:
             number = point.semantic_id
@@ -87,7 +76,7 @@ class KeypointBook:
             self.given |= {self.add(point)}
 
     def find(self, xyz: Iterable[float], *, tolerance: float) -> int | None:
-        """The keypoint at a place, if there is one within the tolerance [model units]."""
+        """Find the id of the keypoint at a position, within the tolerance [model units]."""
         if not self._points:
             return None
         numbers = list(self._points)
@@ -96,23 +85,19 @@ class KeypointBook:
         return numbers[nearest] if gaps[nearest] <= tolerance else None
 
     def rename(self, semantic_id: int, name: str) -> None:
-        """Give a keypoint another name.
-
-        Raises
-        ------
-        InputError
-            If the name is empty, too long, or another keypoint's.
-        """
+        """Rename a keypoint; raises InputError if the name is empty, too long or taken."""
         name = " ".join(name.split())
         if not name or len(name) > _LONGEST_NAME:
             raise InputError(
-                f"{name[:_LONGEST_NAME]!r} is not a name",
+                f"the name {name[:_LONGEST_NAME]!r} is empty or too long",
                 where="name",
                 fix=f"give 1 to {_LONGEST_NAME} characters",
             )
         point = self[semantic_id]
         if name != point.name and name in self._names:
-            raise InputError(f"another keypoint is called {name!r}", where="name")
+            raise InputError(
+                f"another keypoint is called {name!r}", where="name", fix="choose another name"
+            )
         self._points[semantic_id] = replace(point, name=name)
 
     @property
@@ -120,7 +105,7 @@ class KeypointBook:
         return {point.name for point in self._points.values()}
 
     def _free_name(self, name: str) -> str:
-        """The name, or with a number behind it where it is taken."""
+        """The name, with a number appended if it is taken."""
         taken, free, number = self._names, name, 2
         while free in taken:
             free, number = f"{name} ({number})", number + 1

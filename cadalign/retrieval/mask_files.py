@@ -1,4 +1,4 @@
-"""Reading the pictures that silhouettes are taken from."""
+"""Reading of masks and of photos with opacity, for silhouettes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ from cadalign.render.drawing.color import ByteImage
 
 
 def read_mask(path: Path, camera: Camera) -> BoolArray:
-    """Read a picture whose bright pixels are the object's, (h, w) bool.
-
-    Raises
-    ------
-    DataError
-        If it is missing, is not an image, or has another size than the camera.
-    """
+    """Read an image whose bright pixels are the object's, (h, w) bool; raises as `read_image`."""
     return np.asarray(read_image(path, camera).mean(axis=2) > 127.5)
 
 
@@ -32,13 +26,13 @@ def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
     InputError
         If the observation names no image.
     DataError
-        If it is missing, is not an image, or has another size than the camera.
+        If the file is missing, is no image, or has another size than the camera.
     """
     if path is None:
         raise InputError(
             "the observation names no image",
             where="--silhouette",
-            fix="give its image, or the object's pixels with --mask",
+            fix="add the image to the observation, or give the object's pixels with --mask",
         )
     colors = read_image(path, camera)
     from PIL import ImageOps
@@ -46,6 +40,6 @@ def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
     with open_photo(path) as image:
         if not image.has_transparency_data:
             return colors
-        # A transparent colour, as of a palette, is no channel of its own in the file.
+        # The transparent colour of a palette is no separate channel in the file.
         opacity = ImageOps.exif_transpose(image).convert("RGBA").getchannel("A")
         return np.dstack([colors, np.asarray(opacity)])

@@ -1,4 +1,4 @@
-"""From the command line's words to a session."""
+"""Opening of a session: photos, model, camera and keypoints are read and checked."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from cadalign.annotate.document import Document, FocalChoice
 from cadalign.annotate.files import (
     SAME_PLACE,
-    Sheet,
+    AnnotationFiles,
     keypoints_file,
     read_given_keypoints,
     read_own_keypoints,
 )
 from cadalign.annotate.history import History
-from cadalign.annotate.keypoint_book import KeypointBook
-from cadalign.annotate.lenses import lens_of, read_camera
+from cadalign.annotate.intrinsics import intrinsics_of, read_camera
+from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.photos import Photo, find_photos
-from cadalign.annotate.session import Session, Slide
+from cadalign.annotate.session import PhotoState, Session
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
@@ -39,37 +39,24 @@ def open_session(
     keypoints: Path | None = None,
     out: Path | None = None,
 ) -> Session:
-    """Read everything that is to be annotated.
+    """Open an annotation session.
 
-    Parameters
-    ----------
-    image : Path
-        A photo, or a folder of photos.
-    model : Path
-        The mesh file.
-    observation : Path, optional
-        Where a single photo's observation is kept.
-    camera : Path, optional
-        The calibrated camera of the photos.
-    keypoints : Path, optional
-        The model's keypoints.
-    out : Path, optional
-        The folder to write to; by default that of the observation, or of the photos.
+    The parameters are the options of `cadalign annotate`.
 
     Raises
     ------
     CadalignError
-        If a file is missing or not what it should be, or the words contradict each other.
+        If a file is missing or malformed, or the arguments contradict each other.
     """
     paths = find_photos(image)
     if observation is not None and (image.is_dir() or out is not None):
         raise InputError(
-            "names the file of a single photo",
+            "names the file of a single photo, but a folder is given too",
             where="--observation",
-            fix="with a folder of photos, or --out, leave it away",
+            fix="use --out for a folder of photos, and not both options",
         )
     photos = [Photo.open(paths[0])] if not image.is_dir() else _readable(paths)
-    photos[0].encoded()  # a damaged one is refused now, not when the page asks for it
+    photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
     if observation is None:
         files = _observation_files(photos, out or paths[0].parent)
     else:
@@ -78,51 +65,53 @@ def open_session(
     given_camera = None if camera is None else read_camera(camera)
     mesh = load_mesh(model)
     cad = CadModel(mesh)
-    book_file = keypoints_file(model, folder)
-    book = _open_book(book_file, keypoints or keypoints_file(model, model.parent), model, mesh)
-    slides = [
-        _open_slide(photo, file, model, given_camera, book, cad.diagonal)
+    registry_file = keypoints_file(model, folder)
+    registry = _open_registry(
+        registry_file, keypoints or keypoints_file(model, model.parent), model, mesh
+    )
+    photo_states = [
+        _open_photo_state(photo, file, model, given_camera, registry, cad.diagonal)
         for photo, file in zip(photos, files, strict=True)
     ]
-    return Session(cad, book, slides, book_file)
+    return Session(cad, registry, photo_states, registry_file)
 
 
-def _open_book(own: Path, source: Path, model: Path, mesh: Mesh) -> KeypointBook:
-    """The keypoints that came with the model, and those that were placed or renamed before."""
+def _open_registry(own: Path, source: Path, model: Path, mesh: Mesh) -> KeypointRegistry:
+    """Read the keypoints given with the model and those of earlier sessions."""
     came: tuple[ModelKeypoint, ...] = ()
     if source != own and (source.exists() or source != keypoints_file(model, model.parent)):
         came = read_given_keypoints(source, model, mesh)
-    book = KeypointBook(came)
+    registry = KeypointRegistry(came)
     if own.exists():
         low, high = mesh.bounds
         before = read_own_keypoints(own, model, mesh)
-        book.take_in(before, tolerance=SAME_PLACE * float(np.linalg.norm(high - low)))
-    return book
+        registry.merge(before, tolerance=SAME_PLACE * float(np.linalg.norm(high - low)))
+    return registry
 
 
-def _open_slide(
+def _open_photo_state(
     photo: Photo,
     file: Path,
     model: Path,
     camera: Camera | None,
-    book: KeypointBook,
+    registry: KeypointRegistry,
     diagonal: float,
-) -> Slide:
-    sheet = Sheet(file, photo.path, model)
-    document, own = sheet.read(Document(), book, diagonal)
+) -> PhotoState:
+    files = AnnotationFiles(file, photo.path, model)
+    document, own = files.read(Document(), registry, diagonal)
     if own is not None and not own.focal_known:
-        # The file says that it is to be estimated; the camera's is kept for when it is not.
-        lens = lens_of(photo, camera or own)
+        # The file leaves it to be estimated; the given camera's is kept for the user to choose.
+        intrinsics = intrinsics_of(photo, camera or own)
         known = False
     else:
-        lens = lens_of(photo, own or camera)
-        known = lens.calibrated
+        intrinsics = intrinsics_of(photo, own or camera)
+        known = intrinsics.calibrated
     document = document.choose_focal(FocalChoice(known=known))
-    return Slide(photo, sheet, lens, History(document))
+    return PhotoState(photo, files, intrinsics, History(document))
 
 
 def _readable(paths: list[Path]) -> list[Photo]:
-    """The photos among files whose names say that they are; the others are warned of."""
+    """Open the files that are photos, with a warning about the others."""
     photos = []
     for path in paths:
         try:
@@ -130,12 +119,12 @@ def _readable(paths: list[Path]) -> list[Photo]:
         except DataError as error:
             logger.warning("left out: %s", error)
     if not photos:
-        raise DataError("none of its photos can be read", where=str(paths[0].parent))
+        raise DataError("none of the photos in this folder can be read", where=str(paths[0].parent))
     return photos
 
 
 def _observation_files(photos: list[Photo], folder: Path) -> list[Path]:
-    """A file for each photo; with its whole name where two differ only in the ending."""
+    """Name a file for each photo, with its suffix if two photos differ only in that."""
     stems = [photo.path.stem for photo in photos]
     return [
         folder / f"{photo.path.name if stems.count(photo.path.stem) > 1 else photo.path.stem}.json"

@@ -1,4 +1,4 @@
-"""Where the next keypoint would help most, by what its measurement would add to what is known."""
+"""Next-best keypoint: the candidate whose measurement reduces the uncertainty most."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from cadalign.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
-class Advice:
-    """The best next measurement.
+class NextBest:
+    """The candidate to measure next, and its effect.
 
     Parameters
     ----------
     row : int
-        Which of the candidates.
+        Row of the candidate.
     unknown : int
-        The least-known unknown, its place in `FitResult.covariance`.
+        Index of the most uncertain unknown in `FitResult.covariance`.
     before, after : float
-        Its standard deviation without and with the measurement: radians, shares of the distance,
-        or relative (0.02 is 2 %).
+        Standard deviation of that unknown without and with the measurement: radians, shares of the
+        distance, or relative (0.02 is 2 %).
     """
 
     row: int
@@ -35,7 +35,7 @@ class Advice:
     after: float
 
 
-def best_next(
+def find_next_best(
     points_3d: FloatArray,
     camera: Camera,
     alignment: Alignment,
@@ -43,12 +43,12 @@ def best_next(
     *,
     sigma: float,
     known_axis: str = "x",
-) -> Advice | None:
-    """Choose the keypoint whose measurement shrinks the least-known unknown most.
+) -> NextBest | None:
+    """Choose the keypoint whose measurement shrinks the most uncertain unknown most.
 
-    A keypoint with the derivatives J that is measured where it is predicted turns the covariance C
-    into C - C J' (J C J' + sigma^2)^-1 J C. So that they can be compared, rotations count in
-    radians, translations as shares of the distance, scales and focal length by their logarithms.
+    Measuring a keypoint with the derivatives J turns the covariance C into
+    C - C J' (J C J' + sigma^2)^-1 J C. To be comparable, rotations count in radians, translations
+    as shares of the distance, scales and focal length by their logarithms.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def best_next(
 
     Returns
     -------
-    Advice or None
+    NextBest or None
         Of equally good candidates the first; None if there are none, or nothing is uncertain.
     """
     weights = _comparable(alignment, len(covariance))
@@ -78,7 +78,7 @@ def best_next(
     # Rounded, so that candidates that are equal but for rounding are told apart by their order.
     row = int(np.argmin(np.round(variances / covariance[worst, worst], 9)))
     after = float(np.sqrt(max(variances[row], 0.0)) * weights[worst])
-    return Advice(row, worst, float(spread[worst]), after)
+    return NextBest(row, worst, float(spread[worst]), after)
 
 
 def updated_variances(
@@ -90,7 +90,7 @@ def updated_variances(
     sigma: float,
     known_axis: str = "x",
 ) -> FloatArray:
-    """The unknowns' variances (n, k) if one of n candidates is measured; see `best_next`."""
+    """The unknowns' variances (n, k) if one of n candidates is measured; see `find_next_best`."""
     jacobian = projection_jacobian(
         points_3d, camera, alignment, known_axis=known_axis, unknowns=len(covariance)
     )
@@ -101,7 +101,7 @@ def updated_variances(
 
 
 def unknown_name(unknown: int, known_axis: str = "x") -> str:
-    """What an unknown of the covariance is called in a sentence.
+    """Name of an unknown of the covariance, for a sentence.
 
     Examples
     --------

@@ -50,7 +50,7 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
-        from cadalign.render.drawing.job import RenderJob, draw_movie, draw_picture
+        from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
         job = RenderJob.prepare(

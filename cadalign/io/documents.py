@@ -22,6 +22,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.io.files import reading
 
 _MAX = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
@@ -69,12 +70,8 @@ def read_json(path: Path) -> Any:
     DataError
         If it is missing, cannot be read or is not JSON; names the line.
     """
-    try:
+    with reading(path):
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
-    except (OSError, ValueError) as error:  # not UTF-8, or a NUL in the path
-        raise DataError(f"cannot be read ({error})", where=str(path)) from None
     with in_file(path):
         return parse_json(text)
 

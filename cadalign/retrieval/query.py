@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cadalign.errors import CadalignError, DataError
-from cadalign.io.documents import read_json
+from cadalign.errors import DataError
+from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation
 
 _ORIGIN = [0.0, 0.0, 0.0]
@@ -34,14 +34,9 @@ def read_query(path: Path) -> Observation:
         If the file is missing, is not JSON, or a field is missing, unknown or invalid; the message
         names file and field.
     """
-    try:
-        query = Observation.from_dict(_with_model_points(read_json(path)), folder=path.parent)
-    except DataError as error:
-        if error.where is not None and error.where.startswith(str(path)):
-            raise
-        raise _in_file(path, error) from None
-    except CadalignError as error:
-        raise _in_file(path, error) from None
+    data = _with_model_points(read_json(path))
+    with in_file(path):
+        query = Observation.from_dict(data, folder=path.parent)
     if query.semantic_ids is None:
         raise DataError(
             "the keypoints have no semantic_id",
@@ -49,11 +44,6 @@ def read_query(path: Path) -> Observation:
             fix="give each the id that its category's models have for it",
         )
     return query
-
-
-def _in_file(path: Path, error: CadalignError) -> DataError:
-    where = f"{path}: {error.where}" if error.where else str(path)
-    return DataError(error.what, where=where, fix=error.fix)
 
 
 def _with_model_points(data: Any) -> Any:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from cadalign.datasets.sfm.colmap_model import CameraTable, ColmapImage, ColmapPoints, ColmapView
 from cadalign.errors import DataError
 from cadalign.geometry.camera import COLMAP_PARAMS
+from cadalign.io.files import reading
 
 # COLMAP's camera models in the order of their numbers, and how many parameters those have that
 # `Camera` doesn't know: a camera nobody asks for must not keep the others from being read.
@@ -115,7 +116,8 @@ class _Cursor:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._data = path.read_bytes()
+        with reading(path):
+            self._data = path.read_bytes()
         self.offset = 0
 
     def count(self, what: str) -> int:

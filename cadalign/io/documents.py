@@ -194,11 +194,11 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
     if field:
-        known = sorted(each.encode_name for each in _type_at(kind, path).fields)
+        known = sorted(each.encode_name for each in getattr(_type_at(kind, path), "fields", ()))
         return DataError(
             f"unknown field {quote(field[2])}",
             where=where or "top level",
-            fix=f"known are {', '.join(known)}",
+            fix=f"known are {', '.join(known)}" if known else None,
         )
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _type_at(kind, path).values))
@@ -233,14 +233,15 @@ def _wanted(text: str) -> str:
 
 
 def _type_at(kind: Any, path: str | None) -> Any:
-    """The declared type at a path."""
+    """The declared type at a path; None if the path is a part of a hostile field name."""
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer((path or "$")[1:]):
         kind = _without_none(kind)
         if isinstance(kind, msgspec.inspect.StructType):
-            kind = next(each.type for each in kind.fields if each.encode_name == step["name"])
+            types = {each.encode_name: each.type for each in kind.fields}
+            kind = types.get(step["name"])
         else:
-            kind = kind.value_type if step["row"] == "..." else kind.item_type
+            kind = getattr(kind, "value_type" if step["row"] == "..." else "item_type", None)
     return _without_none(kind)
 
 

@@ -94,7 +94,7 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
         fields = cursor.unpack(_IMAGE, "an image")
         name = cursor.name()
         observations = cursor.array(
-            _OBSERVATION, cursor.count("observations"), f"the observations of image {name}"
+            _OBSERVATION, cursor.count("observations"), f"the observations of image {name[:200]}"
         )
         images.append((name, partial(_read_view, fields, observations)))
     cursor.finish()

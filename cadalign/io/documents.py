@@ -10,6 +10,7 @@ are ignored. What the types cannot express is checked in ``__post_init__``, whic
 from __future__ import annotations
 
 import json
+import operator
 import os
 import re
 import sys
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, quote
@@ -117,6 +119,9 @@ def convert(
     try:
         return msgspec.convert(data, kind, strict=strict)
     except msgspec.ValidationError as error:
+        plain = _plain(data)
+        if plain is not data:
+            return convert(plain, kind, where=where, strict=strict)
         raise _located(error, data, kind, where or "") from None
 
 
@@ -176,6 +181,22 @@ _WORDS = {
     "object": "an object",
 }
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
+
+
+def _plain(value: Any) -> Any:
+    """The value with NumPy's arrays and numbers as Python's; itself where it holds none."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    try:
+        if isinstance(value, dict):
+            fields = {name: _plain(each) for name, each in value.items()}
+            return fields if any(fields[name] is not value[name] for name in value) else value
+        if isinstance(value, list | tuple):
+            items = [_plain(each) for each in value]
+            return items if any(map(operator.is_not, items, value)) else value
+    except RecursionError:  # nested deeper than any declared type
+        pass
+    return value
 
 
 def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:

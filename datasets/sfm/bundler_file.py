@@ -144,6 +144,6 @@ def _not_a_number(body: str, path: Path) -> DataError:
 
 
 def _as_count(value: float, path: Path, where: str) -> int:
-    if not (value >= 0 and value % 1 == 0 and np.isfinite(value)):
+    if not (0 <= value < np.inf and value % 1 == 0):
         raise DataError(f"{value:g} is not a number of things", where=f"{path}, {where}", fix=_CUT)
     return int(value)

@@ -1,16 +1,16 @@
-"""A library's file: a header of 64 bytes, then an Arrow table that is read where it lies.
+"""File format of libraries: a header of 64 bytes, then a memory-mapped Arrow table.
 
 The header holds, in little-endian order::
 
-    16 bytes   the word "cadalign library"
+    16 bytes   the text "cadalign library"
      4 bytes   version of the format
      4 bytes   zero
-     8 bytes   length of what follows the header
-    32 bytes   BLAKE2b checksum of it
+     8 bytes   length of the payload
+    32 bytes   BLAKE2b checksum of the payload
 
-What follows is an Arrow IPC file of the columns of `cadalign.retrieval.models.SCHEMA`. Opening maps
+The payload is an Arrow IPC file of the columns of `cadalign.retrieval.models.SCHEMA`. Opening maps
 it into memory and compares the checksum, which reads the file once: 50,000 models of 10 keypoints
-are 30 MB, and take some 0.1 s. Processes that open the same file share its memory.
+are 30 MB and take some 0.1 s. Processes that open the same file share its memory.
 """
 
 from __future__ import annotations
@@ -35,13 +35,7 @@ _AGAIN = "build it again, with: cadalign library build"
 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
-    """Write a library's file, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
+    """Write a library's file atomically; raises DataError on failure."""
     payload = _payload(models)
     header = _HEADER.pack(_MAGIC, VERSION, 0, payload.size, _checksum(payload))
 
@@ -59,7 +53,7 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
     Raises
     ------
     DataError
-        If it is missing, cut short, damaged, of another version, or something else.
+        If the file is missing, truncated, damaged, of another version, or of another format.
     """
     where = str(path)
     try:
@@ -80,7 +74,7 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
         )
     payload = content.slice(_HEADER.size)
     if payload.size != size:
-        what = "cut short" if payload.size < size else "too long"
+        what = "truncated" if payload.size < size else "too long"
         raise DataError(
             f"the library file is {what}: {payload.size} bytes, {size} expected",
             where=where,
@@ -140,7 +134,7 @@ def _check_table(table: pa.Table) -> None:
 
 
 def fingerprint(models: ModelTable) -> str:
-    """A text that changes with anything that is in a library."""
+    """Hash of all content of a library, as text."""
     return _checksum(_payload(models)).hex()
 
 

@@ -98,7 +98,7 @@ def test_of_a_model_with_a_damaged_mesh_the_keypoints_bounds_are_taken(
     held = library[model.key]
     assert held.mesh_path is None
     np.testing.assert_array_equal(held.bounds[0], model.keypoints.xyz.min(axis=0))
-    with pytest.raises(DataError, match=f"model {model.model_id}: there is no mesh"):
+    with pytest.raises(DataError, match=f"model {model.model_id}: the model has no mesh"):
         held.load_mesh()
 
 
@@ -212,7 +212,7 @@ def test_another_version_is_refused_and_both_are_named(file: Path) -> None:
 @pytest.mark.parametrize("left", [HEADER, HEADER + 1000, -1])
 def test_a_file_that_was_cut_short_is_refused(file: Path, left: int) -> None:
     file.write_bytes(file.read_bytes()[:left])
-    with pytest.raises(DataError, match=r"cut short: \d+ bytes, \d+ expected; copy it again"):
+    with pytest.raises(DataError, match=r"truncated: \d+ bytes, \d+ expected; copy it again"):
         Library.open(file)
 
 

@@ -34,7 +34,8 @@ class Render:
     background: str = "grey"
     """grey, white, black, #rrggbb, or transparent (PNG stills)."""
     keypoints: Path | None = None
-    """JSON file with keypoints to draw: a list of [x, y, z], or KeypointNet's annotations."""
+    """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
+    KeypointNet's annotations."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Stretch along the model's axes."""
     fov: float = 35.0

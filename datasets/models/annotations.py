@@ -208,6 +208,7 @@ def _symmetries(read: _Symmetries) -> Symmetries:
 
 def _circle(read: _Circle) -> Circle:
     normal = np.array(read.normal)
+    normal /= np.abs(normal).max()  # whose square is finite
     return Circle(
         center=_frozen(read.center, float),
         radius=read.radius,

@@ -65,16 +65,10 @@ class Colmap(CorrespondenceSet):
         binary = suffix == ".bin"
         files = {stem: folder / f"{stem}{suffix}" for stem in _STEMS}
         self._camera_file, self._point_file = files["cameras"], files["points3D"]
-        try:
-            read_cameras = read_cameras_binary if binary else read_cameras_text
-            self._cameras = read_cameras(self._camera_file)
-            points = (read_points_binary if binary else read_points_text)(self._point_file)
-            images = (read_images_binary if binary else read_images_text)(files["images"])
-        except OSError as error:
-            raise DataError(
-                f"cannot be read ({error.strerror or error})", where=str(error.filename or folder)
-            ) from None
-        ids, xyz = points
+        read_cameras = read_cameras_binary if binary else read_cameras_text
+        self._cameras = read_cameras(self._camera_file)
+        ids, xyz = (read_points_binary if binary else read_points_text)(self._point_file)
+        images = (read_images_binary if binary else read_images_text)(files["images"])
         order = np.argsort(ids, kind="stable")
         self._point_ids, self._points = ids[order], xyz[order]
         twice = self._point_ids[1:][self._point_ids[1:] == self._point_ids[:-1]]

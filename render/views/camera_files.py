@@ -119,7 +119,7 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     if path.is_dir():
         return _read_colmap(path)
     data = read_json(path)
-    with in_file(path):
+    with in_file(path), np.errstate(over="ignore", invalid="ignore"):
         return _views_of(data)
 
 

@@ -437,7 +437,7 @@ def test_malformed_queries_are_refused(
         return text.removeprefix(f"{path}: ")
 
     camera = CAMERA.to_dict()
-    assert refused([]) == "expected an object, got list"
+    assert refused([]) == "[] is not an object"
     assert refused({"camera": camera}) == "keypoints: missing"
     keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
     assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})

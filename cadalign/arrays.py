@@ -1,4 +1,4 @@
-"""Checks of array arguments, shared by all public types and functions."""
+"""Array types, and checks of array arguments."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     Parameters
     ----------
     value : array_like
-        What the caller passed.
+        The argument.
     name : str
         The argument's name, for the message.
     shape : tuple of int or None
-        The required shape; ``None`` stands for any length.
+        The required shape; ``None`` for any length.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:
 
 
 def describe_non_finite(array: FloatArray) -> str:
-    """Say which rows of an array hold NaN or infinite values."""
+    """List the rows of an array that hold NaN or infinite values."""
     bad = ~np.isfinite(array)
     if array.ndim == 0:
         return f"is {array}"

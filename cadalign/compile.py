@@ -1,4 +1,4 @@
-"""Compile kernels: the one way in which cadalign uses Numba."""
+"""Compile kernels; nothing else in cadalign calls Numba's compiler."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _SOLVERS = Path(__file__).parent / "solvers"
 def kernel(function: F) -> F:
     """Compile on first use, keep the result on disk, release the interpreter lock while running.
 
-    No floating-point liberties are taken: contraction into fused multiply-adds, for one, is decided
-    differently for code that was just compiled and for code read back from disk, and results are to
-    be the same bit for bit.
+    Floating-point operations keep their order and rounding: contraction into fused multiply-adds,
+    for one, differs between code just compiled and code read back from disk, and results must be
+    the same bit for bit.
     """
     return _compiled(function, set())
 
@@ -34,7 +34,7 @@ def _compiled(function: F, fastmath: set[str]) -> F:
         cache=True, nogil=True, error_model="numpy", fastmath=fastmath or False, boundscheck=False
     )(function)
     # Numba recompiles a function when its own file changes, but not when a function that it calls
-    # in another file does. One stamp for the files of its folder and the solvers mends that.
+    # in another file does. One stamp for the files of its folder and of the solvers corrects that.
     cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if cache_file is not None:
         folder = Path(function.__code__.co_filename).resolve().parent
@@ -44,6 +44,6 @@ def _compiled(function: F, fastmath: set[str]) -> F:
 
 @cache
 def _stamp(folder: Path) -> tuple[float, int]:
-    """A value that changes with any source file of a folder: newest time, total size."""
+    """Newest time and total size of a folder's source files; changes with any of them."""
     stats = [path.stat() for path in folder.glob("*.py")]
     return max(stat.st_mtime for stat in stats), sum(stat.st_size for stat in stats)

@@ -14,11 +14,11 @@ class CadalignError(Exception):
     Parameters
     ----------
     what : str
-        What is wrong, in words a user understands.
+        Description of the problem, in the user's terms.
     where : str, optional
-        The argument, file, model id or field that it is wrong in.
+        The argument, file, model id or field concerned.
     fix : str, optional
-        What to do about it.
+        Remedy.
 
     Examples
     --------
@@ -52,18 +52,18 @@ class InputError(CadalignError, ValueError):
 
 
 class DegenerateError(CadalignError):
-    """The keypoints do not determine the alignment: too few, in one plane, all the same."""
+    """The keypoints do not determine the alignment: too few, coplanar or coincident."""
 
 
 class NoConsensusError(CadalignError):
-    """No alignment has more keypoints to support it than chance gives.
+    """No alignment has more supporting keypoints than expected by chance.
 
     Attributes
     ----------
     score : float
-        The best truncated score that was reached, sum of squared errors [px^2].
+        The best truncated score reached, a sum of squared errors [px^2].
     inliers : int
-        How many keypoints supported it.
+        Number of keypoints that supported it.
     """
 
     def __init__(

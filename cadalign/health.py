@@ -1,4 +1,4 @@
-"""What works on this machine: renderers, cores, and the cache of compiled solvers."""
+"""Renderers, cores and the cache of compiled solvers, as found on this machine."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from cadalign.render.select import best_renderer
 
 @dataclass(frozen=True)
 class Health:
-    """What was found.
+    """Findings of `examine`.
 
     Parameters
     ----------
     renderers : tuple of Probe
-        Ray casting is the last.
+        All renderers, ray casting last.
     best : str
-        The one that "auto" takes.
+        The renderer that "auto" selects.
     remedies : dict of str to str
-        For each renderer that does not work the command that would enable it.
+        For each renderer that does not work, the command that would enable it.
     cores, usable_cores : int
-        The machine's, and those that this process is allowed.
+        Cores of the machine, and cores that this process may use.
     cache : str
-        Whether compiled solvers are kept, and where.
+        Location and state of the cache of compiled solvers.
     python, numpy, numba : str
         Versions.
     """
@@ -45,7 +45,7 @@ class Health:
 
 
 def examine() -> Health:
-    """Try every renderer in a process of its own, and look at the rest; takes some seconds."""
+    """Try every renderer in a process of its own and collect the rest; takes some seconds."""
     renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
     return Health(
         renderers=renderers,
@@ -61,7 +61,7 @@ def examine() -> Health:
 
 
 def compiled_cache() -> str:
-    """Say whether Numba keeps compiled solvers on disk, and how many are there."""
+    """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     folder = Path(chosen) if chosen else Path(__file__).parent
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0

@@ -1,4 +1,4 @@
-"""Random streams that depend on what they are for, not on when they are drawn."""
+"""Random streams derived from a seed and a name, independent of the order of use."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ import numpy as np
 
 
 def instance_rng(seed: int, *names: str) -> np.random.Generator:
-    """A generator for one instance of a dataset, derived from the run's seed and its names.
+    """Derive the random generator of one instance of a dataset.
 
-    Results then don't depend on the order in which instances are handled, nor on how many
-    workers share them.
+    Results then depend neither on the order of instances nor on the number of workers.
+
+    Parameters
+    ----------
+    seed : int
+        The run's seed.
+    *names : str
+        Names of the instance, such as category and model id.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What a renderer gives back, and what every renderer can do."""
+"""Results of a renderer, and the interface of all renderers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError, RenderError
+from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.color import ByteImage, bytes_from_linear, linear_from_bytes
+from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.scene import Scene
 
 LIGHT_GREY = (228, 230, 233)
@@ -22,7 +22,7 @@ MAX_PIXELS = 100_000_000
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What is seen through the centre of each pixel: exact, not antialiased.
+    """The hit of the ray through the centre of each pixel: exact, not antialiased.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Geometry:
 
     @property
     def mask(self) -> npt.NDArray[np.bool_]:
-        """Where the object is, (h, w) bool."""
+        """Pixels of the object, (h, w) bool."""
         return np.asarray(self.face_id >= 0)
 
 
@@ -77,28 +77,7 @@ class Frame(Geometry):
         InputError
             If the background is neither a colour nor an image of the frame's size.
         """
-        behind = np.asarray(background)
-        shape = (*self.color.shape[:2], 3)
-        if behind.shape not in ((3,), shape):
-            raise InputError(
-                f"shape {behind.shape} is neither (3,) nor {shape}", where="background"
-            )
-        if (
-            behind.dtype.kind not in "ui"
-            or behind.min(initial=0) < 0
-            or behind.max(initial=0) > 255
-        ):
-            raise InputError("not whole numbers from 0 to 255", where="background")
-        result: ByteImage = np.empty(shape, dtype=np.uint8)
-        result[:] = behind
-        opacity = self.color[:, :, 3]
-        result[opacity == 255] = self.color[:, :, :3][opacity == 255]
-        mixed = (opacity > 0) & (opacity < 255)
-        share = opacity[mixed, None] / np.float32(255)
-        front = linear_from_bytes(self.color[:, :, :3][mixed])
-        light = front * share + linear_from_bytes(result[mixed]) * (1 - share)
-        result[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))
-        return result
+        return composite(self.color, background)
 
 
 class Renderer(Protocol):
@@ -106,22 +85,19 @@ class Renderer(Protocol):
 
     @property
     def name(self) -> str:
-        """What the renderer is called on the command line."""
+        """The renderer's name on the command line."""
 
     def render(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
     ) -> Frame:
         """Draw one frame; see `RaycastRenderer.render`."""
 
+    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+        """Name of the renderer that draws a scene's frames: another where this one cannot."""
+
 
 def check_image_size(camera: Camera) -> None:
-    """Refuse images too large to be drawn.
-
-    Raises
-    ------
-    RenderError
-        If a side is longer than 16,384 px or the image has more than 100 million pixels.
-    """
+    """Refuse images too large to be drawn."""
     if max(camera.width, camera.height) > MAX_SIDE or camera.width * camera.height > MAX_PIXELS:
         raise RenderError(
             f"{camera.width} x {camera.height} px is too large to be drawn; the limits are "

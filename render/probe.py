@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ RENDERERS: dict[str, str] = {
     "open3d": "cadalign.render.open3d.renderer:Open3DRenderer",
     "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
 }
-"""Where each renderer's class is."""
+"""Module and class of each renderer."""
 
 _TIMEOUT = 120
 _TIMED_FRAMES = 5
@@ -46,7 +45,7 @@ _CHILD = (
 
 @dataclass(frozen=True)
 class Probe:
-    """What came of trying a renderer.
+    """Result of trying a renderer.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ class Probe:
         The renderer.
     works : bool
     detail : str
-        What draws, or why it does not work.
+        Device that draws, or the reason of the failure.
     versions : str
         Of the packages that it needs.
     milliseconds : float, optional
@@ -69,14 +68,14 @@ class Probe:
 
 
 def probe_renderer(name: str, *, timed: bool = False) -> Probe:
-    """Try a renderer in a process of its own; what came of it is remembered for this process.
+    """Try a renderer in a process of its own; the result is kept for the life of this one.
 
     Parameters
     ----------
     name : str
         One of `RENDERERS`.
     timed : bool
-        Whether to measure the time of a frame, which takes some seconds.
+        Measure the time of a frame too, which takes some seconds.
 
     Raises
     ------
@@ -112,7 +111,7 @@ def _probe(name: str, timed: bool) -> Probe:
     if child.returncode < 0:
         reason = f"the process was killed by signal {-child.returncode}"
     else:
-        reason = (child.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
     return Probe(name, False, reason, _versions(name))
 
 
@@ -128,7 +127,7 @@ def report(name: str, *, timed: bool) -> None:
 
 
 def load_renderer(name: str, studio: Studio | None) -> Renderer:
-    """Make a renderer in this process, whatever may come of it."""
+    """Make a renderer in this process, even if that takes the process down."""
     module, _, kind = RENDERERS[name].partition(":")
     renderer: Renderer = getattr(import_module(module), kind)(studio=studio)
     return renderer
@@ -137,12 +136,12 @@ def load_renderer(name: str, studio: Studio | None) -> Renderer:
 def _try(name: str, *, timed: bool) -> Probe:
     renderer = load_renderer(name, None)
     mesh = ball(5 if timed else 1)
-    camera = Camera.from_fov(640, 480, fov_x=50.0) if timed else Camera.from_fov(64, 48, fov_x=50)
+    camera = Camera.from_fov(*((640, 480) if timed else (64, 48)), fov_x=50.0)
     scene, pose = Scene(mesh), Alignment(np.eye(3), np.array([0, 0, 4.5]), np.ones(3))
     frame = renderer.render(scene, camera, pose)
     seen = float((frame.color[:, :, 3] > 127).mean())
     if not (frame.mask.any() and abs(seen - frame.mask.mean()) < 0.1):
-        return Probe(name, False, "the picture of a ball is not one", _versions(name))
+        return Probe(name, False, "it draws a ball wrongly", _versions(name))
     milliseconds = None
     if timed:
         times = []
@@ -151,7 +150,8 @@ def _try(name: str, *, timed: bool) -> Probe:
             renderer.render(scene, camera, pose)
             times.append(time.perf_counter() - begin)
         milliseconds = 1000 * float(np.median(times))
-    return Probe(name, True, _device(renderer), _versions(name), milliseconds)
+    device = str(getattr(renderer, "device", "processor"))
+    return Probe(name, True, device, _versions(name), milliseconds)
 
 
 def ball(subdivisions: int) -> Mesh:
@@ -160,10 +160,6 @@ def ball(subdivisions: int) -> Mesh:
 
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     return Mesh(np.array(shape.vertices), np.array(shape.faces))
-
-
-def _device(renderer: Any) -> str:
-    return str(getattr(renderer, "device", "processor"))
 
 
 def _versions(name: str) -> str:

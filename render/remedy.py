@@ -1,4 +1,4 @@
-"""What to do about a renderer that does not work: the exact command."""
+"""The exact command that would enable a renderer that does not work."""
 
 from __future__ import annotations
 
@@ -27,10 +27,6 @@ _MODULES = {"pyrender": ("pyrender", "pyrender2"), "open3d": ("open3d", "'cadali
 
 def remedy(probe: Probe) -> str:
     """The command that would enable a renderer; empty where it works or none is known.
-
-    Parameters
-    ----------
-    probe : Probe
 
     Examples
     --------

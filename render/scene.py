@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,7 @@ class Scene:
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
-        return _rebuild, (self.mesh, self.crease_angle)
+        return partial(Scene, crease_angle=self.crease_angle), (self.mesh,)
 
     @cached_property
     def bounds(self) -> FloatArray:
@@ -111,18 +111,18 @@ class Scene:
 
     @cached_property
     def coincident_faces(self) -> tuple[IntArray, IntArray]:
-        """Which triangle to show of those in one place; see `coincident_faces`."""
+        """The triangle to show of those in one place; see `coincident_faces`."""
         return coincident_faces(self.mesh.vertices, self.mesh.faces)
 
     @cached_property
     def is_smooth(self) -> npt.NDArray[np.bool_]:
-        """Which triangles have corner normals that differ from their own, (m,) bool."""
+        """Triangles with corner normals that differ from their own, (m,) bool."""
         difference = self.corner_normals - self.face_normals[:, None]
         return np.asarray((np.abs(difference) > 1e-6).any(axis=(1, 2)))
 
     @cached_property
     def barycentric_gradients(self) -> FloatArray:
-        """How corners 1 and 2 gain weight along the triangle, (m, 2, 3) float.
+        """Gradients of the barycentric weights of corners 1 and 2, (m, 2, 3) float.
 
         The weight of corner i at x is ``gradient[i - 1] @ (x - corner 0)``.
         """
@@ -142,7 +142,3 @@ class Scene:
     def surface(self) -> Surface:
         """The colours of the mesh."""
         return Surface(self.mesh)
-
-
-def _rebuild(mesh: Mesh, crease_angle: float) -> Scene:
-    return Scene(mesh, crease_angle=crease_angle)

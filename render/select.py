@@ -80,5 +80,5 @@ def best_renderer() -> str:
 
 
 def _is_imitation(device: str) -> bool:
-    """Whether OpenGL's device is a program that runs on the processor."""
+    """OpenGL's device is a program that runs on the processor."""
     return any(name in device.lower() for name in _IMITATIONS)

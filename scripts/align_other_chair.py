@@ -32,8 +32,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.color import ByteImage
-from cadalign.render.drawing.stills import on_background
+from cadalign.render.drawing.color import ByteImage, composite
 
 CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 VIEW = Angles(azimuth=143.0, elevation=24.0)
@@ -117,7 +116,7 @@ def still(scene: Scene) -> ByteImage:
     """A picture of a chair, (h, w, 3) uint8."""
     pose = pose_in_view(scene, CAMERA, VIEW)
     color = draw_still(RaycastRenderer(), scene, CAMERA, pose, samples=16)
-    return on_background(color, PHOTO_GROUND)
+    return composite(color, PHOTO_GROUND)
 
 
 def with_wireframe(image: ByteImage, model: CadModel, alignment: Alignment) -> ByteImage:

@@ -116,7 +116,7 @@ def _errors(problem: Problem, batch: cadalign.BatchResult, b: int) -> list[float
 
 
 def _robust(arguments: Arguments, share: float) -> dict[str, float]:
-    """How often the wrong keypoints are told from the right ones."""
+    """Rate at which outliers are told from inliers."""
     rng = np.random.default_rng(arguments.seed)
     found = 0
     for _ in range(arguments.robust_problems):

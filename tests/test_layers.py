@@ -8,18 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from support.layers import layers as listed
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "cadalign"
 
 
 def layers() -> list[str]:
-    """Packages and modules in the order of the README's list, such as ``solvers``, ``errors``."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.search(r"## How it is built\n\n```\n(.*?)```", text, re.S)
-    assert found is not None
-    names = [re.split(r"/|\.py| ", line.strip())[0] for line in found[1].splitlines()]
-    return [name for name in names if name not in ("cadalign", "scripts")]
+    """Layers of the package itself; scripts are none."""
+    return [name for name in listed() if name != "scripts"]
 
 
 def modules() -> list[Path]:

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.layers import layers
 
 import cadalign
 from cadalign.cli import main
 
 ROOT = Path(__file__).parents[1]
+DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -47,9 +49,16 @@ def test_named_make_targets_exist() -> None:
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE) or target == "nothing"
 
 
-def test_linked_files_exist() -> None:
-    for link in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (ROOT / link).exists(), link
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_linked_files_exist(path: Path) -> None:
+    for link in re.findall(r"\]\(([^)#:]+)[^):]*\)", path.read_text(encoding="utf-8")):
+        assert (path.parent / link).exists(), link
+
+
+def test_picture_of_the_architecture_shows_the_list_of_layers() -> None:
+    picture = (ROOT / "docs" / "architecture.svg").read_text(encoding="utf-8")
+    shown = re.findall(r'font-family="monospace">([a-z]+)<', picture)
+    assert shown == layers()[::-1]
 
 
 def test_named_python_objects_exist() -> None:

@@ -7,8 +7,8 @@ import json
 import numpy as np
 
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.simplify import simplify
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import simplify
 from cadalign.render.drawing.color import bytes_from_linear
 from cadalign.render.raycast.caster import FaceArray
 from cadalign.render.scene import Scene

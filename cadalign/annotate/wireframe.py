@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.simplify import simplify
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import cluster, simplify
 from cadalign.render.views.visibility import visible_keypoints
 
 _MOST_FACES = 30_000
@@ -86,42 +87,15 @@ def _is_outline(edges: _Edges, eye: FloatArray) -> BoolArray:
 
 def _find_edges(mesh: Mesh, piece: float) -> _Edges:
     small = simplify(mesh, max_faces=_MOST_FACES)
-    points, faces = _welded(small.vertices, small.faces)
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    third = faces[:, [2, 0, 1]].reshape(-1)
-    key = sides[:, 0] * len(points) + sides[:, 1]
-    order = np.argsort(key, kind="stable")
-    _, first, count = np.unique(key[order], return_index=True, return_counts=True)
-    one = order[first]
-    other = order[first + np.minimum(1, count - 1)]
-    ends = points[sides[one]]
-    beside = np.stack([points[third[one]], points[third[other]]], axis=1)
-    creased = (count != 2) | _bends(points[faces], one // 3, other // 3)
-    lines = ends[creased]
+    # Faces of real models seldom share vertices: weld those in one place.
+    welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
+    edges = mesh_edges(welded.vertices, welded.faces, crease_angle=_CREASE_DEG)
+    ends = welded.vertices[edges.ends]
+    lines = ends[edges.creased]
     longest = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
     lines = lines[np.sort(longest[:_MOST_CREASES])]
-    smooth = (count == 2) & ~creased
-    return _Edges(ends[smooth], beside[smooth], _cut(lines, piece))
-
-
-def _welded(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Merge coinciding vertices, and drop degenerate and duplicate triangles."""
-    low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
-    grid = np.round((vertices - low) / max(float((high - low).max()), 1e-300) * 1e6)
-    _, first, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    merged = place.reshape(-1)[faces]
-    a, b, c = merged.T
-    merged = merged[(a != b) & (b != c) & (c != a)]
-    _, kept = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)
-    return vertices[first], merged[np.sort(kept)]
-
-
-def _bends(triangles: FloatArray, one: IntArray, other: IntArray) -> BoolArray:
-    """Compare the angle between two triangles with that of a crease, orientation ignored."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    cosine = np.abs(np.einsum("ek,ek->e", normals[one], normals[other]))
-    return np.asarray(cosine < np.cos(np.radians(_CREASE_DEG)))
+    beside = welded.vertices[edges.opposite[~edges.creased]]
+    return _Edges(ends[~edges.creased], beside, _cut(lines, piece))
 
 
 def _cut(lines: FloatArray, piece: float) -> FloatArray:

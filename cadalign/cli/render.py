@@ -74,5 +74,5 @@ class Render:
             )
         else:
             job.write_picture(draw_picture(job))
-        console.print(f"Written: {self.out} (drawn by {job.renderer.name})", markup=False)
+        console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)
         return 0

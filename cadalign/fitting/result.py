@@ -1,4 +1,4 @@
-"""What a fit returns."""
+"""The result of a fit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class FitStats:
-    """What a fit took.
+    """Effort of a fit.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class FitResult:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What the keypoints do not determine, in words; empty where all is well."""
+        """Statements on what the keypoints do not determine; empty where all is well."""
         std = self.std
         if std is None:
             return ()

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_points
 from cadalign.errors import InputError, quote
+from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.distortion import distort, undistort
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
@@ -24,8 +25,6 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 _DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# COLMAP puts the centre of the top-left pixel at (0.5, 0.5), cadalign and OpenCV at (0, 0).
-_COLMAP_PIXEL_CENTRE = 0.5
 
 
 @dataclass(frozen=True)
@@ -320,8 +319,8 @@ class Camera:
         values |= {
             "fx": self.fx if self.focal_known else None,
             "fy": self.fy if self.focal_known else None,
-            "cx": self.cx + _COLMAP_PIXEL_CENTRE,
-            "cy": self.cy + _COLMAP_PIXEL_CENTRE,
+            "cx": self.cx + PIXEL_CENTRE,
+            "cy": self.cy + PIXEL_CENTRE,
         }
         return {
             "model": model,
@@ -386,7 +385,7 @@ class Camera:
                 what = f"{name} is {quote(value)}, not a finite number"
                 raise InputError(what, where="camera.params")
         coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
-        cx, cy = values["cx"] - _COLMAP_PIXEL_CENTRE, values["cy"] - _COLMAP_PIXEL_CENTRE
+        cx, cy = values["cx"] - PIXEL_CENTRE, values["cy"] - PIXEL_CENTRE
         distortion = coefficients if any(coefficients[4:]) else coefficients[:4]
         size = data["width"], data["height"]
         if not is_known:

@@ -1,22 +1,57 @@
-"""OpenGL's conventions, and the only place where cadalign turns its own into them.
+"""Axes and pixel centres of other programs, and their conversion: the only place for either.
 
-OpenGL's camera looks along -z with y up, where cadalign's looks along +z with y down, and its image
-begins at the border of the corner pixel, where cadalign's begins at the pixel's centre.
+OpenGL's camera (also NeRF's and Bundler's) looks along -z with y up, where cadalign's looks along
++z with y down. Its image begins at the border of the corner pixel, as COLMAP's does, where
+cadalign's begins at the pixel's centre.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.camera import Camera
 
 PIXEL_CENTRE = 0.5
-"""Where OpenGL, COLMAP and NeRF programs put the centre of the top-left pixel, in x and y."""
+"""The centre of the top-left pixel, in x and y, in OpenGL, COLMAP and NeRF programs."""
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENGL_AXES = np.array([1.0, -1.0, -1.0])
+"""Signs of OpenGL's camera axes in cadalign's: multiply coordinates (n, 3) to go either way."""
+
+_FLIP = np.diag([*OPENGL_AXES, 1.0])
+
+
+def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArray:
+    """Pixels (n, 2) in an image ``factor`` times as large: borders, not centres, stay in place.
+
+    Examples
+    --------
+    >>> rescaled_pixels(np.array([[0.0, 9.5]]), 2).tolist()
+    [[0.5, 19.5]]
+    """
+    return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
+
+
+def resized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of an image that was resized to so many pixels.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> resized_camera(Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5), 8, 4).cx
+    3.5
+    """
+    across, down = width / camera.width, height / camera.height
+    cx, cy = rescaled_pixels(np.array([camera.cx, camera.cy]), np.array([across, down])).tolist()
+    fx, fy = camera.fx * across, camera.fy * down
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
@@ -24,6 +59,7 @@ def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
 
     Examples
     --------
+    >>> from cadalign import Alignment
     >>> opengl_from_model(Alignment(np.eye(3), [1, 2, 3], [1, 1, 1]))[:, 3].tolist()
     [1.0, -2.0, -3.0, 1.0]
     """
@@ -31,13 +67,15 @@ def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
 
 
 def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
-    """Turn a rigid model-view matrix (4, 4) into a pose in cadalign's axes; scale 1.
+    """Convert a rigid model-view matrix (4, 4) to a pose in cadalign's axes; scale 1.
 
     Raises
     ------
     InputError
         If the matrix is not a rotation and a translation.
     """
+    from cadalign.geometry.alignment import Alignment
+
     matrix = _FLIP @ opengl_from_world
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise InputError("the last row is not (0, 0, 0, 1)", where="transform")
@@ -69,6 +107,7 @@ def opengl_projection(
 
     Examples
     --------
+    >>> from cadalign import Camera
     >>> camera = Camera(width=4, height=2, fx=2, fy=2, cx=1.5, cy=0.5)
     >>> clip = opengl_projection(camera, near=1, far=3) @ (0, 0, -1, 1)
     >>> (clip / clip[3]).tolist()

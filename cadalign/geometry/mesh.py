@@ -1,4 +1,4 @@
-"""Triangle meshes with their faces in file order, and how their surface is coloured."""
+"""Triangle meshes with their faces in file order, and the colours of their surface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GREY = (0.7, 0.7, 0.7, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a part of a surface looks.
+    """Look of a part of a surface.
 
     Parameters
     ----------

@@ -107,14 +107,7 @@ class _Predictions(ForeignDocument):
 
 
 def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read any of the four forms, one entry for each object in each image.
-
-    Raises
-    ------
-    DataError
-        If it is missing, is not JSON or of another form, or a field is missing or invalid; names
-        file and field.
-    """
+    """Read any of the four forms, one entry for each object in each image."""
     data = read_json(path)
     with in_file(path):
         objects = _read(data)

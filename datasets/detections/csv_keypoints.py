@@ -64,13 +64,7 @@ class _Row(Document):
 
 
 def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image.
-
-    Raises
-    ------
-    DataError
-        If it is missing, lacks a column, or a value is invalid; names file and line.
-    """
+    """Read a CSV file, one object for each image."""
     by_image: dict[str | None, list[_Row]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

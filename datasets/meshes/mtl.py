@@ -67,13 +67,7 @@ def load_materials(
 
 
 def texture_array(image: Any, file_size: int) -> Texture:
-    """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency.
-
-    Raises
-    ------
-    ValueError
-        If it is far larger than its file of so many bytes can tell.
-    """
+    """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
     width, height = image.size
     if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
         raise ValueError(f"{width} x {height} pixels in {file_size} bytes")

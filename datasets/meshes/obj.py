@@ -51,13 +51,6 @@ def read_obj(path: Path) -> Mesh:
     Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is not an OBJ file, or has no faces.
-    OSError
-        If it cannot be read.
     """
     with path.open("rb") as file:
         statements = _sort_statements(file, path)

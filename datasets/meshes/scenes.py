@@ -24,15 +24,7 @@ _MAX_HEADER_LINES = 1000
 
 
 def read_ply(path: Path) -> Mesh:
-    """Read a PLY file, ASCII or binary; `cadalign.datasets.load_mesh` is the public way to it.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is not a PLY file, or has no faces.
-    OSError
-        If it cannot be read.
-    """
+    """Read a PLY file, ASCII or binary; `cadalign.datasets.load_mesh` is the public way to it."""
     with _parsing(path):
         declared = _declared_counts(path)
         if not declared.get("face"):
@@ -51,15 +43,7 @@ def read_ply(path: Path) -> Mesh:
 
 
 def read_scene(path: Path) -> Mesh:
-    """Read a GLB, glTF, STL or OFF file as one mesh, each node placed by its transform.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is of another format, or has no faces.
-    OSError
-        If it cannot be read.
-    """
+    """Read a GLB, glTF, STL or OFF file as one mesh, each node placed by its transform."""
     with _parsing(path):
         if path.suffix.lower() in (".glb", ".gltf"):
             _check_accessors(path)

@@ -132,13 +132,7 @@ class Annotation:
 
 
 def read_entries(path: Path) -> list[Any]:
-    """Read an annotation file's list of models, not yet checked.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is not JSON, or is not a list; names the line.
-    """
+    """Read an annotation file's list of models, not yet checked."""
     try:
         entries = read_json(path)
     except DataError as error:
@@ -168,12 +162,6 @@ def parse_entry(entry: Any, *, where: str) -> Annotation:
         The model's entry, parsed JSON.
     where : str
         File and model id, for messages.
-
-    Raises
-    ------
-    DataError
-        If a field is missing, of the wrong type or not finite, if there are no keypoints, or a
-        semantic id occurs twice.
     """
     try:
         read: _Entry = convert(entry, _Entry)

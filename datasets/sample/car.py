@@ -1,4 +1,4 @@
-"""Parametric cars: a body with wheel arches, a glass house, wheels and lamps."""
+"""Parametric cars: a body with wheel arches and a glass house."""
 
 from __future__ import annotations
 
@@ -7,79 +7,72 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.car_parts import arch_stations, lamps_and_trim, wheel_set
-from cadalign.datasets.sample.car_style import CarParameters
+from cadalign.datasets.sample import solids as make
+from cadalign.datasets.sample.car_parts import trim, wheels
+from cadalign.datasets.sample.car_shape import CarShape
 from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import Solid, beam, both_sides, box, loft, stacked
+from cadalign.datasets.sample.solids import Point, Solid
 
 _GLASS = (30, 38, 48)
 _DARK = (34, 34, 38)
 
 
-def build_car(p: CarParameters) -> Draft:
-    """Build a car.
+def car(rng: np.random.Generator, index: int) -> Draft:
+    """Draw and build a car.
 
     Semantic ids, right (+x) before left: 0 to 3 front and rear corners of the roof; 4 to 7 middles
     of the front and rear wheels; 8, 9 head lamps; 10, 11 tail lamps; 12, 13 lower corners of the
     windscreen; 14 to 17 ends of the front and rear bumper; 18, 19 mirrors.
     """
+    p = CarShape.draw(rng, index)
     house = _GlassHouse(p)
-    solids = [_body(p), *house.solids(), *wheel_set(p), *lamps_and_trim(p)]
-    if p.kind == "pickup":
-        solids += _bed(p)
-    half, length = p.width / 2, p.length
+    half, end = p.width / 2, p.length / 2
     hub = (half + 0.05, p.wheel_radius)
     pairs = {
         (0, 1): (*house.corner(1.0), house.front(1.0)),
         (2, 3): (*house.corner(1.0), house.rear(1.0)),
-        (4, 5): (*hub, p.z_front_axle),
-        (6, 7): (*hub, p.z_rear_axle),
-        (8, 9): (0.78 * half, p.nose - 0.09, -length / 2 - 0.1),
-        (10, 11): (0.84 * half, p.tail_lamp, length / 2 + 0.1),
+        (4, 5): (*hub, p.z_axles[0]),
+        (6, 7): (*hub, p.z_axles[1]),
+        (8, 9): (0.78 * half, p.nose - 0.09, -end - 0.1),
+        (10, 11): (0.84 * half, p.tail_lamp, end + 0.1),
         (12, 13): (*house.corner(0.06), house.front(0.06)),
-        (14, 15): (0.88 * half, 0.42, -length / 2 - 0.1),
-        (16, 17): (0.9 * half, 0.43, length / 2 + 0.1),
+        (14, 15): (0.88 * half, 0.42, -end - 0.1),
+        (16, 17): (0.9 * half, 0.43, end + 0.1),
         (18, 19): (half + 0.16, p.belt + 0.07, house.front(0.0) + 0.36),
     }
-    return Draft(tuple(solids), tuple(mirrored_places(pairs)), tuple(pairs))
+    bed = _bed(p) if p.kind == "pickup" else []
+    solids = (_body(p), *house.solids(), *wheels(p), *trim(p), *bed)
+    return Draft(solids, mirrored_places(pairs), tuple(pairs))
 
 
-def _body(p: CarParameters) -> Solid:
+def _body(p: CarShape) -> Solid:
     """Everything below the windows, with the arches cut out of it."""
-    half_length = p.length / 2
-    ends = np.array([0.0, 0.015, 0.05, 0.12, 0.22, 0.36])
-    plain = np.concatenate(
-        [ends - half_length, half_length - ends, np.linspace(-half_length, half_length, 13)]
-    )
-    # Two stations at the foot of each arch, a hair apart, make its upright ends.
+    end = p.length / 2
+    rounded = np.array([0.0, 0.015, 0.05, 0.12, 0.22, 0.36])
+    plain = np.concatenate([rounded - end, end - rounded, np.linspace(-end, end, 13)])
     stations = [(z, p.sill) for z in (*plain, p.z_deck, p.z_deck + 0.05)]
-    for axle in (p.z_front_axle, p.z_rear_axle):
-        reach = p.wheel_radius * 1.17
+    angle, reach = np.linspace(0, np.pi, 13), p.wheel_radius * 1.17
+    for axle in p.z_axles:
+        arch = axle + reach * np.cos(angle), p.wheel_radius + reach * np.sin(angle)
+        # Two stations at the foot of each arch, a hair apart, make its upright ends.
+        feet = [(axle - reach - 0.002, p.sill), (axle + reach + 0.002, p.sill)]
         stations = [(z, y) for z, y in stations if abs(z - axle) > reach + 0.02]
-        stations += arch_stations(p, axle, reach)
-    return loft([_section(p, z, bottom) for z, bottom in sorted(stations)], p.paint)
+        stations += [*zip(*(values.tolist() for values in arch), strict=True), *feet]
+    return make.loft([_section(p, z, bottom) for z, bottom in sorted(stations)], p.paint)
 
 
-def _section(p: CarParameters, z: float, bottom: float) -> FloatArray:
+def _section(p: CarShape, z: float, bottom: float) -> FloatArray:
     """The body's outline across at z, starting at the middle of its top."""
-    top = p.top(z)
-    half = p.half_width(z)
-    end = min(z + p.length / 2, p.length / 2 - z)
-    bottom = bottom + 0.12 * max(0.0, 1 - end / 0.12) ** 2
+    top, half = p.top(z), p.half_width(z)
+    bottom = bottom + 0.12 * max(0.0, 1 - (p.length / 2 - abs(z)) / 0.12) ** 2
     shoulder = max(top - p.shoulder_drop, bottom + 0.04)
-    side = np.array(
-        [
-            (0.0, top + 0.02),
-            (0.5 * half, top + 0.015),
-            (0.84 * half, top - 0.005),
-            (0.94 * half, top - 0.35 * (top - shoulder)),
-            (half, shoulder),
-            (half, bottom + 0.45 * (shoulder - bottom)),
-            (0.97 * half, bottom + min(0.04, 0.3 * (shoulder - bottom))),
-            (0.9 * half, bottom),
-            (0.0, bottom),
-        ]
-    )
+    tall = shoulder - bottom
+    side = np.array([
+        (0.0, top + 0.02), (0.5 * half, top + 0.015), (0.84 * half, top - 0.005),
+        (0.94 * half, top - 0.35 * (top - shoulder)), (half, shoulder),
+        (half, bottom + 0.45 * tall), (0.97 * half, bottom + min(0.04, 0.3 * tall)),
+        (0.9 * half, bottom), (0.0, bottom),
+    ])  # fmt: skip
     outline = np.concatenate([side, side[-2:0:-1] * (-1, 1)])
     return np.insert(outline, 2, z, axis=1)
 
@@ -88,7 +81,7 @@ def _section(p: CarParameters, z: float, bottom: float) -> FloatArray:
 class _GlassHouse:
     """The windows and the roof. Heights are shares, 0 at the belt line and 1 at the roof."""
 
-    p: CarParameters
+    p: CarShape
 
     def front(self, share: float) -> float:
         return self.p.z_cowl + share * (self.p.z_roof_front - self.p.z_cowl)
@@ -116,65 +109,64 @@ class _GlassHouse:
         p = self.p
         y, width, front, rear = self.level(-0.25)
         sunk = (y, width - 0.14, front, rear - 0.14)
-        glass = stacked([sunk, self.level(0.0), self.level(0.92)], _GLASS, radius=0.12)
+        glass = make.stacked([sunk, self.level(0.0), self.level(0.92)], _GLASS, radius=0.12)
         y, width, front, rear = self.level(1.0)
-        tall, long = p.roof - p.belt, rear - front
-        roof = stacked(
-            [self.level(0.86, grow=0.012), self.level(0.93, grow=0.012),
-             (y, width - 0.06, front + 0.03, rear - 0.03),
-             (y + 0.03, width - 0.3, front + 0.16 * long, rear - 0.14 * long),
-             (y + 0.042, width - 0.7, front + 0.34 * long, rear - 0.3 * long)],
-            p.paint, radius=0.12,
-        )  # fmt: skip
-        solids = [glass, roof, *self._pillars()]
+        long = rear - front
+        levels = [
+            self.level(0.86, grow=0.012),
+            self.level(0.93, grow=0.012),
+            (y, width - 0.06, front + 0.03, rear - 0.03),
+            (y + 0.03, width - 0.3, front + 0.16 * long, rear - 0.14 * long),
+            (y + 0.042, width - 0.7, front + 0.34 * long, rear - 0.3 * long),
+        ]
+        solids = [glass, make.stacked(levels, p.paint, radius=0.12), *self._pillars()]
         if p.z_panel is not None:
-            lower = self.level(-0.2, grow=0.008, front=p.z_panel)
-            upper = self.level(0.9, grow=0.008, front=p.z_panel)
-            solids.append(stacked([lower, upper], p.paint, radius=0.1))
-            rear_glass = (0, self.height(0.5), self.rear(0.5) + 0.005)
-            solids.append(box(rear_glass, (1.3 * self.half(0.5), 0.5 * tall, 0.03), _GLASS))
-        elif p.z_deck > 0.44 * p.length:
+            levels = [self.level(share, grow=0.008, front=p.z_panel) for share in (-0.2, 0.9)]
+            middle = (0, self.height(0.5), self.rear(0.5) + 0.005)
+            size = (1.3 * self.half(0.5), 0.5 * (p.roof - p.belt), 0.03)
+            solids += [make.stacked(levels, p.paint, radius=0.1), make.box(middle, size, _GLASS)]
+        elif p.steep:
             solids.append(self._tailgate())
         return solids
 
     def _tailgate(self) -> Solid:
         """The painted part of a steep rear end, below its window."""
-        levels = [
-            (
-                self.height(share),
-                2 * self.half(share) - 0.14,
-                self.rear(max(share, 0.0)) - 0.3,
-                self.rear(max(share, 0.0)) + 0.015,
+        levels = []
+        for share in (-0.4, 0.0, 0.16):
+            rear = self.rear(max(share, 0.0))
+            levels.append(
+                (self.height(share), 2 * self.half(share) - 0.14, rear - 0.3, rear + 0.015)
             )
-            for share in (-0.4, 0.0, 0.16)
-        ]
-        return stacked(levels, self.p.paint, radius=0.1)
+        return make.stacked(levels, self.p.paint, radius=0.1)
 
     def _pillars(self) -> list[Solid]:
-        p = self.p
+        shares, inset = (-0.1, 0.92), 0.045
+        posts = [([self.front(share) + inset for share in shares], inset, (0.09, 0.09))]
+        if self.p.z_panel is None:
+            posts.append(([self.rear(share) - inset for share in shares], inset, (0.12, 0.1)))
+        posts += [([z, z + 0.03], 0.012, (0.07, 0.05)) for z in self.p.pillars]
         solids = []
-        inset = 0.045
-        front_low = (self.half(-0.1) - inset, self.height(-0.1), self.front(-0.1) + inset)
-        front_high = (self.half(0.92) - inset, self.height(0.92), self.front(0.92) + inset)
-        solids.append(beam(front_low, front_high, (0.09, 0.09), p.paint, side=(0, 0, 1)))
-        if p.z_panel is None:
-            low = (self.half(-0.1) - inset, self.height(-0.1), self.rear(-0.1) - inset)
-            high = (self.half(0.92) - inset, self.height(0.92), self.rear(0.92) - inset)
-            solids.append(beam(low, high, (0.12, 0.1), p.paint, side=(0, 0, 1)))
-        for z in p.pillars:
-            low = (self.half(-0.1) - 0.012, self.height(-0.1), z)
-            high = (self.half(0.92) - 0.012, self.height(0.92), z + 0.03)
-            solids.append(beam(low, high, (0.07, 0.05), p.paint, side=(0, 0, 1)))
-        return both_sides(*solids)
+        for ends, depth, size in posts:
+            low, high = (
+                (self.half(share) - depth, self.height(share), z)
+                for share, z in zip(shares, ends, strict=True)
+            )
+            solids.append(make.beam(low, high, size, self.p.paint, side=(0, 0, 1)))
+        return make.both_sides(*solids)
 
 
-def _bed(p: CarParameters) -> list[Solid]:
+def _bed(p: CarShape) -> list[Solid]:
     """The load bed of a pickup: walls around a dark floor."""
     front, rear = p.z_deck + 0.1, p.length / 2 - 0.03
-    low, high = p.top(0.5 * (front + rear)) - 0.03, p.belt + 0.08
-    tall, middle, half = high - low, (front + rear) / 2, p.width / 2 - 0.09
-    wall = box((half, low + tall / 2, middle), (0.1, tall, rear - front), p.paint)
-    gate = box((0, low + tall / 2, rear - 0.04), (2 * half + 0.1, tall, 0.08), p.paint)
-    head = box((0, low + tall / 2, front + 0.03), (2 * half + 0.1, tall, 0.06), p.paint)
-    floor = box((0, low + 0.055, middle), (2 * half - 0.02, 0.04, rear - front - 0.08), _DARK)
-    return [*both_sides(wall), gate, head, floor]
+    middle, half = (front + rear) / 2, p.width / 2 - 0.09
+    low = p.top(middle) - 0.03
+    tall = p.belt + 0.08 - low
+    y = low + tall / 2
+    walls: list[tuple[Point, Point]] = [
+        ((half, y, middle), (0.1, tall, rear - front)),
+        ((-half, y, middle), (0.1, tall, rear - front)),
+        ((0, y, rear - 0.04), (2 * half + 0.1, tall, 0.08)),
+        ((0, y, front + 0.03), (2 * half + 0.1, tall, 0.06)),
+    ]
+    floor = make.box((0, low + 0.055, middle), (2 * half - 0.02, 0.04, rear - front - 0.08), _DARK)
+    return [*(make.box(center, size, p.paint) for center, size in walls), floor]

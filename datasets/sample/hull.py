@@ -12,39 +12,19 @@ from cadalign.datasets.sample.solids import Color, Solid, loft
 
 @dataclass(frozen=True)
 class Hull:
-    """A hull of length 1 with its bow at z = -0.5 and the water line at y = 0.
+    """A hull of length 1 with its bow at z = -0.5 and the water line at y = 0."""
 
-    Parameters
-    ----------
-    beam, draft, freeboard : float
-        Greatest width, depth under water, and height of the side amidships.
-    sheer_bow, sheer_stern : float
-        How much higher the side is at the bow and at the stern.
-    rake : float
-        How far the bow overhangs its foot.
-    stern_rake : float
-        The same at the stern.
-    entry : float
-        The position, 0 at the bow, where the hull has its full width.
-    fullness : float
-        How blunt the bow is: 1 is a straight wedge, 3 very full.
-    stern_width : float
-        Width of the stern relative to the beam.
-    bulwark : float
-        How far the deck lies below the edge of the side.
-    """
-
-    beam: float
-    draft: float
-    freeboard: float
-    sheer_bow: float
+    beam: float  # greatest width
+    draft: float  # depth under water
+    freeboard: float  # height of the side amidships
+    sheer_bow: float  # rise of the side towards the bow
     sheer_stern: float
-    rake: float
+    rake: float  # overhang of the bow over its foot
     stern_rake: float
-    entry: float
-    fullness: float
-    stern_width: float
-    bulwark: float
+    entry: float  # position, 0 at the bow, from which the hull has its full width
+    fullness: float  # bluntness of the bow: 1 is a straight wedge, 3 very full
+    stern_width: float  # relative to the beam
+    bulwark: float  # height of the side's edge above the deck
 
     @property
     def water_share(self) -> float:
@@ -75,19 +55,18 @@ class Hull:
         """The part under water, a stripe at the water line, the side, and the deck."""
         water = self.water_share
         band = water + 0.12 * (1 - water)
-        inset = 0.012
-        edge = self._outline(1.0)
-        inner = self._outline(1.0, inset=inset)
+        below, line, above = (
+            [self._outline(share) for share in np.linspace(low, high, count)]
+            for low, high, count in ((0.0, water, 6), (water, band, 2), (band, 1.0, 5))
+        )
+        inner = self._outline(1.0, inset=0.012)
         lowered = inner - (0, self.bulwark, 0)
         return [
-            loft(self._levels(np.linspace(0.0, water, 6)), bottom),
-            loft(self._levels(np.array([water, band])), stripe),
-            loft(np.array([*self._levels(np.linspace(band, 1.0, 5)), edge, inner, lowered]), side),
-            loft(np.array([lowered - (0, 0.004, 0), lowered - (0, -0.002, 0)]), deck),
+            loft(below, bottom),
+            loft(line, stripe),
+            loft([*above, inner, lowered], side),
+            loft([lowered - (0, 0.004, 0), lowered + (0, 0.002, 0)], deck),
         ]
-
-    def _levels(self, shares: FloatArray) -> FloatArray:
-        return np.array([self._outline(share) for share in shares])
 
     def _outline(self, share: float, *, inset: float = 0.0) -> FloatArray:
         """A closed line around the hull, from the middle of the stern over the right side."""

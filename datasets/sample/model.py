@@ -1,60 +1,34 @@
-"""From solids and named places to a finished sample model: one mesh and its keypoints."""
+"""Sample models: solids joined to one mesh, with keypoints on its surface."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import trimesh
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sample.solids import Solid
+from cadalign.datasets.sample.solids import Point, Solid
 from cadalign.geometry.mesh import Mesh
 
 _CREASE_DEGREES = 35.0
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a keypoint is meant to be: it lands on the nearest point of the surface.
-
-    Parameters
-    ----------
-    semantic_id : int
-        Which point of the category it is.
-    position : tuple of 3 float
-        In the draft's own units.
-    """
-
-    semantic_id: int
-    position: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
 class Draft:
-    """A model as its builder makes it, in whatever units suit it, y up and the front at -z.
-
-    Parameters
-    ----------
-    solids : tuple of Solid
-        The parts.
-    places : tuple of Place
-        The keypoints, ordered by semantic id.
-    mirrored : tuple of (int, int)
-        Semantic ids that a mirror plane of the model exchanges.
-    turned : tuple of tuple of int
-        Groups of semantic ids that a rotation about y takes into each other.
-    round : bool
-        Whether any rotation about y does, so that each group lies on a circle.
-    """
+    """A model in its builder's units, y up and the front at -z."""
 
     solids: tuple[Solid, ...]
-    places: tuple[Place, ...]
+    places: Mapping[int, Point]
+    """By semantic id: each keypoint lands on the nearest point of the surface."""
     mirrored: tuple[tuple[int, int], ...] = ()
+    """Semantic ids that a mirror plane of the model exchanges."""
     turned: tuple[tuple[int, ...], ...] = ()
+    """Groups of semantic ids that a rotation about y permutes."""
     round: bool = False
+    """Any rotation about y maps the model to itself, so that each group lies on a circle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +38,7 @@ class SampleKeypoint:
     Parameters
     ----------
     semantic_id : int
-        Which point of the category it is.
+        Number of the point within its category.
     xyz : (3,) float
         Its position [model units].
     face_index : int
@@ -109,85 +83,51 @@ class SampleModel:
     round: bool
 
 
-def mirrored_places(
-    pairs: Mapping[tuple[int, int], tuple[float, float, float]],
-) -> list[Place]:
-    """Two places for each position on the right: there, and its mirror image under x -> -x."""
-    places = []
-    for (right, left), (x, y, z) in pairs.items():
-        places += [Place(right, (x, y, z)), Place(left, (-x, y, z))]
-    return places
+def mirrored_places(pairs: Mapping[tuple[int, int], Point]) -> dict[int, Point]:
+    """Places of pairs of semantic ids: at the given one and at its mirror image under x -> -x."""
+    rights = {right: place for (right, _), place in pairs.items()}
+    return rights | {left: (-x, y, z) for (_, left), (x, y, z) in pairs.items()}
 
 
 def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) -> SampleModel:
-    """Put a draft's parts together, scale it, and set its keypoints on the surface.
+    """Join a draft's parts, scale the mesh, and set the keypoints on its surface.
 
-    Parameters
-    ----------
-    draft : Draft
-        The parts and the places of the keypoints.
-    category, model_id : str
-        The model's names.
-    offset : (3,) float
-        Where the centre of the bounding box is to lie [model units].
+    The centre of the bounding box comes to ``offset`` (3,).
     """
     vertices, faces, colors = _join(draft.solids)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     center, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
     # The file holds single precision: the mesh and what is computed from it agree with that.
     scaled = ((vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
-    faces = _with_area(scaled, faces)
+    a, b, c = scaled[faces].transpose(1, 0, 2)
+    faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]  # rounding flattens some
     mesh = Mesh(scaled, faces, vertex_colors=colors, source=f"{category} {model_id}")
-    wanted = np.array([place.position for place in draft.places])
-    keypoints = _set_on_surface(
-        mesh, (wanted - center) / diagonal + offset, [place.semantic_id for place in draft.places]
-    )
-    return SampleModel(
-        category, model_id, mesh, keypoints, draft.mirrored, draft.turned, draft.round
-    )
+    places = {
+        k: (np.array(place) - center) / diagonal + offset for k, place in draft.places.items()
+    }
+    keypoints = _on_surface(mesh, places)
+    symmetries = draft.mirrored, draft.turned, draft.round
+    return SampleModel(category, model_id, mesh, keypoints, *symmetries)
 
 
 def _join(solids: Sequence[Solid]) -> tuple[FloatArray, IntArray, FloatArray]:
     """Concatenate parts: vertices, faces, and colours (n, 4) from 0 to 1."""
-    vertices, faces, colors, total = [], [], [], 0
-    for solid in solids:
-        vertices.append(solid.vertices)
-        faces.append(solid.faces + total)
-        rgba = np.array([*solid.color, 255]) / 255
-        colors.append(np.broadcast_to(rgba, (len(solid.vertices), 4)))
-        total += len(solid.vertices)
-    joined = np.concatenate(faces)
-    positions, split = split_creases(np.concatenate(vertices), joined)
+    sizes = [len(solid.vertices) for solid in solids]
+    first = np.cumsum(sizes) - sizes
+    joined = np.concatenate([solid.faces + k for solid, k in zip(solids, first, strict=True)])
+    colors = np.repeat([(*solid.color, 255) for solid in solids], sizes, axis=0) / 255
+    positions, faces = split_creases(np.concatenate([solid.vertices for solid in solids]), joined)
     split_colors = np.empty((len(positions), 4))
-    split_colors[split] = np.concatenate(colors)[joined]
-    return positions, split, split_colors
-
-
-def _with_area(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Leave out the faces that have no area left once the coordinates are rounded."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(faces[np.linalg.norm(normal, axis=1) > 1e-12])
+    split_colors[faces] = colors[joined]
+    return positions, faces, split_colors
 
 
 def split_creases(
     vertices: FloatArray, faces: IntArray, *, crease: float = _CREASE_DEGREES
 ) -> tuple[FloatArray, IntArray]:
-    """Double the vertices along sharp edges, so that shading stays smooth only where the shape is.
+    """Double the vertices along edges sharper than an angle [degrees]: new vertices and faces.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions.
-    faces : (m, 3) int
-        Triangles.
-    crease : float
-        Faces that meet at a larger angle [degrees] don't share vertices.
-
-    Returns
-    -------
-    vertices : (k, 3) float
-    faces : (m, 3) int
+    Shading then stays smooth only where the shape is.
 
     Examples
     --------
@@ -196,61 +136,39 @@ def split_creases(
     >>> len(split_creases(corners, faces)[0])
     12
     """
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    # Every edge of every face, as (smaller vertex, larger vertex), with the numbers of the two
-    # face corners at these vertices.
-    corner = np.arange(faces.size).reshape(faces.shape)
-    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    end_corners = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1).reshape(-1, 2)
-    swap = ends[:, 0] > ends[:, 1]
-    ends[swap], end_corners[swap] = ends[swap][:, ::-1], end_corners[swap][:, ::-1]
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    ends, end_corners, face = ends[order], end_corners[order], order // 3
-    neighbours = (ends[1:] == ends[:-1]).all(axis=1)
-    smooth = np.einsum("ij,ij->i", normal[face[1:]], normal[face[:-1]]) > np.cos(np.radians(crease))
-    joined = np.flatnonzero(neighbours & smooth)
-    rows, columns = end_corners[joined].ravel(), end_corners[joined + 1].ravel()
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(faces.size, faces.size))
-    count, label = connected_components(graph, directed=False)
-    positions = np.empty((count, 3))
-    positions[label] = corners.reshape(-1, 3)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    smooth = mesh.face_adjacency_angles < np.radians(crease)
+    beside, ends = mesh.face_adjacency[smooth], mesh.face_adjacency_edges[smooth]
+    # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
+    corner = (faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)
+    joined = (3 * beside[:, :, None] + corner).transpose(0, 2, 1).reshape(-1, 2)
+    graph: Any = trimesh.graph
+    label = graph.connected_component_labels(joined, node_count=faces.size)
+    positions = np.empty((label.max() + 1, 3))
+    positions[label] = vertices[faces].reshape(-1, 3)
     return positions, label.reshape(faces.shape).astype(np.int64)
 
 
-def _set_on_surface(
-    mesh: Mesh, wanted: FloatArray, semantic_ids: Sequence[int]
-) -> tuple[SampleKeypoint, ...]:
+def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKeypoint, ...]:
+    """Keypoints at the surface's nearest points to places (3,)."""
     triangles = mesh.triangles
     centroid = triangles.mean(axis=1)
     radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
     keypoints = []
-    for semantic_id, place in zip(semantic_ids, wanted, strict=True):
-        face, barycentric = _closest(triangles, centroid, radius, place)
-        xyz = barycentric @ triangles[face]
+    for semantic_id, place in sorted(places.items()):
+        distance = np.linalg.norm(centroid - place, axis=1)
+        near = np.flatnonzero(distance - radius <= distance.min())
+        weights = closest_barycentric(triangles[near], place)
+        points = np.einsum("mc,mcd->md", weights, triangles[near])
+        best = int(np.argmin(np.linalg.norm(points - place, axis=1)))
+        xyz, face = points[best], int(near[best])
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
-        keypoints.append(SampleKeypoint(semantic_id, xyz, face, barycentric, vertex))
+        keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights[best], vertex))
     return tuple(keypoints)
-
-
-def _closest(
-    triangles: FloatArray, centroid: FloatArray, radius: FloatArray, place: FloatArray
-) -> tuple[int, FloatArray]:
-    """The face nearest to a place, and the barycentric coordinates of the nearest point in it."""
-    distance = np.linalg.norm(centroid - place, axis=1)
-    candidates = np.flatnonzero(distance - radius <= distance.min())
-    weights = closest_barycentric(triangles[candidates], place)
-    nearest = np.einsum("mc,mcd->md", weights, triangles[candidates])
-    best = int(np.argmin(np.linalg.norm(nearest - place, axis=1)))
-    return int(candidates[best]), weights[best]
 
 
 def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
     """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle.
-
-    That is the foot of the perpendicular where it lies inside, otherwise the nearest of the points
-    nearest on the three edges.
 
     Examples
     --------
@@ -260,28 +178,8 @@ def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
     >>> closest_barycentric(triangle, np.array([2.0, -1.0, 0.0])).tolist()
     [[0.0, 1.0, 0.0]]
     """
-    candidates = [_foot(triangles, point)]
-    for start, end in ((0, 1), (1, 2), (2, 0)):
-        along = triangles[:, end] - triangles[:, start]
-        reach = np.einsum("md,md->m", point - triangles[:, start], along)
-        share = np.clip(reach / np.einsum("md,md->m", along, along), 0.0, 1.0)
-        weights = np.zeros((len(triangles), 3))
-        weights[:, start], weights[:, end] = 1 - share, share
-        candidates.append(weights)
-    choices = np.stack(candidates)
-    positions = np.einsum("kmc,mcd->kmd", choices, triangles)
-    distance = np.linalg.norm(positions - point, axis=2)
-    distance[0][(choices[0] < 0).any(axis=1)] = np.inf
-    return np.asarray(choices[np.argmin(distance, axis=0), np.arange(len(triangles))])
-
-
-def _foot(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """Barycentric coordinates (m, 3) of a point's projection into the planes of triangles."""
-    first = triangles[:, 1] - triangles[:, 0]
-    second = triangles[:, 2] - triangles[:, 0]
-    normal = np.cross(first, second)
-    offset = point - triangles[:, 0]
-    squared = np.einsum("md,md->m", normal, normal)
-    v = np.einsum("md,md->m", np.cross(offset, second), normal) / squared
-    w = np.einsum("md,md->m", np.cross(first, offset), normal) / squared
-    return np.stack([1 - v - w, v, w], axis=1)
+    points = np.broadcast_to(point, (len(triangles), 3))
+    surface: Any = trimesh.triangles
+    nearest = surface.closest_point(triangles, points)
+    weights = np.maximum(surface.points_to_barycentric(triangles, nearest, method="cross"), 0)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))

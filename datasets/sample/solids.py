@@ -1,8 +1,7 @@
-"""Closed solids that the sample models are put together from.
+"""Closed solids of one colour, the parts of the sample models.
 
-Everything is a `loft`: a surface through a row of closed outlines. Solids face outward, and the
-outlines used have their mirror images under x -> -x among their own points, so that what
-is built around the plane x = 0 is exactly mirror symmetric.
+Boxes come from trimesh; the rest is a `loft`, a surface through a row of closed outlines, because a
+part around the plane x = 0 must be exactly mirror symmetric, also in its tessellation.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sample.outlines import ellipse, rounded_rectangle
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255."""
+Point = tuple[float, float, float]
 
 _WELD_DECIMALS = 8
 _TINY_AREA = 1e-12
@@ -25,20 +24,10 @@ _TINY_AREA = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A part of a model: a closed surface of one colour.
+    """A closed surface of one colour."""
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions, each only once.
-    faces : (m, 3) int
-        Triangles, counter-clockwise as seen from outside.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    """
-
-    vertices: FloatArray
-    faces: IntArray
+    vertices: FloatArray  # (n, 3), all different
+    faces: IntArray  # (m, 3), counter-clockwise as seen from outside
     color: Color
 
     @classmethod
@@ -56,10 +45,8 @@ class Solid:
         points = np.round(np.asarray(vertices, dtype=float), _WELD_DECIMALS) + 0.0
         welded, inverse = np.unique(points, axis=0, return_inverse=True)
         triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
-        corners = welded[triangles]
-        doubled_area = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
+        a, b, c = welded[triangles].transpose(1, 0, 2)
+        doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         solid = cls(welded, triangles[doubled_area > _TINY_AREA], color)
         return solid if solid.volume >= 0 else replace(solid, faces=solid.faces[:, ::-1])
 
@@ -69,6 +56,10 @@ class Solid:
         corners = self.vertices[self.faces] - self.vertices.mean(axis=0)
         return float(np.linalg.det(corners).sum() / 6)
 
+    def with_vertices(self, vertices: npt.ArrayLike) -> Solid:
+        """The solid with its vertices at other places (n, 3)."""
+        return Solid.from_triangles(vertices, self.faces, self.color)
+
     def mirrored(self) -> Solid:
         """The mirror image under x -> -x."""
         return replace(self, vertices=self.vertices * (-1, 1, 1), faces=self.faces[:, ::-1])
@@ -77,6 +68,53 @@ class Solid:
 def both_sides(*solids: Solid) -> list[Solid]:
     """The solids together with their mirror images under x -> -x."""
     return [*solids, *(solid.mirrored() for solid in solids)]
+
+
+# Outlines and curves ------------------------------------------------------------------------------
+
+
+def ellipse(width: float, height: float, *, count: int = 16, exponent: float = 2.0) -> FloatArray:
+    """An outline (count, 2): a superellipse ``|x/a|^exponent + |y/b|^exponent = 1`` (Lame curve).
+
+    It starts at the top and is mirror symmetric in its first coordinate.
+    """
+    angle = 2 * np.pi * np.arange(count) / count
+    unit = np.round(np.stack([np.sin(angle), np.cos(angle)], axis=1), 12)
+    half = np.array([width, height]) / 2
+    return np.asarray(np.sign(unit) * np.abs(unit) ** (2.0 / exponent) * half)
+
+
+def rounded_rectangle(
+    width: float, height: float, *, radius: float = 0.0, steps: int = 2
+) -> FloatArray:
+    """An outline (n, 2): a rectangle with round corners, starting at the middle of its top."""
+    radius = max(min(radius, 0.499 * width, 0.499 * height), 0.0)
+    angle = np.linspace(0, np.pi / 2, steps + 1)
+    arc = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    upper = np.array([width, height]) / 2 - radius + radius * arc
+    top = np.array([[0.0, height / 2]])
+    right = np.concatenate([upper, [[width / 2, 0.0]], upper[::-1] * (1, -1)])
+    return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
+
+
+def smooth_curve(knots: npt.ArrayLike, count: int) -> FloatArray:
+    """A Catmull-Rom spline (count, d) through knots (k, d)."""
+    points = np.asarray(knots, dtype=float)
+    padded = np.concatenate([[2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]])
+    position = np.linspace(0, len(points) - 1, count)
+    segment = np.minimum(position.astype(int), len(points) - 2)
+    t = (position - segment)[:, None]
+    p0, p1, p2, p3 = (padded[segment + k] for k in range(4))
+    square, cube = 2 * p0 - 5 * p1 + 4 * p2 - p3, 3 * p1 - p0 - 3 * p2 + p3
+    return np.asarray(0.5 * (2 * p1 + (p2 - p0) * t + square * t**2 + cube * t**3))
+
+
+def at_height(outline: FloatArray, y: float) -> FloatArray:
+    """An outline (n, 2) in the horizontal plane at a height, (n, 3)."""
+    return np.insert(outline, 1, y, axis=1)
+
+
+# Solids -------------------------------------------------------------------------------------------
 
 
 def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
@@ -90,23 +128,19 @@ def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
         spine in the middle of them, so outlines should be symmetric in that order. An outline may
         shrink to a line or a point.
     color : tuple of 3 int
-        Red, green and blue, 0 to 255.
     """
     rings = np.asarray(outlines, dtype=float)
+    # An end is one more outline that has collapsed onto its spine.
+    opposite = -np.arange(rings.shape[1])
+    spines = (rings[[0, -1]] + rings[[0, -1]][:, opposite]) / 2
+    rings = np.concatenate([spines[:1], rings, spines[1:]])
     count, size = rings.shape[:2]
     start = np.arange(count - 1)[:, None] * size
     here = np.arange(size)[None, :]
-    quads = np.stack([start + here, start + (here + 1) % size], axis=-1).reshape(-1, 2)
-    quads = np.concatenate([quads, quads[:, ::-1] + size], axis=1)
-    faces = [_cut_quads(rings.reshape(-1, 3), quads)]
-    vertices = [rings.reshape(-1, 3)]
-    total = count * size
-    for ring, offset, flip in ((rings[0], 0, True), (rings[-1], (count - 1) * size, False)):
-        spine, cap = _cap(ring, offset, total)
-        vertices.append(spine)
-        faces.append(cap[:, ::-1] if flip else cap)
-        total += len(spine)
-    return Solid.from_triangles(np.concatenate(vertices), np.concatenate(faces), color)
+    sides = np.stack([start + here, start + (here + 1) % size], axis=-1).reshape(-1, 2)
+    quads = np.concatenate([sides, sides[:, ::-1] + size], axis=1)
+    vertices = rings.reshape(-1, 3)
+    return Solid.from_triangles(vertices, _cut_quads(vertices, quads), color)
 
 
 def _cut_quads(vertices: FloatArray, quads: IntArray) -> IntArray:
@@ -122,21 +156,12 @@ def _cut_quads(vertices: FloatArray, quads: IntArray) -> IntArray:
     return np.concatenate([first, second])
 
 
-def _cap(ring: FloatArray, offset: int, spine_offset: int) -> tuple[FloatArray, IntArray]:
-    """Close an outline whose points j and n - j face each other."""
-    size = len(ring)
-    half = np.arange(size // 2 + 1)
-    spine = (ring[half] + ring[-half]) / 2
-    here, there = half[:-1], half[1:]
-    right, left = offset + half, offset + (-half) % size
-    middle = spine_offset + half
-    faces = [
-        np.stack([right[here], right[there], middle[there]], -1),
-        np.stack([right[here], middle[there], middle[here]], -1),
-        np.stack([left[there], left[here], middle[there]], -1),
-        np.stack([left[here], middle[here], middle[there]], -1),
-    ]
-    return spine, np.concatenate(faces)
+def box(center: npt.ArrayLike, size: npt.ArrayLike, color: Color) -> Solid:
+    """A box with sharp edges."""
+    import trimesh
+
+    block = trimesh.creation.box(extents=np.asarray(size, dtype=float))
+    return Solid.from_triangles(block.vertices + np.asarray(center), block.faces, color)
 
 
 def rounded_box(
@@ -144,24 +169,13 @@ def rounded_box(
     size: npt.ArrayLike,
     color: Color,
     *,
-    radius: float = 0.0,
+    radius: float,
     corner_radius: float | None = None,
     steps: int = 2,
 ) -> Solid:
-    """A box with its edges rounded, upright.
+    """An upright box with rounded edges; ``steps`` flat pieces make a quarter circle.
 
-    Parameters
-    ----------
-    center, size : (3,) float
-        Centre and full side lengths.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    radius : float
-        Radius of the horizontal edges.
-    corner_radius : float, optional
-        Radius of the vertical edges; by default the same.
-    steps : int
-        Flat pieces of a quarter circle.
+    ``radius`` is that of the horizontal edges, ``corner_radius`` that of the vertical ones.
     """
     width, height, depth = np.asarray(size, dtype=float)
     radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
@@ -169,52 +183,26 @@ def rounded_box(
     angle = np.linspace(0, np.pi / 2, steps + 1)
     inset = radius * (1 - np.sin(angle))
     level = -height / 2 + radius * (1 - np.cos(angle))
+    insets, levels = np.concatenate([inset, inset[::-1]]), np.concatenate([level, -level[::-1]])
     rings = [
-        np.insert(
-            rounded_rectangle(width - 2 * i, depth - 2 * i, radius=corner - i, steps=steps), 1, y, 1
+        at_height(
+            rounded_rectangle(width - 2 * i, depth - 2 * i, radius=corner - i, steps=steps), y
         )
-        for i, y in zip(
-            np.concatenate([inset, inset[::-1]]), np.concatenate([level, -level[::-1]]), strict=True
-        )
+        for i, y in zip(insets, levels, strict=True)
     ]
     return loft(np.array(rings) + np.asarray(center, dtype=float), color)
 
 
 def stacked(
-    levels: Sequence[tuple[float, float, float, float]],
-    color: Color,
-    *,
-    radius: float = 0.05,
-    steps: int = 3,
+    levels: Sequence[tuple[float, float, float, float]], color: Color, *, radius: float
 ) -> Solid:
-    """A body between rounded rectangles that lie one above the other.
-
-    Parameters
-    ----------
-    levels : sequence of (y, width, z_front, z_rear)
-        The rectangles, from the lowest to the highest.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    radius : float
-        Radius of their corners.
-    steps : int
-        Flat pieces of a quarter circle.
-    """
-    rings = []
-    for y, width, front, rear in levels:
-        outline = rounded_rectangle(width, rear - front, radius=radius, steps=steps)
-        rings.append(np.insert(outline + np.array([0, (front + rear) / 2]), 1, y, axis=1))
-    return loft(np.array(rings), color)
-
-
-def box(center: npt.ArrayLike, size: npt.ArrayLike, color: Color) -> Solid:
-    """A box with sharp edges."""
-    half = np.asarray(size, dtype=float) / 2
-    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], dtype=float)
-    corners = np.concatenate([np.insert(square, 1, level, axis=1) for level in (-1, 1)]) * half
-    quads = [(0, 1, 2, 3), (7, 6, 5, 4), (0, 4, 5, 1), (1, 5, 6, 2), (2, 6, 7, 3), (3, 7, 4, 0)]
-    faces = [corner for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))]
-    return Solid.from_triangles(corners + np.asarray(center, dtype=float), faces, color)
+    """A body through rounded rectangles (y, width, z_front, z_rear), from the lowest up."""
+    rings = [
+        at_height(rounded_rectangle(width, rear - front, radius=radius, steps=3), y)
+        + (0, 0, (front + rear) / 2)
+        for y, width, front, rear in levels
+    ]
+    return loft(rings, color)
 
 
 def sweep(
@@ -225,31 +213,17 @@ def sweep(
     scales: npt.ArrayLike = 1.0,
     side: npt.ArrayLike | None = None,
 ) -> Solid:
-    """Move an outline along a path.
+    """Move an outline (n, 2) along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
 
-    Parameters
-    ----------
-    path : (k, 3) float
-        Points of the path.
-    section : (n, 2) float
-        The outline across the path: its first coordinate along ``side``, its second across.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    scales : (k,) or (k, 2) float
-        How much larger the outline is at each point.
-    side : (3,) float, optional
-        Direction of the outline's first coordinate, made perpendicular to the path; by default x,
-        or z where the path runs along x.
+    The outline's first coordinate is along ``side``, made perpendicular to the path: by default
+    along x, or z where the path runs along x.
     """
     points = np.asarray(path, dtype=float)
-    tangent = np.gradient(points, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = _normalized(np.gradient(points, axis=0))
     if side is None:
         side = (1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1)
-    first = (
-        np.asarray(side, dtype=float) - (tangent @ np.asarray(side, dtype=float))[:, None] * tangent
-    )
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    along = np.asarray(side, dtype=float)
+    first = _normalized(along - (tangent @ along)[:, None] * tangent)
     second = np.cross(tangent, first)
     scale = np.asarray(scales, dtype=float)
     scale = np.broadcast_to(scale[:, None] if scale.ndim == 1 else scale, (len(points), 2))
@@ -270,8 +244,7 @@ def rod(
     """A round bar between two points, tapered where ``end_radius`` differs."""
     taper = 1.0 if end_radius is None else end_radius / radius
     outline = ellipse(2 * radius, 2 * radius, count=sides)
-    path = np.array([start, end], dtype=float)
-    return sweep(path, outline, color, scales=[1.0, taper])
+    return sweep(np.array([start, end], dtype=float), outline, color, scales=[1.0, taper])
 
 
 def beam(
@@ -286,8 +259,9 @@ def beam(
 ) -> Solid:
     """A bar of rectangular section between two points; ``size`` is along and across ``side``."""
     outline = rounded_rectangle(*size, radius=0.18 * min(size) * bevel, steps=int(bevel))
-    path = np.array([start, end], dtype=float)
-    return sweep(path, outline, color, scales=[1.0, taper], side=side)
+    return sweep(
+        np.array([start, end], dtype=float), outline, color, scales=[1.0, taper], side=side
+    )
 
 
 def lathe(
@@ -299,29 +273,16 @@ def lathe(
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
 ) -> Solid:
-    """Turn a profile around a vertical axis.
+    """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
 
-    Parameters
-    ----------
-    profile : (k, 2) float
-        Radius and height.
-    color : tuple of 3 int
-        Red, green and blue, 0 to 255.
-    center : (3,) float
-        Where the axis's origin is.
-    count : int
-        Points around the axis, a multiple of 4.
-    depth : float or (k,) float
-        Extent along z relative to x.
-    exponent : float or (k,) float
-        2 for circles, more for rounded squares; see `ellipse`.
+    ``depth``, one or (k,), is the extent along z relative to x; ``exponent`` is 2 for circles, more
+    for rounded squares (see `ellipse`).
     """
     points = np.asarray(profile, dtype=float)
-    exponents = np.broadcast_to(np.asarray(exponent, dtype=float), len(points))
-    depths = np.broadcast_to(np.asarray(depth, dtype=float), len(points))
+    shape = np.broadcast_arrays(points[:, 0], points[:, 1], depth, exponent)
     rings = [
-        np.insert(ellipse(2 * r, 2 * r * share, count=count, exponent=float(power)), 1, y, axis=1)
-        for (r, y), share, power in zip(points, depths, exponents, strict=True)
+        at_height(ellipse(2 * r, 2 * r * share, count=count, exponent=power), y)
+        for r, y, share, power in zip(*shape, strict=True)
     ]
     return loft(np.array(rings) + np.asarray(center, dtype=float), color)
 
@@ -332,27 +293,24 @@ def ellipsoid(
     """An ellipsoid of the given full extents (3,)."""
     angle = np.linspace(0, np.pi, count // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], axis=1), color, count=count)
-    return Solid.from_triangles(
-        unit.vertices * np.asarray(size, dtype=float) / 2 + np.asarray(center, dtype=float),
-        unit.faces,
-        color,
-    )
+    return unit.with_vertices(unit.vertices * np.asarray(size, dtype=float) / 2 + center)
 
 
 def wheel(center: npt.ArrayLike, profile: npt.ArrayLike, color: Color, *, count: int = 24) -> Solid:
     """Turn a profile (radius, distance outward along x) around an axis along x."""
     upright = lathe(profile, color, count=count)
-    turned = upright.vertices[:, [1, 0, 2]]
-    return Solid.from_triangles(turned + np.asarray(center, dtype=float), upright.faces, color)
+    return upright.with_vertices(upright.vertices[:, [1, 0, 2]] + np.asarray(center, dtype=float))
 
 
 def sheet(grid: npt.ArrayLike, thickness: float, color: Color) -> Solid:
     """A curved plate: a grid of points (rows, columns, 3), thickened to both sides."""
     points = np.asarray(grid, dtype=float)
-    along, across = np.gradient(points, axis=0), np.gradient(points, axis=1)
-    normal = np.cross(along, across)
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    normal = _normalized(np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1)))
     upper, lower = points + normal * thickness / 2, points - normal * thickness / 2
     # Each row becomes an outline around the plate's section: over it and back underneath.
     rings = [points[:, :1], upper, points[:, -1:], lower[:, ::-1]]
     return loft(np.concatenate(rings, axis=1), color)
+
+
+def _normalized(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from cadalign.datasets.sample.model import Draft, Place, mirrored_places
+import numpy as np
+
+from cadalign.datasets.sample.model import Draft, mirrored_places
 from cadalign.datasets.sample.vessel_cargo import cargo
-from cadalign.datasets.sample.vessel_parts import Superstructure
+from cadalign.datasets.sample.vessel_motor import tug, yacht
 from cadalign.datasets.sample.vessel_sail import sail
-from cadalign.datasets.sample.vessel_style import VesselParameters
-from cadalign.datasets.sample.vessel_tug import tug
-from cadalign.datasets.sample.vessel_yacht import yacht
+from cadalign.datasets.sample.vessel_shape import VesselShape
 
 _STRIPE = (238, 238, 234)
 _DECKS = {
@@ -17,21 +17,21 @@ _DECKS = {
     "yacht": (204, 166, 118),
     "tug": (112, 118, 112),
 }
+_MAKERS = {"cargo": cargo, "sail": sail, "yacht": yacht, "tug": tug}
 
 
-def build_vessel(p: VesselParameters) -> Draft:
-    """Build a vessel.
+def vessel(rng: np.random.Generator, index: int) -> Draft:
+    """Draw and build a vessel.
 
     Semantic ids, right (+x) before left: 0 top of the bow; 1 bow at the water line; 2, 3 corners of
     the stern; 4, 5 edge of the side amidships, 6, 7 a quarter of the length from the bow; 8, 9
     front and 10, 11 rear upper corners of the deck house; 12 the highest point; 13, 14 stern at the
     water line; 15 the funnel's top, where there is one.
     """
-    hull = p.hull
-    above: Superstructure = {"cargo": cargo, "sail": sail, "yacht": yacht, "tug": tug}[p.kind](p)
+    p = VesselShape.draw(rng, index)
+    hull, water, stern = p.hull, p.hull.water_share, p.hull.stern(1.0)
+    above = _MAKERS[p.kind](p)
     body = hull.solids(bottom=p.bottom, stripe=_STRIPE, side=p.side, deck=_DECKS[p.kind])
-    water = hull.water_share
-    stern = hull.stern(1.0)
     pairs = {
         (2, 3): (hull.half_width(stern), hull.edge(stern), stern),
         (4, 5): (hull.half_width(0.0), hull.edge(0.0), 0.0),
@@ -40,16 +40,8 @@ def build_vessel(p: VesselParameters) -> Draft:
         (10, 11): above.house_rear,
         (13, 14): (hull.half_width(0.5, water), 0.0, hull.stern(water)),
     }
-    places = [
-        Place(0, (0.0, hull.edge(-0.5), -0.5)),
-        Place(1, (0.0, 0.0, hull.bow(water))),
-        Place(12, above.summit),
-        *mirrored_places(pairs),
-    ]
+    places = mirrored_places(pairs)
+    places |= {0: (0.0, hull.edge(-0.5), -0.5), 1: (0.0, 0.0, hull.bow(water)), 12: above.summit}
     if above.funnel is not None:
-        places.append(Place(15, above.funnel))
-    return Draft(
-        solids=(*body, *above.solids),
-        places=tuple(sorted(places, key=lambda place: place.semantic_id)),
-        mirrored=tuple(pairs),
-    )
+        places[15] = above.funnel
+    return Draft((*body, *above.solids), places, tuple(pairs))

@@ -12,20 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
-from cadalign.datasets.sample.bottle import build_bottle, draw_bottle
-from cadalign.datasets.sample.car import build_car
-from cadalign.datasets.sample.car_style import draw_car
-from cadalign.datasets.sample.chair import build_chair
-from cadalign.datasets.sample.chair_style import draw_chair
+from cadalign.datasets.models.categories import SYNSETS
+from cadalign.datasets.sample.bottle import bottle
+from cadalign.datasets.sample.car import car
+from cadalign.datasets.sample.chair import chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
-from cadalign.datasets.sample.vessel import build_vessel
-from cadalign.datasets.sample.vessel_style import draw_vessel
+from cadalign.datasets.sample.vessel import vessel
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 
-_SYNSETS = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
-_CATEGORIES = ("chair", "bottle", "car", "vessel")
+MAKERS: dict[str, Callable[[np.random.Generator, int], Draft]] = {
+    "chair": chair,
+    "bottle": bottle,
+    "car": car,
+    "vessel": vessel,
+}
+"""By category: draws and builds the model with a number; the styles take turns with the number."""
+
 _SPLITS = ("train", "train", "train", "train", "val", "test")  # take turns by number
 _MARKER = "sample_dataset.json"
 _LARGEST_OFFSET = 0.08
@@ -42,7 +47,7 @@ def sample_models(
     Parameters
     ----------
     per_category : int
-        How many models of each category, at least 1.
+        Models of each category, at least 1.
     categories : sequence of str, optional
         Some of chair, bottle, car, vessel; by default all.
     seed : int
@@ -86,12 +91,8 @@ def write_sample_dataset(
     root : path
         The folder to make. It may exist if it is empty or holds an earlier sample data set and
         nothing else: that is replaced.
-    per_category : int
-        How many models of each category, at least 1.
-    categories : sequence of str, optional
-        Some of chair, bottle, car, vessel; by default all.
-    seed : int
-        Not negative.
+    per_category, categories, seed
+        As of `sample_models`.
 
     Returns
     -------
@@ -114,24 +115,22 @@ def write_sample_dataset(
         partial = Path(
             tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent)
         )
-    except OSError as error:
-        raise DataError(f"cannot be written ({error})", where=str(target)) from error
-    try:
-        partial.chmod(0o755)
-        data = partial / "data"
-        data.mkdir()
-        _write(data, names, per_category, seed)
-        if target.exists():
-            target.rename(partial / "replaced")
-        data.rename(target)
+        try:
+            partial.chmod(0o755)
+            data = partial / "data"
+            data.mkdir()
+            _write(data, names, per_category, seed)
+            if target.exists():
+                target.rename(partial / "replaced")
+            data.rename(target)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         raise DataError(
             f"cannot be written ({error})",
             where=str(target),
             fix="give a folder with room to write",
         ) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return target
 
 
@@ -140,66 +139,54 @@ def _check_arguments(
 ) -> tuple[str, ...]:
     for name, value, least in (("per_category", per_category, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise InputError(
-                f"{value!r} is not possible", where=name, fix=f"give a whole number from {least} up"
-            )
+            what = f"must be an integer >= {least}, not {value!r}"
+            raise InputError(what, where=name, fix=f"give {least} or more")
     if categories is None:
-        return _CATEGORIES
+        return tuple(MAKERS)
     if isinstance(categories, str):
         raise InputError(
             "a single text, not a sequence", where="categories", fix=f"give [{categories!r}]"
         )
-    unknown = [name for name in categories if name not in _SYNSETS]
+    unknown = [name for name in categories if name not in MAKERS]
     if unknown or not categories or len(set(categories)) < len(categories):
         what = f"unknown category {unknown[0]!r}" if unknown else f"{list(categories)!r}"
         raise InputError(
-            what, where="categories", fix=f"give some of {', '.join(_CATEGORIES)}, each once"
+            what, where="categories", fix=f"give some of {', '.join(MAKERS)}, each once"
         )
     return tuple(categories)
 
 
-def _draft(category: str, index: int, rng: np.random.Generator) -> Draft:
-    makers: dict[str, Callable[[], Draft]] = {
-        "chair": lambda: build_chair(draw_chair(rng, index)),
-        "bottle": lambda: build_bottle(draw_bottle(rng, index)),
-        "car": lambda: build_car(draw_car(rng, index)),
-        "vessel": lambda: build_vessel(draw_vessel(rng, index)),
-    }
-    return makers[category]()
-
-
 def _make(category: str, index: int, seed: int) -> SampleModel:
-    rng = np.random.default_rng([seed, int(_SYNSETS[category]), index])
+    rng = np.random.default_rng([seed, int(SYNSETS[category]), index])
     # Real models are not centred either; x stays, so that x = 0 remains the mirror plane.
     offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
     if category == "bottle":
         offset[2] = 0.0
-    model_id = f"sample_{category}_{index:03d}"
-    draft = _draft(category, index, rng)
-    return finish(draft, category=category, model_id=model_id, offset=offset)
+    draft = MAKERS[category](rng, index)
+    return finish(
+        draft, category=category, model_id=f"sample_{category}_{index:03d}", offset=offset
+    )
 
 
 def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
     splits: dict[str, list[str]] = {"train": [], "val": [], "test": []}
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for name in names:
-        (root / "ShapeNetCore.v2.ply" / _SYNSETS[name]).mkdir(parents=True)
+        (root / "ShapeNetCore.v2.ply" / SYNSETS[name]).mkdir(parents=True)
     for model in sample_models(per_category=per_category, categories=names, seed=seed):
-        synset = _SYNSETS[model.category]
+        synset, records = SYNSETS[model.category], annotations[model.category]
         path = root / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply"
-        path.write_bytes(ply_bytes(model.mesh))
-        number = len(annotations[model.category])
-        splits[_SPLITS[number % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
-        annotations[model.category].append(annotation(model))
+        path.write_bytes(_ply_bytes(model.mesh))
+        splits[_SPLITS[len(records) % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
+        records.append(_annotation(model))
     (root / "annotations").mkdir()
     for name, records in annotations.items():
         text = json.dumps(records, separators=(",", ":"))
         (root / "annotations" / f"{name}.json").write_text(text, encoding="utf-8")
     (root / "splits").mkdir()
     for split, lines in splits.items():
-        (root / "splits" / f"{split}.txt").write_text(
-            "".join(lines), encoding="utf-8", newline="\n"
-        )
+        path = root / "splits" / f"{split}.txt"
+        path.write_text("".join(lines), encoding="utf-8", newline="\n")
     marker = {
         "made_by": "cadalign.datasets.sample",
         "categories": list(names),
@@ -209,7 +196,7 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
     (root / _MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
 
 
-def annotation(model: SampleModel) -> dict[str, Any]:
+def _annotation(model: SampleModel) -> dict[str, Any]:
     """A model's entry in KeypointNet's ``annotations/<category>.json``."""
     position = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
     rotation = []
@@ -218,7 +205,7 @@ def annotation(model: SampleModel) -> dict[str, Any]:
         circle = _circle(model, members) if model.round else {}
         rotation.append({"kp_indexes": members, "is_circle": model.round, "circle": circle})
     return {
-        "class_id": _SYNSETS[model.category],
+        "class_id": SYNSETS[model.category],
         "model_id": model.model_id,
         "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
         "symmetries": {
@@ -229,9 +216,11 @@ def annotation(model: SampleModel) -> dict[str, Any]:
 
 
 def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
+    # Steps of the golden ratio around the colour circle never come back to a colour.
+    rgb = colorsys.hsv_to_rgb(keypoint.semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
     return {
         "xyz": keypoint.xyz.tolist(),
-        "rgb": _distinct_color(keypoint.semantic_id),
+        "rgb": [round(255 * value) for value in rgb],
         "semantic_id": keypoint.semantic_id,
         "pcd_info": {"point_index": keypoint.vertex_index},
         "mesh_info": {
@@ -239,12 +228,6 @@ def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
             "face_uv": keypoint.barycentric.tolist(),
         },
     }
-
-
-def _distinct_color(semantic_id: int) -> list[int]:
-    # Steps of the golden ratio around the colour circle never come back to a colour.
-    rgb = colorsys.hsv_to_rgb(semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
-    return [round(255 * value) for value in rgb]
 
 
 def _circle(model: SampleModel, members: Sequence[int]) -> dict[str, Any]:
@@ -256,24 +239,12 @@ def _circle(model: SampleModel, members: Sequence[int]) -> dict[str, Any]:
     return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
 
 
-def ply_bytes(mesh: Mesh) -> bytes:
+def _ply_bytes(mesh: Mesh) -> bytes:
     """A mesh with vertex colours as a binary PLY file, positions in single precision."""
-    vertices = np.empty(len(mesh.vertices), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"] = mesh.vertices
-    colors = mesh.vertex_colors
-    vertices["rgb"] = 178 if colors is None else np.round(colors[:, :3] * 255)
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"] = 3
-    faces["corners"] = mesh.faces
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-        f"element face {len(faces)}\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
-    return header.encode("ascii") + vertices.tobytes() + faces.tobytes()
+    assert mesh.vertex_colors is not None
+    colors = np.round(mesh.vertex_colors * 255).astype(np.uint8)
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    return bytes(trimesh.exchange.ply.export_ply(surface, vertex_normal=False))
 
 
 def _check_replaceable(target: Path) -> None:
@@ -283,8 +254,6 @@ def _check_replaceable(target: Path) -> None:
     if not target.is_dir():
         raise DataError("is a file", where=str(target), fix="give a folder")
     present = sorted(path for path in target.rglob("*") if not path.is_dir())
-    if not present:
-        return
     ours = (target / _MARKER).is_file()
     foreign = [path for path in present if not ours or not _is_ours(path.relative_to(target))]
     if foreign:
@@ -297,5 +266,5 @@ def _check_replaceable(target: Path) -> None:
 
 def _is_ours(path: Path) -> bool:
     known = {_MARKER, *(f"splits/{split}.txt" for split in ("train", "val", "test"))}
-    known |= {f"annotations/{category}.json" for category in _CATEGORIES}
+    known |= {f"annotations/{category}.json" for category in MAKERS}
     return path.as_posix() in known or path.match("ShapeNetCore.v2.ply/*/sample_*.ply")

@@ -19,12 +19,12 @@ from cadalign.datasets.sfm.bundler_file import read_bundler
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import OPENGL_AXES
 
 ImageSize = tuple[int, int]
 """Width and height [px]."""
 
 # Bundler's camera looks down -z with y up, cadalign's down z with y down.
-_FLIP = np.array([1.0, -1.0, -1.0])
 _IMAGE_SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"))
 # How far keypoints may lie outside the image's pixel centres [px].
 _MARGIN = 1.0
@@ -90,7 +90,7 @@ class Bundler(CorrespondenceSet):
             points_3d=self._model.points[points],
             points_2d=centred * (1, -1) + middle,
             camera=Camera(width, height, focal, focal, middle[0], middle[1], (k1, k2, 0.0, 0.0)),
-            cam_from_world=rigid_pose(_FLIP[:, None] * pose[:3], _FLIP * pose[3]),
+            cam_from_world=rigid_pose(OPENGL_AXES[:, None] * pose[:3], OPENGL_AXES * pose[3]),
             point_ids=points,
         )
 

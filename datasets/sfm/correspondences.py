@@ -165,7 +165,7 @@ class CorrespondenceSet(ABC):
 
     @property
     def problems(self) -> dict[str, DataError]:
-        """Why images could not be read, by id; reads them all."""
+        """Errors of the images that could not be read, by id; reads them all."""
         self._prepare()
         problems = {}
         for position, name in enumerate(self.ids):

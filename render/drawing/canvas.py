@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import FloatArray
+from cadalign.geometry.conventions import rescaled_pixels
 from cadalign.render.drawing.color import ByteImage
 
 Color = tuple[int, int, int]
@@ -24,15 +25,7 @@ _SMALL_SIDE = 1000
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """A line of the legend.
-
-    Parameters
-    ----------
-    text : str
-    color : tuple of 3 int
-    marker : str
-        "line", "ring" or "cross".
-    """
+    """A line of the legend; its marker is a "line", "ring" or "cross"."""
 
     text: str
     color: Color
@@ -42,12 +35,7 @@ class LegendEntry:
 class Canvas:
     """An image that is drawn on, a small one at twice its size, for finer lines.
 
-    All methods take pixels of the canvas, which `place` makes of the image's.
-
-    Parameters
-    ----------
-    image : (h, w, 3) uint8
-        Copied, not changed.
+    The image (h, w, 3) uint8 is copied. All methods take pixels of the canvas: see `place`.
 
     Attributes
     ----------
@@ -65,7 +53,7 @@ class Canvas:
 
     def place(self, points: FloatArray) -> FloatArray:
         """Take pixels (n, 2) of the image to those of the canvas."""
-        return np.asarray((points + 0.5) * self._zoom - 0.5)
+        return rescaled_pixels(points, self._zoom)
 
     def finished(self) -> ByteImage:
         """The drawn image at its own size; where nothing was drawn it is what it was."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.errors import InputError
+
 LinearArray = npt.NDArray[np.float32]
 ByteImage = npt.NDArray[np.uint8]
 
@@ -37,3 +39,23 @@ def bytes_from_linear(linear: LinearArray) -> ByteImage:
 def linear_from_bytes(image: ByteImage) -> LinearArray:
     """Decode sRGB bytes (any shape) to linear light; float32."""
     return np.asarray(linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))[image])
+
+
+def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
+    """Put an image with opacity (h, w, 4) before a colour or a photo; see `Frame.composite`."""
+    behind = np.asarray(background)
+    shape = (*color.shape[:2], 3)
+    if behind.shape not in ((3,), shape):
+        raise InputError(f"shape {behind.shape} is neither (3,) nor {shape}", where="background")
+    if behind.dtype.kind not in "ui" or behind.min(initial=0) < 0 or behind.max(initial=0) > 255:
+        raise InputError("not whole numbers from 0 to 255", where="background")
+    result: ByteImage = np.empty(shape, dtype=np.uint8)
+    result[:] = behind
+    opacity = color[:, :, 3]
+    result[opacity == 255] = color[:, :, :3][opacity == 255]
+    mixed = (opacity > 0) & (opacity < 255)
+    share = opacity[mixed, None] / np.float32(255)
+    front = linear_from_bytes(color[:, :, :3][mixed])
+    light = front * share + linear_from_bytes(result[mixed]) * (1 - share)
+    result[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))
+    return result

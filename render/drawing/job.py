@@ -1,4 +1,4 @@
-"""What `cadalign render` does: from words to pictures."""
+"""Work of `cadalign render`: arguments checked, files read, pictures drawn and written."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
-from cadalign.render.drawing.color import ByteImage
+from cadalign.io.files import write_whole
+from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.drawing.movie import contact_sheet, write_movie
 from cadalign.render.drawing.stills import (
     VIEWS,
     Angles,
     draw_still,
-    on_background,
     pose_in_view,
     turntable,
     with_keypoints,
@@ -39,31 +39,17 @@ _MAX_FRAMES = 10_000
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """Everything that a picture needs, checked.
-
-    Parameters
-    ----------
-    scene : Scene
-    renderer : Renderer
-    views : tuple of (str, Angles or (Camera, Alignment))
-        Labels, and angles or whole cameras.
-    camera : Camera
-    out : Path
-    style : str
-    background : tuple of 3 int, optional
-        None is transparent.
-    keypoints : (k, 3) float, optional
-    scale : (3,) float
-    samples : int
-    """
+    """Everything that a picture needs, checked."""
 
     scene: Scene
     renderer: Renderer
     views: tuple[tuple[str, Angles | tuple[Camera, Alignment]], ...]
+    """Labels, and angles or whole cameras."""
     camera: Camera
     out: Path
     style: str
     background: tuple[int, int, int] | None
+    """None is transparent."""
     keypoints: FloatArray | None
     scale: FloatArray
     samples: int
@@ -84,13 +70,7 @@ class RenderJob:
         samples: int,
         renderer: str,
     ) -> RenderJob:
-        """Check the words of the command line and read the files that they name.
-
-        Raises
-        ------
-        InputError, DataError, RenderError
-            If a word, a file or the renderer won't do.
-        """
+        """Check the arguments of the command line and read the files that they name."""
         width, height = parse_size(size)
         camera = Camera.from_fov(width, height, fov_x=fov)
         check_image_size(camera)
@@ -107,7 +87,7 @@ class RenderJob:
             raise InputError(f"{scale} is not positive", where="--scale")
         chosen = tuple(view for word in views for view in _views(word, factors))
         if not chosen:
-            raise InputError("there is none", where="--view")
+            raise InputError("no view is given", where="--view", fix="give one or more")
         if color is None and (movie or len(chosen) > 1 or keypoints is not None):
             raise InputError(
                 "only a still without keypoints can be transparent", where="--background"
@@ -128,8 +108,13 @@ class RenderJob:
         )
 
     @property
+    def drawn_by(self) -> str:
+        """Name of the renderer that really draws the model."""
+        return self.renderer.drawn_by(self.scene, samples=self.samples)
+
+    @property
     def is_movie(self) -> bool:
-        """Whether a turntable is asked for."""
+        """True for a turntable, False for a still."""
         return self.out.suffix.lower() == ".mp4"
 
     def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
@@ -139,26 +124,17 @@ class RenderJob:
         )
         if self.background is None:
             return color
-        image = on_background(color, self.background)
+        image = composite(color, self.background)
         if self.keypoints is not None:
             image = with_keypoints(image, self.scene, camera, pose, self.keypoints)
         return image
 
     def write_picture(self, image: ByteImage) -> None:
-        """Write a PNG file.
-
-        Raises
-        ------
-        DataError
-            If that is not possible.
-        """
-        try:
-            Image.fromarray(image).save(self.out, format="PNG")
-        except OSError as error:
-            raise DataError(f"cannot be written ({error})", where=str(self.out)) from None
+        """Write a PNG file, whole or not at all."""
+        write_whole(self.out, lambda path: Image.fromarray(image).save(path, format="PNG"))
 
     def write_movie(self, frames: Iterable[ByteImage], *, fps: float) -> None:
-        """Write an MP4 file; see `write_movie`."""
+        """Write an MP4 file, whole or not at all."""
         write_movie(self.out, frames, fps=fps)
 
 
@@ -179,13 +155,7 @@ def draw_picture(job: RenderJob) -> ByteImage:
 
 
 def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[ByteImage], int]:
-    """Draw a turntable that starts in the first view: its frames, and how many there are.
-
-    Raises
-    ------
-    InputError
-        If there would be no frames or more than 10,000, or the first view is a camera file.
-    """
+    """Draw a turntable that starts in the first view: its frames, and their number."""
     frames = seconds * fps
     if not 1 <= frames <= _MAX_FRAMES:
         raise InputError(
@@ -203,11 +173,6 @@ def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[
 def parse_size(text: str) -> tuple[int, int]:
     """Read an image size ``WIDTHxHEIGHT``.
 
-    Raises
-    ------
-    InputError
-        If it is not one.
-
     Examples
     --------
     >>> parse_size("640x480")
@@ -223,11 +188,6 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def parse_background(text: str) -> tuple[int, int, int] | None:
     """Read a colour's name or ``#rrggbb``; None for ``transparent``.
-
-    Raises
-    ------
-    InputError
-        If it is none of these.
 
     Examples
     --------

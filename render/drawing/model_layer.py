@@ -22,12 +22,7 @@ _CASING_OPACITY = 0.45
 
 
 def check_model_style(geometry: Geometry, image: ByteImage, style: str) -> None:
-    """Refuse an unknown style, or a frame of another size than the image.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse an unknown style, or a frame of another size than the image."""
     if style not in (TRANSLUCENT, LINES):
         raise InputError(
             f"unknown style {style!r}",

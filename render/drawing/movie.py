@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,7 +12,8 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from cadalign.errors import DataError, InputError, RenderError
+from cadalign.errors import InputError, RenderError
+from cadalign.io.files import write_whole
 from cadalign.render.drawing.color import ByteImage
 
 # Browsers play VP9; MPEG-4 part 2 is what every build of OpenCV can write.
@@ -48,7 +50,7 @@ def contact_sheet(
     if not images or len(images) != len(labels):
         raise InputError(f"{len(images)} images and {len(labels)} labels", where="images")
     if len({image.shape for image in images}) > 1:
-        raise InputError("they differ in size", where="images")
+        raise InputError("all must have the same size", where="images")
     height, width = images[0].shape[:2]
     across = columns or int(np.ceil(np.sqrt(len(images))))
     down = -(-len(images) // across)
@@ -81,7 +83,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
     Returns
     -------
     int
-        How many frames were written.
+        Number of frames written.
 
     Raises
     ------
@@ -110,11 +112,8 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
             if writer is not None:
                 writer.release()
         if not count:
-            raise InputError("there are none", where="frames")
-        try:
-            path.write_bytes(draft.read_bytes())
-        except OSError as error:
-            raise DataError(f"cannot be written ({error.strerror})", where=str(path)) from None
+            raise InputError("no frames are given", where="frames")
+        write_whole(path, lambda unfinished: shutil.copyfile(draft, unfinished))
     return count
 
 

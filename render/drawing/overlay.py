@@ -285,7 +285,7 @@ def _legend_entries(
     *,
     axes: bool,
 ) -> list[LegendEntry]:
-    """What was drawn, by name."""
+    """Names and colours of everything drawn."""
     entries = []
     if gt_box is not None:
         entries.append(LegendEntry("ground truth", GT_COLOR))

@@ -10,6 +10,7 @@ from cadalign.arrays import as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.render.drawing.canvas import Canvas
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import Geometry
@@ -55,7 +56,7 @@ def normal_picture(geometry: Geometry) -> ByteImage:
     -------
     (h, w, 4) uint8
     """
-    turned = geometry.normal * np.array([1, -1, -1], dtype=np.float32)
+    turned = geometry.normal * OPENGL_AXES.astype(np.float32)
     return _with_mask((127.5 * (turned + 1) + 0.5).astype(np.uint8), geometry)
 
 

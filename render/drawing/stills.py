@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.pictures import (
     depth_picture,
@@ -20,10 +21,10 @@ from cadalign.render.drawing.pictures import (
     line_picture,
     normal_picture,
 )
-from cadalign.render.frame import Frame, Renderer
+from cadalign.render.frame import Renderer
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.scene import Scene
-from cadalign.render.views.views import frame_object, look_at
+from cadalign.render.views.viewpoints import frame_object, look_at
 from cadalign.render.views.visibility import visible_keypoints
 
 VIEWS: dict[str, tuple[float, float]] = {
@@ -43,7 +44,7 @@ _FILL = 0.88
 
 @dataclass(frozen=True)
 class Angles:
-    """From where a model is looked at; see `look_at`.
+    """Viewing angles of a model; see `look_at`.
 
     Parameters
     ----------
@@ -94,13 +95,7 @@ def pose_in_view(
     InputError
         If an angle or a scale is out of its range.
     """
-    rotation = look_at(
-        azimuth=angles.azimuth,
-        elevation=angles.elevation,
-        roll=angles.roll,
-        distance=1.0,
-        scale=scale,
-    ).rotation
+    rotation = look_at(**asdict(angles), distance=1.0, scale=scale).rotation
     return frame_object(scene.bounds, camera, rotation=rotation, fill=_FILL, scale=scale)
 
 
@@ -134,18 +129,6 @@ def draw_still(
     return pictures[style](cast_geometry(scene, camera, cam_from_model))
 
 
-def on_background(color: ByteImage, background: tuple[int, int, int] | ByteImage) -> ByteImage:
-    """Put a picture with opacity (h, w, 4) on a colour or an image; (h, w, 3) uint8."""
-    empty = np.zeros(color.shape[:2])
-    frame = Frame(
-        depth=empty,
-        face_id=np.full(empty.shape, -1, dtype=np.int32),
-        normal=np.zeros((*empty.shape, 3), dtype=np.float32),
-        color=color,
-    )
-    return frame.composite(background)
-
-
 def with_keypoints(
     image: ByteImage,
     scene: Scene,
@@ -175,7 +158,7 @@ def turntable(
     angles : Angles
         Of the first pose.
     count : int
-        How many.
+        Number of poses.
     scale : (3,) float
     """
     low, high = scene.bounds
@@ -188,28 +171,15 @@ def turntable(
     placed = frame_object(np.array([-wide, wide]), camera, rotation=first, fill=_FILL)
     depth = placed.translation
     for number in range(count):
-        rotation = look_at(
-            azimuth=angles.azimuth + 360.0 * number / count,
-            elevation=angles.elevation,
-            roll=angles.roll,
-            distance=1.0,
-        ).rotation
+        turned = replace(angles, azimuth=angles.azimuth + 360.0 * number / count)
+        rotation = look_at(**asdict(turned), distance=1.0).rotation
         center = rotation @ (middle * around.scale)
         yield Alignment(rotation, depth - center, around.scale)
 
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
     """Feature lines drawn at twice the size and shrunk."""
-    doubled = replace(
-        camera,
-        width=2 * camera.width,
-        height=2 * camera.height,
-        fx=2 * camera.fx,
-        fy=2 * camera.fy,
-        # Pixel borders, not centres, are what doubling keeps in place.
-        cx=2 * camera.cx + 0.5,
-        cy=2 * camera.cy + 0.5,
-    )
+    doubled = resized_camera(camera, 2 * camera.width, 2 * camera.height)
     lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
     # Two pixels wide there is one pixel wide here.
     lines[:, :, 3] = cv2.dilate(lines[:, :, 3], np.ones((2, 2), np.uint8))

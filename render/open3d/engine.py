@@ -12,13 +12,7 @@ _NO_HIT = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
 
 
 class Open3DEngine:
-    """Embree by way of Open3D, which casts with all cores by itself.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float32
-    faces : (m, 3) int32
-    """
+    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
 
     def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
         self._scene = open3d.t.geometry.RaycastingScene()

@@ -55,12 +55,7 @@ class GlContext:
                 self._renderer.delete()
 
     def check_process(self) -> None:
-        """Refuse a process that was forked from the one that made the context.
-
-        Raises
-        ------
-        RenderError
-        """
+        """Refuse a process that was forked from the one that made the context."""
         if os.getpid() != self._process:
             raise RenderError(
                 "this process was forked from one that draws with OpenGL",
@@ -69,13 +64,7 @@ class GlContext:
             )
 
     def draw(self, scene: Any, *, width: int, height: int) -> ByteImage:
-        """Draw a `pyrender.Scene`; (height, width, 4) uint8, red, green and blue premultiplied.
-
-        Raises
-        ------
-        RenderError
-            If OpenGL reports an error, or in a forked process.
-        """
+        """Draw a `pyrender.Scene`; (height, width, 4) uint8, red, green and blue premultiplied."""
         self.check_process()
         with self._lock:
             self._renderer.viewport_width = width
@@ -91,7 +80,7 @@ class GlContext:
         return np.asarray(color, dtype=np.uint8)
 
     def description(self) -> str:
-        """What draws: the graphics card's or the software's name."""
+        """Name of the graphics card, or of the software that imitates one."""
         from OpenGL import GL
 
         platform = self._renderer._platform
@@ -104,13 +93,7 @@ class GlContext:
 
 @cache
 def shared_context() -> GlContext:
-    """The process's context, made on the first call.
-
-    Raises
-    ------
-    RenderError
-        If OpenGL does not start.
-    """
+    """The process's context, made on the first call; a `RenderError` if OpenGL does not start."""
     return GlContext()
 
 

@@ -26,14 +26,6 @@ def gl_meshes(scene: Scene) -> tuple[Any, Any]:
     it is and in the other turned round with its normals, and OpenGL culls what is turned away: the
     two sides look alike, as with ray casting. Of triangles that coincide, the one wound towards
     the viewer is kept.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    front, back : pyrender.Mesh
     """
     alike, opposite = scene.coincident_faces
     own = np.arange(len(alike))
@@ -92,7 +84,7 @@ def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: boo
 
 
 def _welded(rows: LinearArray) -> tuple[IntArray, IntArray]:
-    """Which of equal rows is the first, and the number of each row among the distinct ones."""
+    """First occurrence of each distinct row, and the number of each row among these."""
     packed = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * 4))).ravel()
     _, first, number = np.unique(packed, return_index=True, return_inverse=True)
     # In the order of first use, which graphics cards and their imitations like best.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from cadalign.render.frame import Frame, check_image_size
 from cadalign.render.opengl.context import shared_context, straight_color
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
-from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
+from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry, check_samples
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 
@@ -59,12 +60,12 @@ class PyrenderRenderer:
 
     @property
     def device(self) -> str:
-        """What draws: the graphics card's name, or llvmpipe for Mesa on the processor."""
+        """Name of the graphics card, or llvmpipe for Mesa on the processor."""
         return self._context.description()
 
     def __reduce__(self) -> tuple[object, ...]:
         # OpenGL's objects belong to this process; another one makes its own.
-        return _rebuild, (self.studio,)
+        return partial(PyrenderRenderer, studio=self.studio), ()
 
     def render(
         self, scene: Scene, camera: Camera, cam_from_model: Alignment, *, samples: int = 8
@@ -81,9 +82,9 @@ class PyrenderRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        if not scene.surface.opaque or samples == 1:
+        if self.drawn_by(scene, samples=samples) != self.name:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
-        self._fallback.check_samples(samples)
+        check_samples(samples)
         check_image_size(camera)
         geometry = cast_geometry(scene, camera, cam_from_model)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
@@ -92,20 +93,17 @@ class PyrenderRenderer:
             posed = PosedScene(scene, cam_from_model)
             sides = posed.seen_sides(geometry.face_id[block.slices])
             self._stage.place(scene, cam_from_model, sides=sides)
-            if camera.distortion:
-                color[block.slices] = self._draw_bent(camera, block)
-            else:
-                color[block.slices] = self._draw(camera, block)
+            draw = self._draw_bent if camera.distortion else self._draw
+            color[block.slices] = straight_color(draw(camera, block))
             darken_corners(color, geometry, block, posed, camera, studio=self.studio)
-        return Frame(
-            depth=geometry.depth, face_id=geometry.face_id, normal=geometry.normal, color=color
-        )
+        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
+
+    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+        """ "pyrender", or "raycast" for transparent models and frames without antialiasing."""
+        return self.name if scene.surface.opaque and samples > 1 else self._fallback.name
 
     def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
-        """Draw a block of an image without lens distortion, straight colour (h, w, 4)."""
-        return straight_color(self._draw_premultiplied(camera, block))
-
-    def _draw_premultiplied(self, camera: Camera, block: Rectangle) -> ByteImage:
+        """Draw a block of an image without lens distortion, premultiplied (h, w, 4)."""
         result: ByteImage = np.empty((block.height, block.width, 4), dtype=np.uint8)
         for tile in _tiles(block):
             width, height = (_rounded_up(size) for size in (tile.width, tile.height))
@@ -117,7 +115,7 @@ class PyrenderRenderer:
         return result
 
     def _draw_bent(self, camera: Camera, block: Rectangle) -> ByteImage:
-        """Draw as a pinhole camera would and bend that as the lens does."""
+        """Draw as a pinhole camera would and bend that as the lens does, premultiplied."""
         columns, rows = np.meshgrid(
             np.arange(block.left, block.right), np.arange(block.top, block.bottom)
         )
@@ -128,12 +126,12 @@ class PyrenderRenderer:
         low, high = rays[valid].min(axis=0), rays[valid].max(axis=0)
         pinhole = _pinhole_over(camera, low, high)
         whole = Rectangle(0, 0, pinhole.width, pinhole.height)
-        drawn = self._draw_premultiplied(pinhole, whole)
+        drawn = self._draw(pinhole, whole)
         at = pinhole.pixels_from_normalized(rays)
         at[~valid] = -10
         at_x, at_y = at.astype(np.float32).T.reshape(2, block.height, block.width)
         bent = cv2.remap(drawn, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return straight_color(np.asarray(bent, dtype=np.uint8))
+        return np.asarray(bent, dtype=np.uint8)
 
 
 def _tiles(block: Rectangle) -> Iterator[Rectangle]:
@@ -159,7 +157,3 @@ def _pinhole_over(camera: Camera, low: FloatArray, high: FloatArray) -> Camera:
     width, height = (int(value) for value in np.ceil(span * focal) + 3)
     cx, cy = 1 - low * focal
     return Camera(width, height, float(focal[0]), float(focal[1]), float(cx), float(cy))
-
-
-def _rebuild(studio: Studio) -> PyrenderRenderer:
-    return PyrenderRenderer(studio=studio)

@@ -13,7 +13,7 @@ import pyrender
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import opengl_from_model, opengl_projection
+from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 
@@ -33,21 +33,14 @@ class WindowCamera(pyrender.Camera):  # type: ignore[misc]
         self.projection: FloatArray = np.eye(4)
 
     def get_projection_matrix(self, width: object = None, height: object = None) -> FloatArray:
-        """What pyrender asks for."""
+        """The projection matrix, in pyrender's terms."""
         return self.projection
 
 
 class GlStage:
-    """Lights and camera that stand still, and a mesh that stays loaded between frames.
+    """A `pyrender.Scene`: lights and camera that stand still, a mesh that stays loaded.
 
-    Parameters
-    ----------
-    studio : Studio
-        OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
-
-    Attributes
-    ----------
-    scene : pyrender.Scene
+    OpenGL's lights have no size, so shadows' edges are harder than in ray-cast frames.
     """
 
     def __init__(self, studio: Studio) -> None:
@@ -57,8 +50,7 @@ class GlStage:
         ambient = np.full(3, studio.ground_power + (1 - _SKY_SHARE) * sky + around)
         self.scene: Any = pyrender.Scene(bg_color=np.zeros(4), ambient_light=ambient)
         for direction, power in ((studio.key, studio.key_power), (studio.fill, studio.fill_power)):
-            right, down, forward = direction
-            self._add_light(power, _pose_towards(np.array([right, -down, -forward])))
+            self._add_light(power, _pose_towards(OPENGL_AXES * direction))
         self._sky = self._add_light(_SKY_SHARE * sky, np.eye(4))
         self._camera = WindowCamera()
         self.scene.add(self._camera, pose=np.eye(4))

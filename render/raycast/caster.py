@@ -35,20 +35,14 @@ class RayEngine(Protocol):
     def blocked(
         self, origins: SingleArray, directions: SingleArray, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Whether anything is hit before ``origin + reach * direction``, (n,) bool."""
+        """Rays that hit anything before ``origin + reach * direction``, (n,) bool."""
 
 
 EngineMaker = Callable[[SingleArray, FaceArray], RayEngine]
 
 
 class EmbreeEngine:
-    """Embree by way of embreex.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float32
-    faces : (m, 3) int32
-    """
+    """Embree by way of embreex, over vertices (n, 3) and faces (m, 3)."""
 
     def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
         self._scene = EmbreeScene()
@@ -70,17 +64,7 @@ class EmbreeEngine:
 
 
 class RayCaster:
-    """A bounding volume hierarchy over a mesh; built once, then only read.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions [model units], finite.
-    faces : (m, 3) int
-        Vertex numbers of the triangles.
-    engine : callable
-        Makes the hierarchy.
-    """
+    """A bounding volume hierarchy over finite vertices (n, 3) and faces (m, 3), then only read."""
 
     def __init__(
         self, vertices: FloatArray, faces: IntArray, *, engine: EngineMaker = EmbreeEngine
@@ -127,18 +111,9 @@ class RayCaster:
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Say which rays hit anything on the way; to single precision.
+        """Find the rays (n, 3) that hit anything on their way, (n,) bool; to single precision.
 
-        Parameters
-        ----------
-        origins, directions : (n, 3) float
-            In model coordinates.
-        reach : float
-            How far each ray goes, in lengths of its direction.
-
-        Returns
-        -------
-        (n,) bool
+        Each ray goes ``reach`` times its direction's length, in model coordinates.
         """
         unit = (origins - self._center) / self._radius
         return self._engine.blocked(
@@ -167,7 +142,7 @@ class RayCaster:
         )
 
     def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
-        """Where the rays cross the planes of their triangles, (n,) float."""
+        """Ray parameters at the planes of their triangles, (n,) float."""
         distance = np.full(len(face), np.inf)
         hit = np.flatnonzero(face >= 0)
         found, along = face[hit], directions[hit]

@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-
-
-def number_rows(rows: npt.NDArray[np.float64] | npt.NDArray[np.int64]) -> IntArray:
-    """Number the distinct rows of an (n, 3) array; (n,) int, equal for equal rows."""
-    # Adding 0 turns -0.0 into 0.0, which has other bytes.
-    packed = np.ascontiguousarray(rows + 0).view(np.dtype((np.void, 3 * rows.itemsize))).ravel()
-    return np.asarray(np.unique(packed, return_inverse=True)[1].ravel(), dtype=np.int64)
+from cadalign.geometry.edges import number_rows
 
 
 def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
@@ -20,11 +13,6 @@ def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, I
 
     Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
     front and of its back. The one to show is wound towards the viewer.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float
-    faces : (m, 3) int
 
     Returns
     -------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.render.raycast.coincident import number_rows
+from cadalign.geometry.edges import number_rows
 
 # A point at which more triangles meet than this is left faceted: pairs grow with the square.
 _MAX_VALENCE = 1024
@@ -19,16 +19,8 @@ def corner_normals(
 
     Faces meet where their vertices have the same position, whether they share the vertex or not.
     Those that are turned the other way count with their normal reversed, since the faces of many
-    CAD models are turned at random. Each counts by its angle at the corner.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float
-    faces : (m, 3) int
-    face_normals : (m, 3) float
-        Unit normals.
-    crease_angle : float
-        Faces at a larger angle than this [degrees] meet in an edge.
+    CAD models are turned at random. Each counts by its angle at the corner. Faces at a larger angle
+    than ``crease_angle`` [degrees] meet in an edge.
 
     Returns
     -------
@@ -64,7 +56,7 @@ def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> Flo
 
 
 def _runs(values: IntArray) -> tuple[IntArray, IntArray]:
-    """Where runs of equal values start in a sorted array, and how long they are."""
+    """Starts and lengths of the runs of equal values in a sorted array."""
     start = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
     return start, np.diff(np.concatenate([start, [len(values)]]))
 

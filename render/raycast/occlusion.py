@@ -1,4 +1,4 @@
-"""Ambient occlusion: how much of the sky each seen point of the surface is open to."""
+"""Ambient occlusion: the share of the sky that is open to each seen point of the surface."""
 
 from __future__ import annotations
 
@@ -41,18 +41,9 @@ def darken_corners(
     *,
     studio: Studio,
 ) -> None:
-    """Darken, in place, what lies in corners and under other parts of the object.
+    """Darken, in place, corners and places under other parts of the object.
 
-    Parameters
-    ----------
-    color : (h, w, 4) uint8
-    geometry : Geometry
-    block : Rectangle
-        Where the object is.
-    posed : PosedScene
-    camera : Camera
-    studio : Studio
-        How strong this is and how far it reaches.
+    ``color`` is (h, w, 4) uint8, ``block`` holds the object, ``studio`` says strength and reach.
     """
     if studio.occlusion <= 0:
         return

@@ -35,7 +35,7 @@ class Rectangle:
 
     @property
     def width(self) -> int:
-        """Columns [px]."""
+        """Number of columns."""
         return self.right - self.left
 
     @property
@@ -50,15 +50,7 @@ class Rectangle:
 
 
 class PosedScene:
-    """A scene placed before a camera.
-
-    Parameters
-    ----------
-    scene : Scene
-    cam_from_model : Alignment
-    caster : RayCaster, optional
-        What finds the hits; by default the scene's own.
-    """
+    """A scene placed before a camera; ``caster`` replaces the scene's own ray hierarchy."""
 
     def __init__(
         self, scene: Scene, cam_from_model: Alignment, *, caster: RayCaster | None = None
@@ -93,7 +85,7 @@ class PosedScene:
         return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
 
     def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
-        """Whether any of the triangles in an image is seen from its front, and from its back."""
+        """Tell if any triangle in an image is seen from its front, and any from its back."""
         seen = np.zeros(len(self._side) + 1, dtype=bool)
         # Where nothing is, -1 marks the last place, which is no triangle's.
         seen[face_id.ravel()] = True
@@ -109,18 +101,10 @@ class PosedScene:
     def blocked(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
     ) -> npt.NDArray[np.bool_]:
-        """Say which points (n, 3) of the camera frame see a part of the object on their rays.
+        """Find the rays that hit a part of the object within a distance, (n,) bool.
 
-        Parameters
-        ----------
-        points_cam, directions : (n, 3) float
-            Rays in the camera frame; the directions have length 1.
-        reach : float
-            Parts farther off than this [model units] don't count.
-
-        Returns
-        -------
-        (n,) bool
+        ``points_cam`` and the unit ``directions`` (n, 3) are in the camera frame, ``reach`` in
+        model units.
         """
         columns = self._model_from_ray.T
         return self._caster.blocked(
@@ -134,19 +118,9 @@ class PosedScene:
     def light_of_hits(
         self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
-        """Colour seen in normalised directions whose first hits are known.
+        """Colour seen in normalised directions (n, 2) whose first hits are known.
 
-        Parameters
-        ----------
-        normalized : (n, 2) float
-        face : (n,) int
-        depth : (n,) float
-        studio : Studio
-
-        Returns
-        -------
-        (n, 4) float32
-            Linear light, premultiplied, and opacity.
+        Linear light, premultiplied, and opacity: (n, 4) float32.
         """
         result = np.zeros((len(face), 4), dtype=np.float32)
         active = np.flatnonzero(face >= 0)
@@ -227,16 +201,7 @@ class PosedScene:
 def object_rectangle(
     scene: Scene, camera: Camera, cam_from_model: Alignment, *, margin: int = 2
 ) -> Rectangle | None:
-    """The block of pixels outside of which nothing of the object is seen; None if it is nowhere.
-
-    Parameters
-    ----------
-    scene : Scene
-    camera : Camera
-    cam_from_model : Alignment
-    margin : int
-        Pixels added on every side.
-    """
+    """The block of pixels that holds all of the object and a margin [px]; None if it is unseen."""
     points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
     nearest = points[:, 2].min()
     if points[:, 2].max() <= 0:
@@ -269,6 +234,5 @@ def _outline(low: FloatArray, high: FloatArray, *, count: int = 65) -> FloatArra
     share = np.linspace(0, 1, count)[:, None]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     following = np.roll(corners, -1, axis=0)
-    return np.concatenate(
-        [a + share * (b - a) for a, b in zip(corners, following, strict=True)], axis=0
-    )
+    lines = [a + share * (b - a) for a, b in zip(corners, following, strict=True)]
+    return np.concatenate(lines)

@@ -15,7 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.frame import Frame, Geometry, check_image_size
-from cadalign.render.raycast.caster import RayCaster
+from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
 from cadalign.render.raycast.shading import Studio
@@ -92,52 +92,30 @@ class RaycastRenderer:
         InputError
             If ``samples`` is not from 1 to 256.
         """
-        self.check_samples(samples)
+        check_samples(samples)
         check_image_size(camera)
-        geometry = empty_geometry(camera)
+        geometry = _empty_geometry(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         block = object_rectangle(scene, camera, cam_from_model)
         if block is not None:
             posed = PosedScene(scene, cam_from_model, caster=self._caster_of(scene))
             posed.prepare_color()
-            self._draw(geometry, color, _bands(block), posed, camera)
+
+            def shade(
+                band: Rectangle, normalized: FloatArray, face: FaceArray, depth: FloatArray
+            ) -> None:
+                light = posed.light_of_hits(normalized, face, depth, self.studio)
+                color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
+
+            _cast(geometry, block, posed, camera, shade=shade)
             if samples > 1:
                 self._antialias(color, block, posed, camera, samples)
             darken_corners(color, geometry, block, posed, camera, studio=self.studio)
-        return Frame(
-            depth=geometry.depth, face_id=geometry.face_id, normal=geometry.normal, color=color
-        )
+        return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    @staticmethod
-    def check_samples(samples: int) -> None:
-        """Refuse a number of rays per pixel that is out of range.
-
-        Raises
-        ------
-        InputError
-        """
-        if not 1 <= samples <= _MAX_SAMPLES:
-            raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
-
-    def _draw(
-        self,
-        geometry: Geometry,
-        color: ByteImage,
-        bands: list[Rectangle],
-        posed: PosedScene,
-        camera: Camera,
-    ) -> None:
-        """Draw with one ray through each pixel's centre."""
-
-        def draw(band: Rectangle) -> None:
-            normalized, valid = _normalized(camera, band)
-            face, depth = posed.cast(normalized)
-            face[~valid] = -1
-            _fill(geometry, band, posed, face, depth)
-            light = posed.light_of_hits(normalized, face, depth, self.studio)
-            color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
-
-        in_threads(draw, bands)
+    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+        """The renderer's own name."""
+        return self.name
 
     def _antialias(
         self,
@@ -195,7 +173,7 @@ def cast_geometry(
     camera : Camera
     cam_from_model : Alignment
     caster : RayCaster, optional
-        What finds the hits; by default the scene's own.
+        By default the scene's own.
 
     Returns
     -------
@@ -208,45 +186,50 @@ def cast_geometry(
         If the image is too large.
     """
     check_image_size(camera)
-    geometry = empty_geometry(camera)
+    geometry = _empty_geometry(camera)
     block = object_rectangle(scene, camera, cam_from_model)
     if block is not None:
-        posed = PosedScene(scene, cam_from_model, caster=caster)
-
-        def draw(band: Rectangle) -> None:
-            normalized, valid = _normalized(camera, band)
-            face, depth = posed.cast(normalized)
-            face[~valid] = -1
-            _fill(geometry, band, posed, face, depth)
-
-        in_threads(draw, _bands(block))
+        _cast(geometry, block, PosedScene(scene, cam_from_model, caster=caster), camera)
     return geometry
 
 
-def empty_geometry(camera: Camera) -> Geometry:
+def check_samples(samples: int) -> None:
+    """Refuse a number of rays per pixel that is out of range."""
+    if not 1 <= samples <= _MAX_SAMPLES:
+        raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
+
+
+def _empty_geometry(camera: Camera) -> Geometry:
     shape = (camera.height, camera.width)
-    return Geometry(
-        depth=np.zeros(shape),
-        face_id=np.full(shape, -1, dtype=np.int32),
-        normal=np.zeros((*shape, 3), dtype=np.float32),
-    )
+    face_id = np.full(shape, -1, dtype=np.int32)
+    return Geometry(np.zeros(shape), face_id, np.zeros((*shape, 3), dtype=np.float32))
 
 
-def _fill(
+def _cast(
     geometry: Geometry,
-    band: Rectangle,
+    block: Rectangle,
     posed: PosedScene,
-    face: npt.NDArray[np.int32],
-    depth: FloatArray,
+    camera: Camera,
+    *,
+    shade: Callable[[Rectangle, FloatArray, FaceArray, FloatArray], None] | None = None,
 ) -> None:
-    """Write hits into the images."""
-    hit = np.flatnonzero(face >= 0)
-    shape = (band.height, band.width)
-    geometry.face_id[band.slices] = face.reshape(shape)
-    geometry.depth[band.slices] = np.where(face >= 0, depth, 0.0).reshape(shape)
-    normal = np.zeros((len(face), 3), dtype=np.float32)
-    normal[hit] = posed.normals[face[hit]]
-    geometry.normal[band.slices] = normal.reshape(*shape, 3)
+    """Fill a block of the images with hits of one ray through each pixel's centre, and shade it."""
+
+    def draw(band: Rectangle) -> None:
+        normalized, valid = _normalized(camera, band)
+        face, depth = posed.cast(normalized)
+        face[~valid] = -1
+        hit = np.flatnonzero(face >= 0)
+        shape = (band.height, band.width)
+        geometry.face_id[band.slices] = face.reshape(shape)
+        geometry.depth[band.slices] = np.where(face >= 0, depth, 0.0).reshape(shape)
+        normal = np.zeros((len(face), 3), dtype=np.float32)
+        normal[hit] = posed.normals[face[hit]]
+        geometry.normal[band.slices] = normal.reshape(*shape, 3)
+        if shade is not None:
+            shade(band, normalized, face, depth)
+
+    in_threads(draw, _bands(block))
 
 
 def _bands(block: Rectangle) -> list[Rectangle]:

@@ -49,23 +49,10 @@ class Studio:
     def shade(
         self, albedo: LinearArray, normal: LinearArray, view: LinearArray, up: FloatArray
     ) -> LinearArray:
-        """Light points of a surface.
+        """Linear light (n, 3) that points of a surface send towards the camera.
 
-        Parameters
-        ----------
-        albedo : (n, 3) float32
-            Linear colour.
-        normal : (n, 3) float32
-            Unit normals in the camera frame, on the side that is seen.
-        view : (n, 3) float32
-            Unit vectors from the points to the camera.
-        up : (3,) float
-            Where the sky is, in the camera frame.
-
-        Returns
-        -------
-        (n, 3) float32
-            Linear light towards the camera.
+        ``albedo`` is linear colour; ``normal``, on the seen side, ``view``, from the points to the
+        camera, and ``up``, towards the sky, are unit vectors in the camera frame.
         """
         key, fill = _unit(self.key), _unit(self.fill)
         towards_sky = 0.5 + 0.5 * (normal @ up.astype(np.float32))

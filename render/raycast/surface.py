@@ -1,4 +1,4 @@
-"""What colour a mesh has at a point of its surface: materials, vertex colours, textures."""
+"""Colours of a mesh at points of its surface: materials, vertex colours, textures."""
 
 from __future__ import annotations
 
@@ -15,10 +15,6 @@ class Surface:
 
     Vertex colours, where there are any, take the place of the materials' plain colour; a texture
     multiplies with it. Textures repeat outside [0, 1]; their v runs up from the bottom row.
-
-    Parameters
-    ----------
-    mesh : Mesh
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -42,31 +38,21 @@ class Surface:
 
     @property
     def varies(self) -> bool:
-        """Whether the colour changes within a face, so that a lookup needs weights."""
+        """The colour changes within a face, so that a lookup needs weights."""
         return self._corner_color is not None or bool(self._textures)
 
     @property
     def opaque(self) -> bool:
-        """Whether nothing can be seen through the surface."""
+        """Nothing can be seen through the surface."""
         color = self._face_color if self._corner_color is None else self._corner_color
         return bool((color[..., 3] >= 1).all()) and all(
             bool((texture[..., 3] >= 1).all()) for texture in self._textures.values()
         )
 
     def color(self, face: FaceArray, weights: LinearArray | None) -> LinearArray:
-        """Look up the colour at points of the surface.
+        """Look up linear colour and opacity (n, 4), not premultiplied, at points of triangles (n,).
 
-        Parameters
-        ----------
-        face : (n,) int
-            Triangle numbers.
-        weights : (n, 3) float, optional
-            Barycentric coordinates; needed where `varies`.
-
-        Returns
-        -------
-        (n, 4) float32
-            Linear red, green, blue, and opacity; not premultiplied.
+        Their barycentric coordinates ``weights`` (n, 3) are needed where the colour `varies`.
         """
         if weights is None or not self.varies:
             return np.asarray(self._face_color[face])

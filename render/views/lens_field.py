@@ -1,4 +1,4 @@
-"""Which points the lens model can be trusted with."""
+"""Points for which the lens model is valid."""
 
 from __future__ import annotations
 
@@ -12,21 +12,12 @@ _STEPS = 24
 
 
 def within_lens_field(camera: Camera, normalized: FloatArray) -> npt.NDArray[np.bool_]:
-    """Say where the lens model still maps outer points farther out than inner ones.
+    """Find the points up to which the lens model maps outer points farther out than inner ones.
 
     A distortion polynomial turns back at some radius and from there on folds far-off directions
     into the image. Points beyond are not seen by the camera, wherever the model puts them.
-
-    Parameters
-    ----------
-    camera : Camera
-    normalized : (n, 2) float
-        Normalised image coordinates, undistorted.
-
-    Returns
-    -------
-    (n,) bool
-        Whether the distorted radius grows all the way from the centre to the point.
+    For undistorted normalised coordinates (n, 2), tell if the distorted radius grows all the way
+    from the centre to the point, (n,) bool.
     """
     if not camera.distortion:
         return np.ones(len(normalized), dtype=bool)

@@ -1,4 +1,4 @@
-"""How well two silhouettes agree."""
+"""Agreement of two silhouettes."""
 
 from __future__ import annotations
 

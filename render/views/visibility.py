@@ -1,4 +1,4 @@
-"""Which keypoints a camera sees: rays to the keypoints themselves, no picture."""
+"""Keypoints that a camera sees, by rays to the keypoints themselves; no picture is drawn."""
 
 from __future__ import annotations
 

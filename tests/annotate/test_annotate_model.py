@@ -14,10 +14,10 @@ from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.display import display_bytes
 from cadalign.annotate.files import read_given_keypoints
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.simplify import simplify
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.datasets import KeypointNet, load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.simplify import simplify
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 

@@ -22,7 +22,7 @@ from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at
-from cadalign.render.probe import Probe
+from cadalign.render.probe import Probe, probe_renderer
 from cadalign.render.views.camera_files import CameraView, write_open3d
 
 
@@ -38,6 +38,21 @@ def _run(model, *arguments, renderer="raycast"):
     """Run the command as the command line does."""
     command = tyro.cli(Render, args=[str(model), "--renderer", renderer, *map(str, arguments)])
     return command.run()
+
+
+def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
+    if not probe_renderer("pyrender").works:
+        pytest.skip("pyrender does not work here")
+    names = {}
+    for opacity in (255, 90):
+        box = trimesh.creation.box((0.4, 0.8, 0.6))
+        box.visual.vertex_colors = [180, 40, 40, opacity]
+        path = tmp_path / f"box{opacity}.ply"
+        box.export(path)
+        out = tmp_path / f"box{opacity}.png"
+        assert _run(path, "--out", out, "--size", "64x48", renderer="pyrender") == 0
+        names[opacity] = capsys.readouterr().err.split("drawn by ")[1].strip(")\n")
+    assert names == {255: "pyrender", 90: "raycast"}
 
 
 def _pixels(path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,24 +15,12 @@ from scipy.spatial import cKDTree
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import SampleModel, sample_models, write_sample_dataset
-from cadalign.datasets.sample.bottle import build_bottle, draw_bottle
-from cadalign.datasets.sample.car import build_car
-from cadalign.datasets.sample.car_style import draw_car
-from cadalign.datasets.sample.chair import build_chair
-from cadalign.datasets.sample.chair_style import draw_chair
-from cadalign.datasets.sample.model import Draft, closest_barycentric, split_creases
+from cadalign.datasets.sample.model import closest_barycentric, split_creases
 from cadalign.datasets.sample.solids import box, ellipsoid, rounded_box
-from cadalign.datasets.sample.vessel import build_vessel
-from cadalign.datasets.sample.vessel_style import draw_vessel
+from cadalign.datasets.sample.writer import MAKERS
 from cadalign.errors import CadalignError, DataError, InputError
 
 CATEGORIES = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
-DRAFTS: dict[str, Callable[[np.random.Generator, int], Draft]] = {
-    "bottle": lambda rng, index: build_bottle(draw_bottle(rng, index)),
-    "car": lambda rng, index: build_car(draw_car(rng, index)),
-    "chair": lambda rng, index: build_chair(draw_chair(rng, index)),
-    "vessel": lambda rng, index: build_vessel(draw_vessel(rng, index)),
-}
 FEWEST_KEYPOINTS = {"bottle": 8, "car": 12, "chair": 10, "vessel": 8}
 
 
@@ -296,7 +283,7 @@ def test_faces_have_an_area_and_their_number_is_moderate(models: tuple[SampleMod
 def test_parts_are_closed_and_face_outward(category: str) -> None:
     for index in range(12):
         rng = np.random.default_rng(index)
-        for solid in DRAFTS[category](rng, index).solids:
+        for solid in MAKERS[category](rng, index).solids:
             edges = np.concatenate([solid.faces[:, [i, (i + 1) % 3]] for i in range(3)])
             forward = Counter(map(tuple, edges.tolist()))
             backward = Counter(map(tuple, edges[:, ::-1].tolist()))

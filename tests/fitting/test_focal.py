@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support.problems import LENS, assert_same, moved, problem_of
+from support.problems import LENS, assert_same, moved, problem_of, with_outliers
 
 from cadalign import Alignment, Camera, FitResult, FocalPrior, RansacOptions, fit, fit_batch
 from cadalign.datasets import Bundler, Colmap
@@ -40,13 +40,9 @@ def whitened(
 def spoiled(problem: Problem, share: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Image points of which some were moved by 15 px or more, and which these are."""
     rng = np.random.default_rng(seed)
-    points_2d = problem.points_2d.copy()
-    low, high = points_2d.min(axis=0), points_2d.max(axis=0)
-    wrong = rng.permutation(len(points_2d)) < round(share * len(points_2d))
-    for i in np.flatnonzero(wrong):
-        while np.linalg.norm(points_2d[i] - problem.points_2d[i]) < 15:
-            points_2d[i] = rng.uniform(low, high)
-    return points_2d, wrong
+    count = len(problem.points_2d)
+    wrong = rng.permutation(count) < round(share * count)
+    return with_outliers(problem.points_2d, np.flatnonzero(wrong), rng), wrong
 
 
 # --- accuracy ---------------------------------------------------------------------------------

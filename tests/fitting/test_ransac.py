@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.problems import with_outliers
 
 import cadalign
 from cadalign import Alignment, Camera, RansacOptions, fit, fit_batch
@@ -26,11 +27,7 @@ def spoiled(seed: int, *, points: int, outliers: int, noise_px: float = 1.0) -> 
         rng, points=points, noise_px=noise_px, camera=CAMERA, depth=(6.0, 9.0)
     )
     wrong = rng.choice(points, outliers, replace=False)
-    points_2d = problem.points_2d.copy()
-    low, high = points_2d.min(axis=0), points_2d.max(axis=0)
-    for i in wrong:
-        while np.linalg.norm(points_2d[i] - problem.points_2d[i]) < 15:
-            points_2d[i] = rng.uniform(low, high)
+    points_2d = with_outliers(problem.points_2d, wrong, rng)
     mask = np.zeros(points, dtype=bool)
     mask[wrong] = True
     return problem, points_2d, mask

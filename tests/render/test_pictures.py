@@ -182,7 +182,7 @@ def test_a_contact_sheet_holds_every_picture_and_refuses_odd_ones():
     sheet = contact_sheet(images, ["a", "b", "c"])
     for value in (10, 90, 170):
         assert (sheet == value).all(axis=2).sum() == 1200
-    with pytest.raises(InputError, match="differ in size"):
+    with pytest.raises(InputError, match="must have the same size"):
         contact_sheet([images[0], images[1][1:]], ["a", "b"])
     with pytest.raises(InputError, match="labels"):
         contact_sheet(images, ["a"])
@@ -205,7 +205,7 @@ def test_a_movie_can_be_read_again(tmp_path):
 
 def test_a_movie_that_cannot_be_made_leaves_no_file(tmp_path, monkeypatch):
     frame = np.zeros((20, 30, 3), np.uint8)
-    with pytest.raises(InputError, match="there are none"):
+    with pytest.raises(InputError, match="no frames are given"):
         write_movie(tmp_path / "m.mp4", [], fps=25)
     with pytest.raises(InputError, match="frame 1 is"):
         write_movie(tmp_path / "m.mp4", [frame, frame[1:]], fps=25)

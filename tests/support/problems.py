@@ -54,3 +54,15 @@ def assert_drawn_stretches_are_recovered(images: Iterable[Correspondences]) -> N
         found = fit(image.points_3d / scale, image.points_2d, image.camera, method="aepnp")
         np.testing.assert_allclose(found.alignment.scale, scale, rtol=0.01)
         assert rotation_error(est=found.alignment, gt=image.cam_from_world) < 0.5
+
+
+def with_outliers(
+    points_2d: np.ndarray, outliers: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """The image points (n, 2), those with the numbers ``outliers`` moved by 15 px or more."""
+    moved_2d = points_2d.copy()
+    low, high = points_2d.min(axis=0), points_2d.max(axis=0)
+    for i in outliers:
+        while np.linalg.norm(moved_2d[i] - points_2d[i]) < 15:
+            moved_2d[i] = rng.uniform(low, high)
+    return moved_2d

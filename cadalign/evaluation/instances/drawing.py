@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
 from cadalign.io.files import write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
@@ -78,20 +78,10 @@ def draw_instance(
 def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
     """A picture of that width, and its camera."""
     height = round(camera.height * width / camera.width)
-    across, down = width / camera.width, height / camera.height
     small = np.asarray(
         cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
     )
-    return small, replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        # Pixels' corners, not their centres, are where they were.
-        cx=(camera.cx + 0.5) * across - 0.5,
-        cy=(camera.cy + 0.5) * down - 0.5,
-    )
+    return small, resized_camera(camera, width, height)
 
 
 def _write_webp(path: Path, image: ByteImage, *, quality: int) -> None:

@@ -11,16 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.clustering import merge_vertices
+from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import cluster, simplify
 from cadalign.io.files import dense_json, write_text
 
 MAX_FACES = 1500
 MAX_EDGES = 1500
 _FINEST = 1 << 15  # cells along the longest side: the steps of 16-bit coordinates
-_COARSEST = 4
-_FIRST_TRY = 96
-_SHRINK = 0.88
 _CREASE_DEG = 30.0
 
 
@@ -61,7 +59,7 @@ class Sketch:
 def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES) -> Sketch:
     """Simplify a mesh by merging the vertices in each cell of a grid.
 
-    The finest grid is taken that leaves few enough triangles; a mesh that has few is kept as it is.
+    The grid is fine enough to leave about as many triangles as may be; a mesh that has few is kept.
 
     Parameters
     ----------
@@ -76,16 +74,15 @@ def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_ED
     >>> len(sketch.faces), len(sketch.edges)  # the diagonal is no crease
     (2, 4)
     """
-    vertices, faces, wires = _merged(mesh.vertices, mesh.faces, _FINEST)
-    cells = float(_FIRST_TRY)
-    while len(faces) > max_faces and cells > _COARSEST:
-        vertices, faces, wires = _merged(mesh.vertices, mesh.faces, cells)
-        cells *= _SHRINK
-    # Only where even the coarsest grid has too many: the largest ones.
-    largest = np.argsort(-np.linalg.norm(_normals(vertices, faces), axis=1), kind="stable")
-    faces = faces[np.sort(largest[:max_faces])]
-    edges = np.concatenate([wires, _feature_edges(vertices, faces)])
-    return Sketch(vertices, faces, edges[:max_edges])
+    small = cluster(mesh, cells=_FINEST)
+    if len(small.faces) > max_faces:
+        small = simplify(mesh, max_faces=max_faces)
+    edges = mesh_edges(small.vertices, small.faces, crease_angle=_CREASE_DEG)
+    creases = edges.ends[edges.creased]
+    length = np.linalg.norm(small.vertices[creases[:, 0]] - small.vertices[creases[:, 1]], axis=1)
+    longest = creases[np.argsort(-length, kind="stable")]
+    lines = np.concatenate([small.wires, longest])[:max_edges]
+    return Sketch(small.vertices, small.faces, lines)
 
 
 def write_sketch(path: Path, mesh: Mesh) -> None:
@@ -97,65 +94,6 @@ def write_sketch(path: Path, mesh: Mesh) -> None:
         If the file cannot be written.
     """
     write_text(path, dense_json(sketch_of(mesh).to_dict()))
-
-
-def _merged(
-    vertices: FloatArray, faces: IntArray, cells: float
-) -> tuple[FloatArray, IntArray, IntArray]:
-    """Vertices of one cell become their mean; gives vertices, triangles, and what is only lines.
-
-    Of triangles in one place one is left. One that becomes a line is a wire if no triangle has that
-    side: so masts and railings don't vanish.
-    """
-    used, faces = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-    places = np.floor((vertices - low) * (cells / max(size, 1e-300)) + 0.5).astype(np.int64)
-    centers, cell = merge_vertices(vertices, places)
-    faces = cell[faces]
-    ordered = np.sort(faces, axis=1)
-    solid = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
-    _, first = np.unique(ordered[solid], axis=0, return_index=True)
-    thin = ordered[~solid][:, [0, 2]]
-    thin = np.unique(thin[thin[:, 0] != thin[:, 1]], axis=0)
-    faces = faces[solid][np.sort(first)]
-    sides = _sides(faces)
-    wires = thin[~np.isin(thin @ [len(centers), 1], sides @ [len(centers), 1])]
-    kept, places = np.unique(np.concatenate([faces.ravel(), wires.ravel()]), return_inverse=True)
-    faces, wires = np.split(places, [faces.size])
-    return centers[kept], faces.reshape(-1, 3), wires.reshape(-1, 2)
-
-
-def _sides(faces: IntArray) -> IntArray:
-    """The sides of triangles, (3 m, 2) int, the lower vertex first."""
-    return np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-
-
-def _normals(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Normals of the triangles with twice their area as length, (m, 3) float."""
-    corners = vertices[faces]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _feature_edges(vertices: FloatArray, faces: IntArray) -> IntArray:
-    """Edges where the surface bends or ends, (k, 2) int, the longest first."""
-    if not len(faces):
-        return np.empty((0, 2), dtype=np.int64)
-    normals = _normals(vertices, faces)
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    edges, edge, count = np.unique(_sides(faces), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.ravel(), kind="stable")
-    owner = np.tile(np.arange(len(faces)), 3)[order]
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
-    flat = np.zeros(len(edges), dtype=bool)
-    pairs = count == 2
-    first, second = owner[start[pairs]], owner[start[pairs] + 1]
-    # Files do not agree on which way triangles face.
-    bend = np.abs((normals[first] * normals[second]).sum(axis=1))
-    flat[pairs] = bend > np.cos(np.radians(_CREASE_DEG))
-    edges = edges[~flat]
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    return np.asarray(edges[np.argsort(-length, kind="stable")])
 
 
 def _base64(values: npt.NDArray[Any], kind: str) -> str:

@@ -228,7 +228,7 @@ def frame_object(
 
 
 def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
-    """How far towards the border of the image the farthest corner reaches."""
+    """Share of the way to the image's border that the farthest corner reaches."""
     if corners[:, 2].min() <= 0:
         return np.inf
     normalized = corners[:, :2] / corners[:, 2:]

@@ -1,0 +1,123 @@
+"""Mesh simplification by grid clustering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.edges import first_of_each, triangle_sides
+from cadalign.geometry.mesh import Mesh
+
+FINEST = float(1 << 20)
+"""The largest number of cells along an axis, so that a cell's number fits into 63 bits."""
+
+_CELL_NUMBER = np.array([1 << 42, 1 << 21, 1])
+_FACES_PER_CELL = 9.4  # over the number of cells along an axis, squared: a sphere's
+_MOST_TRIES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """A mesh with fewer triangles.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float
+        [model units]
+    faces : (m, 3) int
+    source : (m,) int
+        For each triangle, one of the full mesh that it replaces.
+    wires : (k, 2) int
+        Lines left of parts too thin for triangles: no triangle has these as a side.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    source: IntArray
+    wires: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+
+
+def cluster(mesh: Mesh, *, cells: float) -> Simplified:
+    """Merge the vertices in each cell of a grid into their mean; drop what has lost its area.
+
+    As in Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes"
+    (1993). Of triangles in one place the first remains. A triangle that becomes a line remains as a
+    wire, so that masts and railings don't vanish.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    cells : float
+        Cells along the longest side of the mesh, at most `FINEST`.
+
+    Examples
+    --------
+    >>> mesh = Mesh([[0, 0, 0], [4, 0, 0], [0, 3, 0], [0.1, 3, 0]], [[0, 1, 2], [0, 2, 3]])
+    >>> small = cluster(mesh, cells=4)
+    >>> small.vertices.tolist(), small.faces.tolist()
+    ([[0.0, 0.0, 0.0], [0.05, 3.0, 0.0], [4.0, 0.0, 0.0]], [[0, 2, 1]])
+    """
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    vertices = mesh.vertices[used]
+    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    cell = np.floor((vertices - low) * (cells / max(size, 1e-300)) + 0.5).astype(np.int64)
+    number, place, count = np.unique(cell @ _CELL_NUMBER, return_inverse=True, return_counts=True)
+    sums = [np.bincount(place, weights=axis, minlength=len(count)) for axis in vertices.T]
+    centers = np.stack(sums, axis=1) / count[:, None]
+    faces = place[faces.reshape(-1, 3)]
+    ordered = np.sort(faces, axis=1)
+    solid = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
+    kept = np.flatnonzero(solid)
+    kept = kept[first_of_each(ordered[kept])]
+    # Pairs of vertices as one number each.
+    thin = np.unique(ordered[~solid][:, [0, 2]] @ [len(number), 1])
+    thin = thin[thin // len(number) != thin % len(number)]
+    thin = thin[~np.isin(thin, triangle_sides(faces[kept]) @ [len(number), 1])]
+    wires = np.stack([thin // len(number), thin % len(number)], axis=1)
+    remaining = np.concatenate([faces[kept].ravel(), wires.ravel()])
+    remaining, place = np.unique(remaining, return_inverse=True)
+    corners, ends = np.split(place, [3 * len(kept)])
+    return Simplified(centers[remaining], corners.reshape(-1, 3), kept, ends.reshape(-1, 2))
+
+
+def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
+    """Cluster a mesh to at most so many triangles; unchanged if it has no more.
+
+    The grid is made coarser or finer until about as many triangles are left as may be. If none has
+    a fitting number, the largest triangles of the mesh remain.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    max_faces : int
+        At least 1.
+
+    Examples
+    --------
+    >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> simplify(mesh, max_faces=10).faces.tolist()
+    [[0, 1, 2]]
+    """
+    if len(mesh.faces) <= max_faces:
+        return Simplified(mesh.vertices, mesh.faces, np.arange(len(mesh.faces)))
+    best, most = None, 0
+    cells = np.sqrt(max_faces / _FACES_PER_CELL)
+    for _ in range(_MOST_TRIES):
+        result = cluster(mesh, cells=min(cells, FINEST))
+        count = len(result.faces)
+        if most < count <= max_faces:
+            best, most = result, count
+        if 0.6 * max_faces < count <= max_faces:
+            break
+        # The number of triangles goes with the square of the number of cells.
+        cells *= np.sqrt(0.8 * max_faces / max(count, 1))
+    return best or _largest(mesh, max_faces)
+
+
+def _largest(mesh: Mesh, count: int) -> Simplified:
+    a, b, c = mesh.triangles.transpose(1, 0, 2)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    largest = np.sort(np.argsort(-area, kind="stable")[:count])
+    return Simplified(mesh.vertices, mesh.faces[largest], largest)

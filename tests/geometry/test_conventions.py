@@ -1,0 +1,71 @@
+"""Pixel centres and axes of other programs: one module converts, and it agrees with renderings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Mesh
+from cadalign.geometry.conventions import (
+    OPENGL_AXES,
+    opengl_from_model,
+    rescaled_pixels,
+    resized_camera,
+)
+from cadalign.render import RaycastRenderer, Scene
+
+CAMERA = Camera(160, 120, 170.0, 140.0, 60.25, 71.75, (-0.25, 0.06, 0.004, -0.003))
+SOURCES = Path(__file__).parents[2]
+
+
+def centroid(camera: Camera, center: np.ndarray) -> np.ndarray:
+    """The opacity-weighted mean pixel of a small square, rendered."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.036
+    mesh = Mesh(center + corners, [[0, 1, 2], [0, 2, 3]])
+    frame = RaycastRenderer().render(Scene(mesh), camera, Alignment.identity(), samples=256)
+    return image_centroid(frame.color[:, :, 3].astype(float))
+
+
+def image_centroid(weight: np.ndarray) -> np.ndarray:
+    rows, columns = np.indices(weight.shape)
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+
+
+@pytest.mark.parametrize("factor", [2, 3, 0.5])
+def test_a_resized_camera_renders_where_the_resized_pixels_are(factor: float) -> None:
+    pixel = np.array([80.0, 60.0])
+    center = 3.0 * np.append(CAMERA.normalize([pixel])[0], 1.0)
+    resized = resized_camera(CAMERA, round(160 * factor), round(120 * factor))
+    expected = rescaled_pixels(pixel, factor)
+    np.testing.assert_allclose(resized.project(center[None])[0], expected, atol=1e-9)
+    if factor > 1:  # a marker of few pixels covers them unevenly
+        np.testing.assert_allclose(centroid(resized, center), expected, atol=0.02)
+
+
+def test_pixels_move_as_opencv_resizes_an_image() -> None:
+    image = np.zeros((120, 160), dtype=np.float32)
+    image[40:44, 90:96] = 1
+    small = cv2.resize(image, (80, 60), interpolation=cv2.INTER_AREA)
+    moved = rescaled_pixels(image_centroid(image), 0.5)
+    np.testing.assert_allclose(image_centroid(small), moved, atol=1e-6)
+
+
+def test_opengl_axes_are_the_model_view_matrix_without_a_pose() -> None:
+    matrix = opengl_from_model(Alignment.identity())
+    np.testing.assert_array_equal(matrix[:3, :3], np.diag(OPENGL_AXES))
+    np.testing.assert_array_equal(OPENGL_AXES**2, 1)
+
+
+def test_no_other_module_writes_the_conversions_out() -> None:
+    patterns = re.compile(r"[\[(]1(\.0)?, -1(\.0)?, -1(\.0)?[\])]|c[xy] [+-] 0?\.5|PIXEL_CENTRE = ")
+    found = [
+        path.relative_to(SOURCES).as_posix()
+        for folder in ("cadalign", "datasets", "render")
+        for path in (SOURCES / folder).rglob("*.py")
+        if patterns.search(path.read_text(encoding="utf-8"))
+    ]
+    assert {Path(name).name for name in found} == {"conventions.py"}, found

@@ -50,10 +50,7 @@ def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory.
 
-    Raises
-    ------
-    DataError
-        If the file is missing, truncated, damaged, of another version, or of another format.
+    Raises DataError if the file is missing, truncated, damaged, or of another version or format.
     """
     where = str(path)
     try:

@@ -132,14 +132,15 @@ class AnnotationFiles:
             ]
             write_json(self.unfinished, {"format": _UNFINISHED, "pairs": entries})
         else:
-            self.unfinished.unlink(missing_ok=True)
+            with writing(self.unfinished):
+                self.unfinished.unlink(missing_ok=True)
 
     def write_fit(self, result: FitResult | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
-        if result is None:
-            self.fit.unlink(missing_ok=True)
-            return
         with writing(self.fit):
+            if result is None:
+                self.fit.unlink(missing_ok=True)
+                return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
 

@@ -31,7 +31,7 @@ from cadalign.retrieval.models import SCHEMA, ModelTable
 VERSION = 1
 _MAGIC = b"cadalign library"
 _HEADER = struct.Struct("<16sIIQ32s")
-_AGAIN = "build it again, with: cadalign library build"
+_AGAIN = "build it with: cadalign library build"
 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:

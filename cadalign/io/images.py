@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -111,6 +110,7 @@ def write_image(path: Path, image: ByteImage) -> None:
     DataError
         If the file cannot be written.
     """
+    import cv2  # on first use: it takes longer to import than all the rest
 
     colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     encoded, data = cv2.imencode(".png", cv2.cvtColor(image, colors))

@@ -92,6 +92,10 @@ class Document:
                 return pair
         raise InputError(f"there is no pair {number}", where="pair", fix="reload the page")
 
+    def append(self, pair: Pair) -> Document:
+        """Append a pair, whose number is `next_number`."""
+        return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
+
     def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Document, int]:
         """Place the photo half of a pair that lacks it, or of a new one.
 
@@ -114,10 +118,7 @@ class Document:
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Document, int]:
         """Place the model half of a pair that lacks it, or of a new one; as `place_uv`.
 
-        Raises
-        ------
-        InputError
-            If the keypoint is already placed in the photo.
+        Raises InputError if the keypoint is already placed in the photo.
         """
         for position, pair in enumerate(self.pairs, start=1):
             if pair.keypoint == keypoint:
@@ -152,9 +153,7 @@ class Document:
     def _fill(self, lacking: list[int], preferred: int | None, half: Pair) -> tuple[Document, int]:
         """Merge half a pair into one that lacks it, or append it."""
         if not lacking:
-            return replace(
-                self, pairs=(*self.pairs, half), next_number=self.next_number + 1
-            ), half.number
+            return self.append(half), half.number
         number = preferred if preferred in lacking else lacking[0]
         pair = self.pair(number)
         merged = replace(

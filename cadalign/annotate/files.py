@@ -21,7 +21,6 @@ from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, Mode
 from cadalign.errors import DataError, InputError
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import Document as JsonDocument
 from cadalign.io.documents import (
     Index,
@@ -88,16 +87,9 @@ class AnnotationFiles:
     def read(
         self, empty: Document, registry: KeypointRegistry, diagonal: float
     ) -> tuple[Document, Camera | None]:
-        """Read an earlier session's annotation.
+        """Read an earlier session's annotation into the ``empty`` document.
 
-        Parameters
-        ----------
-        empty : Document
-            The document to start from.
-        registry : KeypointRegistry
-            Model points that it lacks are added to it.
-        diagonal : float
-            Diagonal of the model's box [model units].
+        New model points are added to the registry; ``diagonal`` is that of the model's box.
 
         Returns
         -------
@@ -105,10 +97,7 @@ class AnnotationFiles:
         Camera or None
             The observation's camera, if the file exists.
 
-        Raises
-        ------
-        DataError
-            If a file is malformed or belongs to another model.
+        Raises DataError if a file is malformed or belongs to another model.
         """
         document, camera = empty, None
         if self.observation.exists():
@@ -143,14 +132,15 @@ class AnnotationFiles:
             ]
             write_json(self.unfinished, {"format": _UNFINISHED, "pairs": entries})
         else:
-            self.unfinished.unlink(missing_ok=True)
+            with writing(self.unfinished):
+                self.unfinished.unlink(missing_ok=True)
 
     def write_fit(self, result: FitResult | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
-        if result is None:
-            self.fit.unlink(missing_ok=True)
-            return
         with writing(self.fit):
+            if result is None:
+                self.fit.unlink(missing_ok=True)
+                return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
 
@@ -186,41 +176,6 @@ def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
         where=str(where),
         fix="give another --observation or --out",
     )
-
-
-def read_own_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeypoint, ...]:
-    """Read the keypoints file of an earlier session.
-
-    Raises
-    ------
-    DataError
-        If it belongs to another model, or for the reasons of `read_given_keypoints`.
-    """
-    if isinstance(read_json(path), dict):
-        own = ModelKeypoints.load(path, mesh=mesh)
-        refuse_other_model(own.model, model, where=path)
-        return own.keypoints
-    return read_given_keypoints(path, model, mesh)
-
-
-def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeypoint, ...]:
-    """Read the keypoints that come with a model.
-
-    Parameters
-    ----------
-    path : Path
-        A file of model keypoints, or KeypointNet's annotations of the model's category, of which
-        those are taken whose model id occurs in the mesh file's path.
-    model : Path
-        The mesh file.
-    mesh : Mesh
-
-    Raises
-    ------
-    DataError
-        If the file has another format, or no keypoints of this model.
-    """
-    return ModelKeypoints.load(path, mesh=mesh, model=model).keypoints
 
 
 def keypoints_file(model: Path, folder: Path) -> Path:
@@ -262,12 +217,8 @@ def _with_pairs(
             sigma=_entry(observation.sigma, row),
             confidence=_entry(observation.confidences, row),
         )
-        document = _with(document, pair)
+        document = document.append(pair)
     return document
-
-
-def _with(document: Document, pair: Pair) -> Document:
-    return replace(document, pairs=(*document.pairs, pair), next_number=document.next_number + 1)
 
 
 def _entry(values: FloatArray | None, row: int) -> float | None:
@@ -302,5 +253,5 @@ def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> 
             if half.semantic_id not in registry or half.semantic_id in document.keypoints:
                 continue  # its other half was saved, or the keypoints file was deleted
             pair = replace(pair, keypoint=half.semantic_id)
-        document = _with(document, pair)
+        document = document.append(pair)
     return document

@@ -55,10 +55,7 @@ class Intrinsics:
 def read_camera(path: Path) -> Camera:
     """Read a camera in COLMAP's form, or the first one of an Open3D, NeRF or COLMAP file.
 
-    Raises
-    ------
-    DataError
-        If the file is missing or has none of these formats.
+    Raises DataError if the file is missing or has none of these formats.
     """
     if not path.is_dir():
         data = read_json(path)
@@ -71,10 +68,7 @@ def read_camera(path: Path) -> Camera:
 def intrinsics_of(photo: Photo, camera: Camera | None) -> Intrinsics:
     """Combine a photo's EXIF data with its calibrated camera, which may lack a focal length.
 
-    Raises
-    ------
-    DataError
-        If the camera's image has another size than the photo.
+    Raises DataError if the camera's image has another size than the photo.
     """
     if camera is None:
         camera = Camera.without_focal(photo.width, photo.height)

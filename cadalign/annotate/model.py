@@ -37,10 +37,7 @@ class CadModel:
     diagonal : float
         The length of the box's diagonal [model units].
 
-    Raises
-    ------
-    InputError
-        If the mesh is a single point.
+    Raises InputError if the mesh is a single point.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -72,10 +69,7 @@ class CadModel:
         ModelKeypoint or None
             The first intersection; None if the ray misses.
 
-        Raises
-        ------
-        InputError
-            If the ray is not made of finite numbers, or its direction is zero.
+        Raises InputError if the ray is not made of finite numbers, or its direction is zero.
         """
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))

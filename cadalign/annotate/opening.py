@@ -5,15 +5,12 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import numpy as np
-
 from cadalign.annotate.document import Document, FocalChoice
 from cadalign.annotate.files import (
     SAME_PLACE,
     AnnotationFiles,
     keypoints_file,
-    read_given_keypoints,
-    read_own_keypoints,
+    refuse_other_model,
 )
 from cadalign.annotate.history import History
 from cadalign.annotate.intrinsics import intrinsics_of, read_camera
@@ -22,10 +19,9 @@ from cadalign.annotate.model import CadModel
 from cadalign.annotate.photos import Photo, find_photos
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.datasets.meshes.load import load_mesh
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
 
 logger = logging.getLogger("cadalign")
 
@@ -43,10 +39,7 @@ def open_session(
 
     The parameters are the options of `cadalign annotate`.
 
-    Raises
-    ------
-    CadalignError
-        If a file is missing or malformed, or the arguments contradict each other.
+    Raises CadalignError if a file is missing or malformed, or the arguments contradict each other.
     """
     paths = find_photos(image)
     if observation is not None and (image.is_dir() or out is not None):
@@ -63,12 +56,10 @@ def open_session(
         files = [observation]
     folder = files[0].parent
     given_camera = None if camera is None else read_camera(camera)
-    mesh = load_mesh(model)
-    cad = CadModel(mesh)
+    cad = CadModel(load_mesh(model))
     registry_file = keypoints_file(model, folder)
-    registry = _open_registry(
-        registry_file, keypoints or keypoints_file(model, model.parent), model, mesh
-    )
+    source = keypoints or keypoints_file(model, model.parent)
+    registry = _open_registry(registry_file, source, model, cad)
     photo_states = [
         _open_photo_state(photo, file, model, given_camera, registry, cad.diagonal)
         for photo, file in zip(photos, files, strict=True)
@@ -76,16 +67,17 @@ def open_session(
     return Session(cad, registry, photo_states, registry_file)
 
 
-def _open_registry(own: Path, source: Path, model: Path, mesh: Mesh) -> KeypointRegistry:
+def _open_registry(own: Path, source: Path, model: Path, cad: CadModel) -> KeypointRegistry:
     """Read the keypoints given with the model and those of earlier sessions."""
-    came: tuple[ModelKeypoint, ...] = ()
+    mesh = cad.scene.mesh
+    given: tuple[ModelKeypoint, ...] = ()
     if source != own and (source.exists() or source != keypoints_file(model, model.parent)):
-        came = read_given_keypoints(source, model, mesh)
-    registry = KeypointRegistry(came)
+        given = ModelKeypoints.load(source, mesh=mesh, model=model).keypoints
+    registry = KeypointRegistry(given)
     if own.exists():
-        low, high = mesh.bounds
-        before = read_own_keypoints(own, model, mesh)
-        registry.merge(before, tolerance=SAME_PLACE * float(np.linalg.norm(high - low)))
+        earlier = ModelKeypoints.load(own, mesh=mesh, model=model)
+        refuse_other_model(earlier.model, model, where=own)
+        registry.merge(earlier.keypoints, tolerance=SAME_PLACE * cad.diagonal)
     return registry
 
 

@@ -27,10 +27,7 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
     outcome : Outcome, optional
         Outcome of the last action.
 
-    Raises
-    ------
-    InputError
-        If there is no such photo.
+    Raises InputError if there is no such photo.
     """
     outcome = outcome or Outcome()
     with session.lock:

@@ -9,64 +9,39 @@ from pathlib import Path
 from PIL import ImageOps
 
 from cadalign.errors import DataError, InputError
-from cadalign.io.images import open_photo
+from cadalign.io.images import open_photo, photo_size
 
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
-_ORIENTATION = 0x0112  # the EXIF tag; 1 is upright
-_UPRIGHT = 1
-_SIDEWAYS = (5, 6, 7, 8)
+_ORIENTATION = 0x0112  # the EXIF tag
+_TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo with its upright size.
-
-    Parameters
-    ----------
-    path : Path
-    width, height : int
-        Size of the upright photo [px].
-    orientation : int
-        The EXIF orientation, 1 for a photo that is stored upright.
-    kind : str
-        Pillow's name of the file format.
-    """
+    """A photo with its upright size [px]."""
 
     path: Path
     width: int
     height: int
-    orientation: int
-    kind: str
 
     @classmethod
     def open(cls, path: Path) -> Photo:
-        """Read a photo's size and orientation; raises DataError if it is missing or no photo."""
-        with open_photo(path) as image:
-            orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
-            width, height = image.size
-            kind = image.format or ""
-        if orientation in _SIDEWAYS:
-            width, height = height, width
-        if orientation not in range(1, 9):  # invalid EXIF data
-            orientation = _UPRIGHT
-        return cls(path, width, height, orientation, kind)
+        """Read a photo's size; raises DataError if it is missing or no photo."""
+        return cls(path, *photo_size(path))
 
     def encoded(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
 
-        A file that browsers show upright is passed on unchanged.
-
-        Raises
-        ------
-        DataError
-            If the file is damaged.
+        A file that browsers show upright is passed on unchanged. Raises DataError if the file is
+        damaged.
         """
         with open_photo(self.path) as image:
             image.load()
-            if self.orientation == _UPRIGHT and self.kind in _SHOWN_AS_IS:
-                return _SHOWN_AS_IS[self.kind], self.path.read_bytes()
+            is_turned = image.getexif().get(_ORIENTATION) in _TURNED
+            if not is_turned and image.format in _SHOWN_AS_IS:
+                return _SHOWN_AS_IS[image.format], self.path.read_bytes()
             upright = ImageOps.exif_transpose(image).convert("RGB")
         data = io.BytesIO()
         upright.save(data, format="JPEG", quality=_QUALITY, subsampling=0)

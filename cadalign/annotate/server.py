@@ -44,10 +44,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
 def listen(port: int) -> socket.socket:
     """Open a socket on the loopback interface; port 0 chooses a free one.
 
-    Raises
-    ------
-    InputError
-        If the port is in use or invalid.
+    Raises InputError if the port is in use or invalid.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -134,10 +134,7 @@ class Session:
         action : mapping
             ``do``, the name of the action, and its arguments.
 
-        Raises
-        ------
-        CadalignError
-            If the action is unknown or invalid.
+        Raises CadalignError if the action is unknown or invalid.
         """
         with self.lock:
             state = self.photo_state(number)

@@ -29,7 +29,7 @@ class _FitOptions(FitOptions):
     focal_prior: tyro.conf.Suppress[FocalPrior | None] = FitOptions.focal_prior
 
     def __post_init__(self) -> None:
-        with named_as_flags():
+        with named_as_flags(self):
             super().__post_init__()
 
 
@@ -38,7 +38,7 @@ class _RansacOptions(RansacOptions):
     """Search for outliers (LO-RANSAC), with --robust."""
 
     def __post_init__(self) -> None:
-        with named_as_flags():
+        with named_as_flags(self):
             super().__post_init__()
 
 
@@ -87,7 +87,8 @@ class Fit:
         options = replace(
             self.fitting, sigma=self._sigma(observation), focal=focal, focal_prior=prior
         )
-        with console.status("fitting (the first time after an installation takes a minute)"):
+        status = console.status("fitting (the first time after an installation takes a minute)")
+        with status, named_as_flags(self, options):
             result = fit(
                 observation.points_3d,
                 observation.points_2d,

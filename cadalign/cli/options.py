@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
+from typing import TYPE_CHECKING
 
 from cadalign.errors import CadalignError, InputError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 class OptionError(CadalignError):
@@ -16,10 +21,13 @@ class OptionError(CadalignError):
 
 
 @contextmanager
-def named_as_flags() -> Iterator[None]:
-    """Let errors of a dataclass of options name the command line's options."""
+def named_as_flags(*options: DataclassInstance) -> Iterator[None]:
+    """Let errors about fields of dataclasses of options name the command line's options."""
     try:
         yield
     except InputError as error:
-        name = None if error.where is None else "--" + error.where.replace("_", "-")
-        raise OptionError(error.what, where=name, fix=error.fix) from None
+        names = {field.name for each in options for field in fields(each)}
+        if error.where not in names:
+            raise
+        flag = "--" + str(error.where).replace("_", "-")
+        raise OptionError(error.what, where=flag, fix=error.fix) from None

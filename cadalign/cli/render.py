@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.output import make_folder, new_console, progress_over
 
 
@@ -54,19 +55,20 @@ class Render:
         from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
-        job = RenderJob.prepare(
-            model=self.model,
-            out=self.out,
-            views=self.view,
-            size=self.size,
-            style=self.style,
-            background=self.background,
-            keypoints=self.keypoints,
-            scale=self.scale,
-            fov=self.fov,
-            samples=self.samples,
-            renderer=self.renderer,
-        )
+        with named_as_flags(self):
+            job = RenderJob.prepare(
+                model=self.model,
+                out=self.out,
+                views=self.view,
+                size=self.size,
+                style=self.style,
+                background=self.background,
+                keypoints=self.keypoints,
+                scale=self.scale,
+                fov=self.fov,
+                samples=self.samples,
+                renderer=self.renderer,
+            )
         make_folder(self.out.absolute().parent)
         if job.is_movie:
             frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)

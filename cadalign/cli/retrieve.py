@@ -28,7 +28,7 @@ class _RetrievalOptions(RetrievalOptions):
     sigma: tyro.conf.Suppress[Sigma] = RetrievalOptions.sigma
 
     def __post_init__(self) -> None:
-        with named_as_flags():
+        with named_as_flags(self):
             super().__post_init__()
 
 
@@ -86,7 +86,8 @@ class Retrieve:
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, camera)
         console = new_console()
-        with console.status("retrieving (the first time after an installation takes a minute)"):
+        status = console.status("retrieving (the first time after an installation takes a minute)")
+        with status, named_as_flags(self, self.ranking):
             matches = library.retrieve(
                 query.points_2d,
                 query.semantic_ids,

@@ -26,17 +26,15 @@ class Observed:
 
     Parameters
     ----------
-    semantic_ids : (n,) int
     points_2d : (n, 2) float
         [px]
     camera : Camera
     query : Query
-        The keypoints for the kernels.
+        Semantic ids and rays of the keypoints, for the kernels.
     spurious : float
         Log-likelihood of the keypoints if all of them are spurious.
     """
 
-    semantic_ids: IntArray
     points_2d: FloatArray
     camera: Camera
     query: Query
@@ -79,7 +77,7 @@ def observe(
         max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
-    return Observed(ids, pixels, camera, query, float(off) * len(ids))
+    return Observed(pixels, camera, query, float(off) * len(ids))
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
@@ -139,7 +137,7 @@ def gather_candidates(
         If no model shares at least 4 keypoints with the image.
     """
     chosen = _chosen_models(table, options.category, exclude)
-    _check_known(table, observed.semantic_ids, chosen, options.category)
+    _check_known(table, observed.query.ids, chosen, options.category)
     models, candidates, labelings = _candidates(table, chosen, options.symmetries)
     bounds, gains, shared = bound_all(observed.query, candidates)
     kept = shared >= LEAST_SHARED

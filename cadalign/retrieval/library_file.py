@@ -31,7 +31,7 @@ from cadalign.retrieval.models import SCHEMA, ModelTable
 VERSION = 1
 _MAGIC = b"cadalign library"
 _HEADER = struct.Struct("<16sIIQ32s")
-_AGAIN = "build it again, with: cadalign library build"
+_AGAIN = "build it with: cadalign library build"
 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
@@ -50,10 +50,7 @@ def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory.
 
-    Raises
-    ------
-    DataError
-        If the file is missing, truncated, damaged, of another version, or of another format.
+    Raises DataError if the file is missing, truncated, damaged, or of another version or format.
     """
     where = str(path)
     try:

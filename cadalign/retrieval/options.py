@@ -41,10 +41,7 @@ METHODS = ("optimal", "epnp")
 class RetrievalOptions:
     """Options of a retrieval.
 
-    Raises
-    ------
-    InputError
-        If a value is out of range or unknown.
+    Raises InputError if a value is out of range or unknown.
     """
 
     top: int = 10

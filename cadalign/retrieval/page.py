@@ -44,10 +44,7 @@ def write_retrieval(
     image : (h, w, 3) uint8, optional
         The photo; without it the overlays are drawn on grey.
 
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    Raises DataError if a file cannot be written.
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)

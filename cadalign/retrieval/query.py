@@ -19,10 +19,7 @@ def read_query(path: Path) -> Observation:
     The format is that of `cadalign.io.observation`, but keypoints must have a ``semantic_id`` and
     may lack ``xyz``, which is zero in the returned observation and not used.
 
-    Raises
-    ------
-    DataError
-        If the file is missing, is not JSON, or a field is missing, unknown or invalid.
+    Raises DataError if the file is missing, is not JSON, or a field is missing, unknown or invalid.
     """
     data = _with_model_points(read_json(path))
     with in_file(path):

@@ -226,7 +226,7 @@ def shared_keypoints(
     keypoints = candidates.keypoints
     first, last, row = keypoints.spans[candidate].tolist()
     _, on_model, in_image = np.intersect1d(
-        keypoints.ids[first:last], observed.semantic_ids, return_indices=True
+        keypoints.ids[first:last], observed.query.ids, return_indices=True
     )
     return keypoints.xyz[keypoints.rows[row + on_model]], in_image
 
@@ -257,11 +257,11 @@ def make_matches(
                 score=float(ranking.scores[place]),
                 box=Box.from_model(model.bounds, alignment),
                 bounds=model.bounds,
-                semantic_ids=observed.semantic_ids[rows],
+                semantic_ids=observed.query.ids[rows],
                 points_3d=points_3d,
                 points_2d=observed.points_2d[rows],
                 residuals=residuals,
-                missing_ids=tuple(np.delete(observed.semantic_ids, rows).tolist()),
+                missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
                 mirrored=bool(candidates.mirrored[candidate]),
                 mesh_path=model.mesh_path,
             )

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.display import display_bytes
-from cadalign.annotate.files import read_given_keypoints
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.wireframe import Wireframe, box_lines
-from cadalign.datasets import KeypointNet, load_mesh
+from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.simplify import simplify
 
@@ -227,8 +226,8 @@ def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> No
     assert annotated.mesh_path is not None
     mesh = load_mesh(annotated.mesh_path)
     file = sample_root / "annotations" / "chair.json"
-    points = read_given_keypoints(file, annotated.mesh_path, mesh)
+    points = ModelKeypoints.load(file, mesh=mesh, model=annotated.mesh_path).keypoints
     assert [point.semantic_id for point in points] == annotated.keypoints.semantic_ids.tolist()
     np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
     with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
-        read_given_keypoints(file, Path("other.ply"), mesh)
+        ModelKeypoints.load(file, mesh=mesh, model=Path("other.ply"))

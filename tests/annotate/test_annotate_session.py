@@ -429,7 +429,9 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
 def test_orientation_that_does_not_exist_is_ignored(case: Case) -> None:
     path = case.folder / "odd.jpg"
     exif_photo(path, orientation=99)
-    assert Photo.open(path).orientation == 1
+    photo = Photo.open(path)
+    assert (photo.width, photo.height) == (400, 300)
+    assert photo.encoded() == ("image/jpeg", path.read_bytes())
 
 
 def test_what_is_not_a_photo_is_refused(case: Case) -> None:

@@ -185,7 +185,7 @@ def test_a_library_without_models_can_be_saved_and_opened(tmp_path: Path) -> Non
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such library file; build it again, with: cadalign lib"):
+    with pytest.raises(DataError, match="no such library file; build it with: cadalign lib"):
         Library.open(tmp_path / "nowhere")
 
 

@@ -260,6 +260,12 @@ def test_refused_options_are_named_as_they_are_typed(
     assert refusal_line(capsys, "retrieve", *case.arguments, "--max-stretch", "0.5") == (
         "--max-stretch: must be between 1 and 1000, not 0.5"
     )
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--workers", "0") == (
+        "--workers: must be >= 1, or -1 for all cores, not 0"
+    )
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--category", "tabel").startswith(
+        "--category: unknown category 'tabel'; known are "
+    )
 
 
 def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
@@ -437,7 +443,7 @@ def test_malformed_queries_are_refused(
         return text.removeprefix(f"{path}: ")
 
     camera = CAMERA.to_dict()
-    assert refused([]) == "expected an object, got list"
+    assert refused([]) == "[] is not an object"
     assert refused({"camera": camera}) == "keypoints: missing"
     keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
     assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})
@@ -454,7 +460,7 @@ def test_what_the_library_refuses_is_one_line(
 ) -> None:
     seen = case.arguments[0]
     nowhere = refusal_line(capsys, "retrieve", seen, "--library", str(tmp_path / "no"))
-    assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it again, with")
+    assert nowhere.startswith(f"{tmp_path / 'no'}: no such library file; build it with")
     unknown = refusal_line(capsys, "retrieve", *case.arguments, "--category", "chiar")
     assert "did you mean 'chair'" in unknown
     masked = refusal_line(capsys, "retrieve", *case.arguments, "--mask", str(tmp_path / "no.png"))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.fitting.batch import BatchResult
     from cadalign.fitting.fit import fit, fit_batch
-    from cadalign.fitting.robust import RansacOptions
+    from cadalign.fitting.options import RansacOptions
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
 
@@ -49,7 +49,7 @@ __all__ = [
 
 # Imported when first asked for, so that `import cadalign` stays quick.
 _NAMES = {
-    "RansacOptions": "cadalign.fitting.robust",
+    "RansacOptions": "cadalign.fitting.options",
     "BatchResult": "cadalign.fitting.batch",
     "Library": "cadalign.retrieval.library",
     "Match": "cadalign.retrieval.match",

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import reprlib
+from typing import Any
+
+_QUOTED_LENGTH = 200
+
 
 class CadalignError(Exception):
     """Base class of every error that cadalign raises on purpose.
@@ -85,3 +90,23 @@ class DataError(CadalignError):
 
 class RenderError(CadalignError):
     """Something cannot be drawn: an empty mesh, an image size out of bounds, no view found."""
+
+
+def quote(value: Any) -> str:
+    """Quote a value for a message, in at most 200 characters.
+
+    Examples
+    --------
+    >>> len(quote("a" * 300))
+    200
+    >>> quote([1, None])
+    '[1, None]'
+    """
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = short.maxlong = _QUOTED_LENGTH
+    short.maxlist = short.maxtuple = short.maxdict = 12
+    try:
+        text = short.repr(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = f"a {type(value).__name__} of thousands of digits"
+    return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."

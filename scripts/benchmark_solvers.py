@@ -25,9 +25,10 @@ from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_lim
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
 from cadalign.fitting.noise import whitening_of
+from cadalign.solvers.constants import LINEAR, UNKNOWNS
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
-from cadalign.solvers.objective import LINEAR, UNKNOWNS, Objective, evaluate_cost
+from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 
 ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))

@@ -5,11 +5,11 @@ Killed, it goes on where it was when it is started again with the same arguments
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+
+import tyro
 
 from cadalign.errors import CadalignError
 from cadalign.evaluation.paper.reproduction import PaperPlan, reproduce_paper
@@ -18,15 +18,9 @@ from cadalign.evaluation.runs.run import Progress
 
 def main() -> int:
     """Run it; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("paper"), help="folder to write to")
-    parser.add_argument("--root", type=Path, help="KeypointNet, besides the sample dataset")
-    parser.add_argument("--quick", action="store_true", help="few problems: about two minutes")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=-1, help="processes; -1 for all cores")
-    parser.add_argument("--dask", help="address of a Dask scheduler to use instead")
+    plan = tyro.cli(PaperPlan, description=__doc__)
     try:
-        report = reproduce_paper(PaperPlan(**vars(parser.parse_args())), announce=_announce)
+        report = reproduce_paper(plan, announce=_announce)
     except CadalignError as error:
         print(f"reproduce_paper: {error}", file=sys.stderr)
         return 1

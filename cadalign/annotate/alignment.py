@@ -1,4 +1,4 @@
-"""The live alignment: fitted to the pairs of a document after every change."""
+"""Live alignment: a fit to the pairs of a document after every change."""
 
 from __future__ import annotations
 
@@ -6,96 +6,50 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cadalign.annotate.contradictions import Rows, find_contradictions
 from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.intrinsics import Intrinsics
+from cadalign.annotate.outliers import Rows, find_outliers
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit
-from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.result import FitResult
-from cadalign.geometry.camera import Camera
 
 LEAST_PAIRS = 4
 _LEAST_SIGMA = 1.0
 _ROBUST_ROUNDS = 3
 _ROBUST_SHARE = 2.0  # of the median residual
-_LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, where the pairs do not tell it
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What is known of the camera that took a photo.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera; without one, image size, principal point, and a likely focal length.
-    calibrated : bool
-        Whether that focal length was given.
-    prior : FocalPrior, optional
-        What the photo's EXIF data say of it.
-    note : str
-        Where the focal length comes from, in words.
-    """
-
-    camera: Camera
-    calibrated: bool
-    prior: FocalPrior | None = None
-    note: str = ""
-
-    def with_focal(self, choice: FocalChoice) -> Camera:
-        """The camera with the focal length that was typed, if one was."""
-        if choice.pixels is None:
-            return self.camera
-        return self.camera.with_focal(choice.pixels)
-
-    def to_write(self, choice: FocalChoice) -> Camera:
-        """The camera for an observation file: without a focal length where that is estimated."""
-        if choice.known:
-            return self.with_focal(choice)
-        camera = self.camera
-        return Camera.without_focal(
-            camera.width,
-            camera.height,
-            cx=camera.cx,
-            cy=camera.cy,
-            distortion=camera.distortion,
-        )
+_LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, if the pairs leave it open
 
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
-    """What the pairs say.
+    """Alignment of the pairs placed so far.
 
     Parameters
     ----------
     result : FitResult, optional
-        As `cadalign fit` finds it; None without enough pairs, or if they determine nothing.
-    camera : Camera, optional
-        The camera that it was found with.
+        As `cadalign fit` finds it; None without enough pairs, or if they are degenerate.
     message : str
-        Why there is no result, or what to know about it; may be empty.
-    contradictions : dict of int to float
-        See `find_contradictions`.
+        Reason for a missing result, or an assumption that was made; may be empty.
+    outliers : dict of int to float
+        See `find_outliers`.
     sigma : float
-        The pairs' standard deviation: 1 px, or more where the residuals say so.
+        Standard deviation of the pairs: 1 px, or more if the residuals are larger.
     provisional : bool
-        Whether it needed more than the pairs say: a stretch near 1, or a likely focal length.
+        True if the pairs alone did not suffice: the stretch or the focal length was assumed.
     """
 
     result: FitResult | None = None
-    camera: Camera | None = None
     message: str = ""
-    contradictions: dict[int, float] = field(default_factory=dict)
+    outliers: dict[int, float] = field(default_factory=dict)
     sigma: float = _LEAST_SIGMA
     provisional: bool = False
 
     @property
     def cautious(self) -> FitResult | None:
-        """The result with a covariance that goes by the residuals, where they exceed 1 px.
+        """The result with its covariance scaled to the residuals, where they exceed 1 px.
 
-        A model that is only similar to the object does not fit to the pixels' noise; the
-        deviations shown are not to claim that it does.
+        A model that is only similar to the object has larger residuals than the clicks' noise.
         """
         if self.result is None or self.result.covariance is None:
             return self.result
@@ -106,7 +60,7 @@ def align(
     points_3d: FloatArray,
     points_2d: FloatArray,
     sigma: FloatArray | None,
-    lens: Lens,
+    intrinsics: Intrinsics,
     choice: FocalChoice,
 ) -> LiveAlignment:
     """Fit the model to the complete pairs.
@@ -118,7 +72,7 @@ def align(
         [px]
     sigma : (n,) float, optional
         Standard deviations [px]; by default 1 px each.
-    lens : Lens
+    intrinsics : Intrinsics
     choice : FocalChoice
     """
     count = len(points_3d)
@@ -127,33 +81,30 @@ def align(
         return LiveAlignment(
             message=f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
-    fitter = _Fitter(points_3d, points_2d, sigma, lens, choice)
+    fitter = _Fitter(points_3d, points_2d, sigma, intrinsics, choice)
     message = ""
     if not choice.known and count <= LEAST_PAIRS:
         fitter = replace(fitter, choice=replace(choice, known=True))
-        message = "With 4 pairs the focal length is assumed; the fifth pair begins to tell it."
+        message = "With 4 pairs the focal length is assumed; it is estimated from 5 pairs on."
     try:
-        result, camera = fitter.fit()
+        result = fitter.fit()
     except DegenerateError as error:
-        message = f"Only a likely stretch is shown: {error.what}. Add a pair elsewhere."
+        message = f"The stretch shown is assumed: {error.what}. Add a pair elsewhere."
         fitter = replace(fitter, scale_prior_sigma=_LIKELY_STRETCH)
         try:
-            result, camera = fitter.fit()
+            result = fitter.fit()
         except CadalignError:
             return LiveAlignment(message=f"No alignment yet: {error.what}.")
     except CadalignError as error:
         return LiveAlignment(message=f"No alignment: {error}.")
     unknowns = len(result.covariance) if result.covariance is not None else 8
-    squares = float((result.residuals**2).sum()) if sigma is None else _whitened(result, sigma)
+    whitened = result.residuals if sigma is None else result.residuals / sigma[:, None]
     redundancy = 2 * count - unknowns
-    estimated = np.sqrt(squares / redundancy) if redundancy > 0 else 0.0
+    estimated = np.sqrt(float((whitened**2).sum()) / redundancy) if redundancy > 0 else 0.0
     return LiveAlignment(
         result=result,
-        camera=camera,
         message=message,
-        contradictions=find_contradictions(
-            points_3d, points_2d, fitter.fit_rows, unknowns=unknowns
-        ),
+        outliers=find_outliers(points_3d, points_2d, fitter.fit_rows, unknowns=unknowns),
         sigma=max(_LEAST_SIGMA, float(estimated)),
         provisional=bool(message),
     )
@@ -161,45 +112,38 @@ def align(
 
 @dataclass(frozen=True, eq=False)
 class _Fitter:
-    """The one place that calls `cadalign.fit`, and knows whether the focal length is estimated."""
+    """`cadalign.fit` with the annotator's options, on all pairs or on some."""
 
     points_3d: FloatArray
     points_2d: FloatArray
     sigma: FloatArray | None
-    lens: Lens
+    intrinsics: Intrinsics
     choice: FocalChoice
     scale_prior_sigma: float | None = None
 
-    def fit(self) -> tuple[FitResult, Camera]:
-        """As `cadalign fit` does."""
+    def fit(self) -> FitResult:
+        """Fit all pairs as `cadalign fit` does."""
         return self._fit(np.arange(len(self.points_3d)), 1.0 if self.sigma is None else self.sigma)
 
-    def fit_rows(self, rows: Rows, robust: bool) -> tuple[FitResult, Camera]:
-        """See `cadalign.annotate.contradictions.FitRows`."""
-        result, camera = self._fit(rows, _LEAST_SIGMA)
+    def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
+        """Fit some pairs; see `cadalign.annotate.outliers.FitRows`."""
+        result = self._fit(rows, _LEAST_SIGMA)
         if robust:
-            # sigma=None goes on until nothing changes, which takes ten times as long.
+            # sigma=None iterates until nothing changes, which takes ten times as long.
             for _ in range(_ROBUST_ROUNDS):
                 median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
                 sigma = max(_LEAST_SIGMA, median / _ROBUST_SHARE)
-                result, camera = self._fit(rows, sigma, loss="cauchy")
-        return result, camera
+                result = self._fit(rows, sigma, loss="cauchy")
+        return result
 
-    def _fit(
-        self, rows: Rows, sigma: float | FloatArray | None, *, loss: str = "linear"
-    ) -> tuple[FitResult, Camera]:
-        result = fit(
+    def _fit(self, rows: Rows, sigma: float | FloatArray, *, loss: str = "linear") -> FitResult:
+        return fit(
             self.points_3d[rows],
             self.points_2d[rows],
-            self.lens.with_focal(self.choice),
+            self.intrinsics.with_focal(self.choice),
             sigma=sigma,
             loss=loss,
             scale_prior_sigma=self.scale_prior_sigma,
             focal="known" if self.choice.known else "estimate",
-            focal_prior=None if self.choice.known else self.lens.prior,
+            focal_prior=None if self.choice.known else self.intrinsics.prior,
         )
-        return result, result.camera
-
-
-def _whitened(result: FitResult, sigma: FloatArray) -> float:
-    return float(((result.residuals / sigma[:, None]) ** 2).sum())

@@ -1,4 +1,4 @@
-"""The model as the page gets it: triangles, normals and colours in one block of bytes."""
+"""Encoding of the displayed model: triangles, normals and colours in one block of bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_FACES = 150_000
 
 
 def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
-    """The model for display, with at most so many triangles.
+    """Encode the model for display, simplified to at most ``max_faces`` triangles.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""What is annotated in one photo: pairs of a place in the photo and a keypoint of the model.
+"""Annotation document of one photo: pairs of a photo point and a keypoint of the model.
 
-Documents never change; every edit makes a new one. That is all that undo needs.
+Documents are immutable; every edit makes a new one, which undo keeps.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ class Pair:
     Parameters
     ----------
     number : int
-        Names the pair; never given twice in one document.
+        Identifier, unique in a document.
     uv : (float, float), optional
-        Where it is in the photo [px].
+        The photo half [px].
     keypoint : int, optional
-        Its semantic id on the model.
+        The model half: a semantic id.
     sigma : float, optional
-        Standard deviation of ``uv`` [px], where the observation file gives one.
+        Standard deviation of ``uv`` [px], if the observation file gives one.
     confidence : float, optional
-        How much it is trusted, where the file says that.
+        Confidence in the observation file.
     """
 
     number: int
@@ -38,20 +38,20 @@ class Pair:
 
     @property
     def complete(self) -> bool:
-        """Whether both halves are placed."""
+        """True if both halves are placed."""
         return self.uv is not None and self.keypoint is not None
 
 
 @dataclass(frozen=True)
 class FocalChoice:
-    """Whether the focal length is known, and which it is.
+    """The user's choice of a known or estimated focal length.
 
     Parameters
     ----------
     known : bool
-        Otherwise it is estimated from the pairs.
+        False to estimate it from the pairs.
     pixels : float, optional
-        The focal length that was typed in [px]; None for that of the given camera.
+        Typed focal length [px]; None for that of the camera.
     """
 
     known: bool
@@ -60,14 +60,7 @@ class FocalChoice:
 
 @dataclass(frozen=True)
 class Document:
-    """Everything that is annotated in one photo.
-
-    Parameters
-    ----------
-    pairs : tuple of Pair
-    focal : FocalChoice
-    next_number : int
-        The number of the next pair.
+    """All annotations of one photo; ``next_number`` is the number of the next pair.
 
     Examples
     --------
@@ -84,22 +77,16 @@ class Document:
 
     @property
     def complete_pairs(self) -> tuple[Pair, ...]:
-        """The pairs of which both halves are placed."""
+        """Pairs with both halves placed."""
         return tuple(pair for pair in self.pairs if pair.complete)
 
     @property
     def keypoints(self) -> frozenset[int]:
-        """The semantic ids in use."""
+        """Semantic ids in use."""
         return frozenset(pair.keypoint for pair in self.pairs if pair.keypoint is not None)
 
     def pair(self, number: int) -> Pair:
-        """The pair of a number.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
+        """Find a pair by its number; raises InputError if there is none."""
         for pair in self.pairs:
             if pair.number == number:
                 return pair
@@ -113,7 +100,7 @@ class Document:
         uv : (float, float)
             [px]
         preferred : int, optional
-            The pair that is filled first of all, if it lacks this half.
+            Number of the pair to complete, if it lacks this half.
 
         Returns
         -------
@@ -130,14 +117,14 @@ class Document:
         Raises
         ------
         InputError
-            If the keypoint has its place in the photo already.
+            If the keypoint is already placed in the photo.
         """
         for position, pair in enumerate(self.pairs, start=1):
             if pair.keypoint == keypoint:
                 raise InputError(
-                    f"this keypoint is pair {position} already",
+                    f"this keypoint is already used by pair {position}",
                     where="keypoint",
-                    fix="a keypoint has one place in a photo: move or delete that pair",
+                    fix="move or delete that pair: a keypoint occurs once in a photo",
                 )
         lacking = [pair.number for pair in self.pairs if pair.keypoint is None]
         return self._fill(lacking, preferred, Pair(self.next_number, keypoint=keypoint))
@@ -147,7 +134,7 @@ class Document:
         return self._with(replace(self.pair(number), uv=uv))
 
     def release_keypoint(self, number: int) -> Document:
-        """Take the model half off a pair, so that another can be placed."""
+        """Remove the model half of a pair, so that another can be placed."""
         pair = self.pair(number)
         if pair.uv is None:
             return self.delete(number)
@@ -159,7 +146,7 @@ class Document:
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
 
     def choose_focal(self, focal: FocalChoice) -> Document:
-        """Say whether the focal length is known."""
+        """Choose a known or an estimated focal length."""
         return replace(self, focal=focal)
 
     def _fill(self, lacking: list[int], preferred: int | None, half: Pair) -> tuple[Document, int]:

@@ -1,9 +1,9 @@
-"""What annotating writes: an observation for each photo, and the model's keypoints.
+"""Files of the annotator: an observation for each photo, and the model's keypoints.
 
 Beside the observation `photo.json` there may be
 
 - `photo_fit/fit.json`, the alignment as `cadalign fit` finds and writes it,
-- `photo.unfinished.json`, pairs of which only one half is placed.
+- `photo.unfinished.json`, pairs with only one half placed.
 """
 
 from __future__ import annotations
@@ -11,45 +11,64 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cadalign.annotate.document import Document, Pair
-from cadalign.annotate.keypoint_book import KeypointBook
+from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.annotations import parse_entry, read_entries
 from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError, InputError
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_json
-from cadalign.io.json_file import (
-    as_index,
-    as_numbers,
-    as_object,
-    as_path,
+from cadalign.io.documents import Document as JsonDocument
+from cadalign.io.documents import (
+    Index,
+    PathText,
+    Point2,
+    convert,
+    in_file,
+    path_from,
+    read_document,
     read_json,
-    refuse_unknown,
 )
+from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 
 _UNFINISHED = "cadalign unfinished pairs"
 SAME_PLACE = 1e-6
-"""How far apart two points may lie that are one [diagonals]."""
+"""Largest distance of two points that count as one [diagonals]."""
+
+
+class _Half(JsonDocument):
+    """Pair with only the photo half or the model half."""
+
+    uv: Point2 | None = None
+    semantic_id: Index | None = None
+
+    def __post_init__(self) -> None:
+        if self.uv is None and self.semantic_id is None:
+            raise InputError("uv and semantic_id are both missing")
+
+
+class _Unfinished(JsonDocument):
+    """File of the pairs with only one half placed."""
+
+    pairs: list[_Half]
+    format: str = ""
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """The files of one photo.
+class AnnotationFiles:
+    """Files of one photo.
 
     Parameters
     ----------
     observation : Path
         The observation file; it need not exist yet.
     image, model : Path
-        What it names.
+        Photo and mesh, which the observation names.
     """
 
     observation: Path
@@ -58,65 +77,59 @@ class Sheet:
 
     @property
     def unfinished(self) -> Path:
-        """Where halves of pairs are kept."""
+        """File of the pairs with only one half placed."""
         return self.observation.with_name(f"{self.observation.stem}.unfinished.json")
 
     @property
     def fit(self) -> Path:
-        """Where the alignment is written, as `cadalign fit` does."""
+        """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
     def read(
-        self, empty: Document, book: KeypointBook, diagonal: float
+        self, empty: Document, registry: KeypointRegistry, diagonal: float
     ) -> tuple[Document, Camera | None]:
-        """Read what was annotated before.
+        """Read an earlier session's annotation.
 
         Parameters
         ----------
         empty : Document
-            What to begin with.
-        book : KeypointBook
-            Gets the model points that it does not have yet.
+            The document to start from.
+        registry : KeypointRegistry
+            Model points that it lacks are added to it.
         diagonal : float
-            Of the model's box [model units].
+            Diagonal of the model's box [model units].
 
         Returns
         -------
         Document
         Camera or None
-            The file's, if there is a file.
+            The observation's camera, if the file exists.
 
         Raises
         ------
         DataError
-            If a file is there but is none of ours, or belongs to another model.
+            If a file is malformed or belongs to another model.
         """
         document, camera = empty, None
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
-            document = _with_pairs(document, observation, book, diagonal)
+            document = _with_pairs(document, observation, registry, diagonal)
         if self.unfinished.exists():
-            document = _with_halves(document, self.unfinished, book)
+            document = _with_halves(document, self.unfinished, registry)
         return document, camera
 
-    def write(self, document: Document, book: KeypointBook, camera: Camera) -> None:
-        """Write the photo's observation and halves of pairs, each whole or not at all.
-
-        Raises
-        ------
-        DataError
-            If one cannot be written.
-        """
+    def write(self, document: Document, registry: KeypointRegistry, camera: Camera) -> None:
+        """Write the photo's observation and its unfinished pairs; raises DataError on failure."""
         pairs = document.complete_pairs
         keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
         observation = Observation(
-            points_3d=book.xyz(keypoints),
+            points_3d=registry.xyz(keypoints),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=camera,
             sigma=sigmas_of(pairs),
             semantic_ids=np.array(keypoints, dtype=np.int64),
-            names=tuple(book[keypoint].name for keypoint in keypoints),
+            names=tuple(registry[keypoint].name for keypoint in keypoints),
             confidences=_filled([pair.confidence for pair in pairs]),
             image=self.image,
             model=self.model,
@@ -124,61 +137,48 @@ class Sheet:
         observation.save(self.observation)
         halves = [pair for pair in document.pairs if not pair.complete]
         if halves:
-            write_json(self.unfinished, _written(halves))
+            entries = [
+                {"semantic_id": pair.keypoint} if pair.uv is None else {"uv": list(pair.uv)}
+                for pair in halves
+            ]
+            write_json(self.unfinished, {"format": _UNFINISHED, "pairs": entries})
         else:
             self.unfinished.unlink(missing_ok=True)
 
     def write_fit(self, result: FitResult | None) -> None:
-        """Write the alignment; where there is none, take away its file.
-
-        Raises
-        ------
-        DataError
-            If it cannot be written.
-        """
+        """Write the alignment, or remove its file; raises DataError on failure."""
         if result is None:
             self.fit.unlink(missing_ok=True)
             return
-        try:
+        with writing(self.fit):
             self.fit.parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise DataError(f"cannot be made ({error.strerror})", where=str(self.fit)) from None
         write_json(self.fit, result.to_dict())
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
         if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
-            # All pairs were deleted; the camera is kept.
-            try:
+            # All pairs were deleted; the camera is kept, and unfinished pairs belong to the model.
+            with in_file(self.observation):
                 camera = Camera.from_dict(data["camera"])
-            except CadalignError as error:
-                raise DataError(error.what, where=f"{self.observation}: {error.where}") from None
-            if data.get("model") is not None:  # the halves of pairs are that model's
-                where = f"{self.observation}: model"
-                named = as_path(data["model"], folder=self.observation.parent, where=where)
-                refuse_other_model(named, self.model, where=self.observation)
-            return Observation(np.empty((0, 3)), np.empty((0, 2)), camera)
-        observation = Observation.load(self.observation)
+                named: str | None = convert(data.get("model"), PathText | None, where="model")
+            model = None if named is None else path_from(named, self.observation.parent)
+            observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=model)
+        else:
+            observation = Observation.load(self.observation)
         refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
 
 
 def sigmas_of(pairs: Iterable[Pair]) -> FloatArray | None:
-    """Standard deviations (n,) of complete pairs, if any has one: 1 px for the others."""
+    """Standard deviations (n,) of complete pairs, 1 px by default; None if no pair has one."""
     return _filled([pair.sigma for pair in pairs])
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
-    """Refuse a file that names another model than the one that is annotated.
-
-    Raises
-    ------
-    DataError
-        If it does. A file that names none may be of any model.
-    """
+    """Refuse a file that names another model than the annotated one; raises DataError."""
     if named is None or named.resolve() == model.resolve():
         return
-    # Whole datasets call every mesh the same; only the folders tell these apart.
+    # In some datasets all meshes have the same file name and differ by their folders.
     same = named.name == model.name
     other, ours = (named.resolve(), model.resolve()) if same else (named.name, model.name)
     raise DataError(
@@ -189,12 +189,12 @@ def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
 
 
 def read_own_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeypoint, ...]:
-    """Read the keypoints that an earlier session wrote, or that lie where it would write them.
+    """Read the keypoints file of an earlier session.
 
     Raises
     ------
     DataError
-        If they are another model's, or for the reasons of `read_given_keypoints`.
+        If it belongs to another model, or for the reasons of `read_given_keypoints`.
     """
     if isinstance(read_json(path), dict):
         own = ModelKeypoints.load(path, mesh=mesh)
@@ -209,8 +209,8 @@ def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeyp
     Parameters
     ----------
     path : Path
-        A file of model keypoints, or KeypointNet's annotations of the model's category: of these
-        the model's are taken, whose id occurs in its file's path.
+        A file of model keypoints, or KeypointNet's annotations of the model's category, of which
+        those are taken whose model id occurs in the mesh file's path.
     model : Path
         The mesh file.
     mesh : Mesh
@@ -218,135 +218,89 @@ def read_given_keypoints(path: Path, model: Path, mesh: Mesh) -> tuple[ModelKeyp
     Raises
     ------
     DataError
-        If it is neither, or has no keypoints of this model.
+        If the file has another format, or no keypoints of this model.
     """
-    if isinstance(read_json(path), dict):
-        return ModelKeypoints.load(path, mesh=mesh).keypoints
-    places = {part.split(".")[0] for part in model.absolute().parts}
-    for entry in read_entries(path):
-        if isinstance(entry, dict) and entry.get("model_id") in places:
-            keypoints = parse_entry(entry, where=f"{path}, {entry['model_id']}").keypoints
-            rows = zip(
-                keypoints.semantic_ids.tolist(),
-                keypoints.xyz.tolist(),
-                keypoints.face_index.tolist(),
-                keypoints.barycentric.tolist(),
-                strict=True,
-            )
-            return tuple(
-                ModelKeypoint(f"keypoint {number}", tuple(xyz), number, face, tuple(weights))
-                for number, xyz, face, weights in rows
-            )
-    raise DataError(
-        "has no annotations of a model whose id occurs in the model's path",
-        where=str(path),
-        fix=f"is {model} of this category?",
-    )
+    return ModelKeypoints.load(path, mesh=mesh, model=model).keypoints
 
 
 def keypoints_file(model: Path, folder: Path) -> Path:
-    """Where the keypoints of a model are written in a folder."""
+    """Path of a model's keypoints file in a folder."""
     return folder / f"{model.stem}{SUFFIX}"
 
 
-def write_keypoints(path: Path, book: KeypointBook, used: frozenset[int], model: Path) -> None:
-    """Write the model's keypoints: those that were given, and those in use.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    """
-    kept = tuple(point for number, point in book if number in book.given or number in used)
+def write_keypoints(
+    path: Path, registry: KeypointRegistry, used: frozenset[int], model: Path
+) -> None:
+    """Write the given keypoints and those in use; raises DataError on failure."""
+    kept = tuple(point for number, point in registry if number in registry.given or number in used)
     ModelKeypoints(kept, model).save(path)
 
 
 def _filled(values: list[float | None]) -> FloatArray | None:
-    """The values, 1 where one is missing; None where all are."""
+    """The values, 1 where one is missing; None if all are missing."""
     if all(value is None for value in values):
         return None
     return np.array([1.0 if value is None else value for value in values])
 
 
 def _with_pairs(
-    document: Document, observation: Observation, book: KeypointBook, diagonal: float
+    document: Document, observation: Observation, registry: KeypointRegistry, diagonal: float
 ) -> Document:
+    ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)
     ):
-        x, y, z = xyz
-        ids, names = observation.semantic_ids, observation.names
         point = ModelKeypoint(
             name="" if names is None else names[row],
-            xyz=(x, y, z),
+            xyz=tuple(xyz),
             semantic_id=None if ids is None else int(ids[row]),
         )
-        keypoint = _keypoint_of(point, book, SAME_PLACE * diagonal, document.keypoints)
         pair = Pair(
             document.next_number,
-            uv=(uv[0], uv[1]),
-            keypoint=keypoint,
+            uv=tuple(uv),
+            keypoint=_registered(point, registry, SAME_PLACE * diagonal, document.keypoints),
             sigma=_entry(observation.sigma, row),
             confidence=_entry(observation.confidences, row),
         )
-        document = replace(
-            document, pairs=(*document.pairs, pair), next_number=document.next_number + 1
-        )
+        document = _with(document, pair)
     return document
+
+
+def _with(document: Document, pair: Pair) -> Document:
+    return replace(document, pairs=(*document.pairs, pair), next_number=document.next_number + 1)
 
 
 def _entry(values: FloatArray | None, row: int) -> float | None:
     return None if values is None else float(values[row])
 
 
-def _keypoint_of(
-    point: ModelKeypoint, book: KeypointBook, tolerance: float, taken: frozenset[int]
+def _registered(
+    point: ModelKeypoint, registry: KeypointRegistry, tolerance: float, taken: frozenset[int]
 ) -> int:
-    """The keypoint that a pair of an observation file means; added where the book has none."""
+    """Find a point of an observation file in the registry, or add it; returns its id."""
     wanted = point.semantic_id
-    if wanted is not None and wanted in book and wanted not in taken:
-        gap = np.linalg.norm(np.subtract(book[wanted].xyz, point.xyz))
+    if wanted is not None and wanted in registry and wanted not in taken:
+        gap = np.linalg.norm(np.subtract(registry[wanted].xyz, point.xyz))
         if gap <= tolerance:
             return wanted
-    found = book.find(point.xyz, tolerance=tolerance)
+    found = registry.find(point.xyz, tolerance=tolerance)
     if found is not None and found not in taken:
         return found
-    free = wanted is not None and wanted >= 0 and wanted not in book
-    return book.add(point if free else replace(point, semantic_id=None))
+    free = wanted is not None and wanted >= 0 and wanted not in registry
+    return registry.add(point if free else replace(point, semantic_id=None))
 
 
-def _with_halves(document: Document, path: Path, book: KeypointBook) -> Document:
-    data = as_object(read_json(path), where=str(path))
-    refuse_unknown(data, {"format", "pairs"}, where=str(path))
-    entries = data.get("pairs")
-    if data.get("format") != _UNFINISHED or not isinstance(entries, list):
+def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> Document:
+    data = read_document(path, _Unfinished)
+    if data.format != _UNFINISHED:
         raise DataError(
-            f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to go on without"
+            f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to start without them"
         )
-    for row, entry in enumerate(entries):
-        where = f"{path}, pairs[{row}]"
-        entry = as_object(entry, where=where)
-        refuse_unknown(entry, {"uv", "semantic_id"}, where=where)
-        pair = Pair(document.next_number)
-        if "uv" in entry:
-            u, v = as_numbers(entry["uv"], 2, where=f"{where}.uv")
-            pair = replace(pair, uv=(u, v))
-        elif "semantic_id" in entry:
-            keypoint = as_index(entry["semantic_id"], where=f"{where}.semantic_id")
-            if keypoint not in book or keypoint in document.keypoints:
-                continue  # its other half was saved, or the file of keypoints is gone
-            pair = replace(pair, keypoint=keypoint)
-        else:
-            raise DataError("neither uv nor semantic_id", where=where)
-        document = replace(
-            document, pairs=(*document.pairs, pair), next_number=document.next_number + 1
-        )
+    for half in data.pairs:
+        pair = Pair(document.next_number, uv=half.uv)
+        if half.uv is None:
+            if half.semantic_id not in registry or half.semantic_id in document.keypoints:
+                continue  # its other half was saved, or the keypoints file was deleted
+            pair = replace(pair, keypoint=half.semantic_id)
+        document = _with(document, pair)
     return document
-
-
-def _written(halves: list[Pair]) -> dict[str, Any]:
-    entries: list[dict[str, Any]] = [
-        {"semantic_id": pair.keypoint} if pair.uv is None else {"uv": list(pair.uv)}
-        for pair in halves
-    ]
-    return {"format": _UNFINISHED, "pairs": entries}

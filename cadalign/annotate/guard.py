@@ -1,4 +1,4 @@
-"""Who may talk to the annotator: this machine's browser with the session's token, nobody else."""
+"""Access control of the annotator: only this machine's browser with the session's token."""
 
 from __future__ import annotations
 
@@ -39,35 +39,27 @@ HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """What a request must show.
-
-    Parameters
-    ----------
-    port : int
-        The port that is listened on.
-    token : str
-        The session's secret.
-    """
+    """Requirements on requests: host, origin and the session's secret token."""
 
     port: int
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
     @property
     def url(self) -> str:
-        """The page's address with the token."""
+        """Address of the page with the token."""
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     @property
     def cookie(self) -> str:
-        """The name of the cookie; browsers send cookies to all ports of a machine."""
+        """Name of the cookie, by port: browsers send cookies to all ports of a machine."""
         return f"cadalign-{self.port}"
 
     def refusal(self, scope: Scope) -> tuple[int, str] | None:
-        """Status and reason if a request is refused, before any of its body is read."""
+        """Check a request before its body is read; returns status and reason of a refusal."""
         headers = Headers(scope=scope)
         hosts = {f"{name}:{self.port}" for name in _NAMES}
         if headers.get("host") not in hosts:
-            # A name that another site has made resolve to this machine.
+            # Another site's name may resolve to this machine (DNS rebinding).
             return 400, "unknown host"
         origin = headers.get("origin")
         if origin is not None and origin not in {f"http://{host}" for host in hosts}:
@@ -97,13 +89,7 @@ class Access:
 
 
 class Guard:
-    """Middleware that refuses what `Access` refuses, and bodies that are too long.
-
-    Parameters
-    ----------
-    app : ASGI application
-    access : Access
-    """
+    """ASGI middleware that enforces `Access` and limits the length of bodies."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -114,7 +100,7 @@ class Guard:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        if scope["type"] != "http":  # there are no web sockets here
+        if scope["type"] != "http":  # web sockets are not used
             return
         refused = self._access.refusal(scope)
         if refused is None:
@@ -124,13 +110,13 @@ class Guard:
                 return
             refused = 413, f"more than {MAX_BODY} bytes"
         status, reason = refused
-        # The body has not been read to its end, so the connection cannot be used again.
+        # The rest of the body is unread, so the connection cannot be reused.
         headers = HEADERS | {"Connection": "close"}
         await PlainTextResponse(reason, status_code=status, headers=headers)(scope, receive, send)
 
 
 async def _read_body(receive: Receive) -> bytes | None:
-    """A request's body; None as soon as it is longer than it may be."""
+    """Read a request's body; None as soon as it exceeds `MAX_BODY`."""
     body = b""
     while True:
         message = await receive()
@@ -145,7 +131,7 @@ async def _read_body(receive: Receive) -> bytes | None:
 
 
 def _replay(body: bytes) -> Receive:
-    """A receiver that hands over a body that has been read."""
+    """Make a receiver of a body that was read already."""
     messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def receive() -> Message:
@@ -155,7 +141,7 @@ def _replay(body: bytes) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
-    """A sender that adds the security headers to a response."""
+    """Wrap a sender so that responses carry the security headers."""
 
     async def add(message: Message) -> None:
         if message["type"] == "http.response.start":

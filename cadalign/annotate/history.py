@@ -1,4 +1,4 @@
-"""Undo and redo over documents that never change."""
+"""Undo and redo over immutable documents."""
 
 from __future__ import annotations
 
@@ -8,12 +8,7 @@ _LONGEST = 1000
 
 
 class History:
-    """The documents that were, the one that is, and those that were undone.
-
-    Parameters
-    ----------
-    document : Document
-        The first one.
+    """The current document, those before it, and those that were undone.
 
     Examples
     --------
@@ -34,23 +29,19 @@ class History:
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is anything to undo."""
+        """True if there is a change to undo."""
         return bool(self._before)
 
     @property
     def can_redo(self) -> bool:
-        """Whether there is anything to redo."""
+        """True if there is a change to redo."""
         return bool(self._after)
 
     def record(self, document: Document, *, step: object = None) -> None:
         """Go on to another document.
 
-        Parameters
-        ----------
-        document : Document
-        step : object, optional
-            Changes that follow each other with the same step are undone together, such as the
-            places of a point that is dragged.
+        Consecutive changes with the same ``step`` are undone together, such as the positions of a
+        point while it is dragged.
         """
         if step is None or step != self._step or not self._before:
             self._before.append(self.document)
@@ -60,11 +51,11 @@ class History:
         self._step = step
 
     def undo(self) -> bool:
-        """Go back by one change; says whether there was one."""
+        """Go back by one change; returns False if there is none."""
         return self._go(self._before, self._after)
 
     def redo(self) -> bool:
-        """Take back an undo; says whether there was one."""
+        """Redo the last undone change; returns False if there is none."""
         return self._go(self._after, self._before)
 
     def _go(self, source: list[Document], target: list[Document]) -> bool:

@@ -1,4 +1,4 @@
-"""The CAD model: exact points on its full mesh, whatever is shown of it."""
+"""CAD model in the annotator: exact points on its full mesh, independent of what is displayed."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats
+from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.scene import Scene
-from cadalign.render.views.visibility import visible_keypoints
 
 _SAMPLES = 96
 _SAMPLED_FROM = 20_000
 _NEAREST_SAMPLES = 2e-3  # in diagonals
-# How far beneath the surface a marker's point may lie to be clicked on, in diagonals: keypoints sit
-# in corners, where rays to them graze other parts. The page shows and takes markers by the same.
+# Depth beneath the surface at which markers can still be clicked [diagonals]: keypoints sit in
+# corners, where rays to them graze other parts. The page uses the same value.
 _BENEATH = 0.02
 _EXACT = 1e-6
 
@@ -52,18 +49,18 @@ class CadModel:
         self.center: FloatArray = (low + high) / 2
         self.diagonal = self.scene.diagonal
         if not self.diagonal > 0:
-            raise InputError("all its vertices are in one place", where=mesh.source)
+            raise InputError("all vertices of the mesh coincide", where=mesh.source)
 
     def to_display(self, xyz: npt.ArrayLike) -> FloatArray:
-        """Model coordinates (..., 3) as the page has them: centred, with a diagonal of 1."""
+        """Turn model coordinates (..., 3) into the page's: centred, with a diagonal of 1."""
         return np.asarray((np.asarray(xyz, dtype=float) - self.center) / self.diagonal)
 
     def from_display(self, xyz: npt.ArrayLike) -> FloatArray:
-        """The model coordinates (..., 3) of the page's."""
+        """Turn the page's coordinates (..., 3) into model coordinates."""
         return np.asarray(np.asarray(xyz, dtype=float) * self.diagonal + self.center)
 
     def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> ModelKeypoint | None:
-        """The first point of the surface on a ray.
+        """Intersect a ray with the surface.
 
         Parameters
         ----------
@@ -73,7 +70,7 @@ class CadModel:
         Returns
         -------
         ModelKeypoint or None
-            None where the ray misses.
+            The first intersection; None if the ray misses.
 
         Raises
         ------
@@ -83,14 +80,14 @@ class CadModel:
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))
         if not along.any():
-            raise InputError("is zero", where="direction")
+            raise InputError("the vector is zero", where="direction")
         face, distance = self.scene.caster.first_hits(start, along[None])
         if face[0] < 0 or not np.isfinite(distance[0]):
             return None
         return self._on_triangle(int(face[0]), start + distance[0] * along)
 
     def is_seen(self, origin: npt.ArrayLike, xyz: npt.ArrayLike) -> bool:
-        """Whether a point on the model, or little beneath its surface, is seen from a place."""
+        """True if a point on the surface, or slightly beneath it, is visible from ``origin``."""
         start = as_floats(origin, name="origin", shape=(3,))
         sight = as_floats(xyz, name="xyz", shape=(3,)) - start
         length = float(np.linalg.norm(sight))
@@ -99,18 +96,9 @@ class CadModel:
         _, distance = self.scene.caster.first_hits(start, sight[None])
         return bool(distance[0] >= 1 - _BENEATH * self.diagonal / length)
 
-    def visible(
-        self, points: FloatArray, camera: Camera, alignment: Alignment
-    ) -> npt.NDArray[np.bool_]:
-        """Which points (k, 3) a camera sees of the stretched model."""
-        return visible_keypoints(self.scene, points, camera, alignment)
-
     @cached_property
     def samples(self) -> tuple[ModelKeypoint, ...]:
-        """Corners all over the model, far from each other: vertices by farthest-point sampling.
-
-        The first is the vertex farthest from the centre, so that extremes come first.
-        """
+        """Vertices by farthest-point sampling, starting with the one farthest from the centre."""
         mesh = self.scene.mesh
         used, first = np.unique(mesh.faces, return_index=True)
         step = -(-len(used) // _SAMPLED_FROM)
@@ -133,14 +121,14 @@ class CadModel:
         return np.array([point.xyz for point in self.samples])
 
     def _on_triangle(self, triangle: int, xyz: FloatArray) -> ModelKeypoint:
-        """A point of a triangle, with the file's face number and that face's barycentrics.
+        """Make a keypoint of a point on a triangle, with the file's face number and barycentrics.
 
-        Of a polygon its first triangle counts, also for points on its others: their weights are
-        negative in part. Where a polygon is not flat that names no point of it, and is left out.
+        Barycentrics refer to the first triangle of a polygon: on its other triangles some weights
+        are negative. They are left out if the polygon is not flat.
         """
         mesh = self.scene.mesh
         face = int(mesh.polygon[triangle])
-        corners = mesh.vertices[mesh.faces[self._first_triangle(mesh.polygon, face)]]
+        corners = mesh.vertices[mesh.faces[np.searchsorted(mesh.polygon, face)]]
         edges = (corners[1:] - corners[0]).T
         if np.linalg.matrix_rank(edges) == 2:
             first, second = np.linalg.lstsq(edges, xyz - corners[0], rcond=None)[0]
@@ -152,7 +140,3 @@ class CadModel:
             return ModelKeypoint(name="", xyz=(x, y, z))
         a, b, c = weights.tolist()
         return ModelKeypoint(name="", xyz=(x, y, z), face_index=face, barycentric=(a, b, c))
-
-    @staticmethod
-    def _first_triangle(polygon: IntArray, face: int) -> int:
-        return int(np.searchsorted(polygon, face))

@@ -1,4 +1,4 @@
-"""Photos to annotate: found, checked, and shown upright."""
+"""Photos to annotate, upright by their EXIF orientation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _QUALITY = 95
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo, measured upright: as its EXIF orientation says it is to be shown.
+    """A photo with its upright size.
 
     Parameters
     ----------
@@ -42,32 +42,26 @@ class Photo:
 
     @classmethod
     def open(cls, path: Path) -> Photo:
-        """Read a photo's size and orientation.
-
-        Raises
-        ------
-        DataError
-            If it is missing or not a photo.
-        """
+        """Read a photo's size and orientation; raises DataError if it is missing or no photo."""
         with open_photo(path) as image:
             orientation = image.getexif().get(_ORIENTATION, _UPRIGHT)
             width, height = image.size
             kind = image.format or ""
         if orientation in _SIDEWAYS:
             width, height = height, width
-        if orientation not in range(1, 9):  # EXIF that lies
+        if orientation not in range(1, 9):  # invalid EXIF data
             orientation = _UPRIGHT
         return cls(path, width, height, orientation, kind)
 
     def encoded(self) -> tuple[str, bytes]:
-        """Media type and bytes of the upright photo, for a browser.
+        """Encode the upright photo for a browser: media type and bytes.
 
-        A file that a browser shows upright is passed on as it is, so that no pixel changes.
+        A file that browsers show upright is passed on unchanged.
 
         Raises
         ------
         DataError
-            If it cannot be read to its end.
+            If the file is damaged.
         """
         with open_photo(self.path) as image:
             image.load()
@@ -80,12 +74,12 @@ class Photo:
 
 
 def find_photos(path: Path) -> list[Path]:
-    """The photos of a folder by name, or the one that a path names.
+    """List the photos of a folder by name, or the given photo.
 
     Raises
     ------
     DataError
-        If there is no such file or folder.
+        If the path does not exist.
     InputError
         If the folder holds no photos.
     """
@@ -95,7 +89,7 @@ def find_photos(path: Path) -> list[Path]:
             raise InputError(
                 "there are no photos in this folder",
                 where=str(path),
-                fix=f"photos end in {', '.join(ENDINGS)}",
+                fix=f"file names of photos end in {', '.join(ENDINGS)}",
             )
         return found
     if not path.exists():

@@ -1,4 +1,4 @@
-"""The annotator's server: the page, its photos and model, and the actions on them."""
+"""Web server of the annotator: the page, photos, model and actions."""
 
 from __future__ import annotations
 
@@ -15,36 +15,16 @@ from starlette.types import ASGIApp
 
 from cadalign.annotate.display import display_bytes
 from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.state import state_of
 from cadalign.errors import CadalignError, InputError
 from cadalign.web import asset
 
 LOOPBACK = "127.0.0.1"
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>cadalign annotate</title>
-<link rel="icon" href="data:,">
-<link rel="stylesheet" href="annotate.css">
-<script src="annotate.js" defer></script>
-</head>
-<body><noscript>The annotator needs JavaScript.</noscript></body>
-</html>
-"""
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
-    """The application, guarded.
-
-    Parameters
-    ----------
-    session : Session
-    access : Access
-        What requests must show.
-    """
+    """Make the guarded application."""
     routes = _Routes(session, access)
     app = Starlette(
         routes=[
@@ -62,30 +42,25 @@ def make_app(session: Session, access: Access) -> ASGIApp:
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on the loopback interface.
-
-    Parameters
-    ----------
-    port : int
-        0 for any that is free.
+    """Open a socket on the loopback interface; port 0 chooses a free one.
 
     Raises
     ------
     InputError
-        If the port is in use or not a port.
+        If the port is in use or invalid.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((LOOPBACK, port))
-        listener.listen()  # whoever connects before the server runs has to wait, not to fail
+        listener.listen()  # connections wait until the server runs
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"port {port} cannot be listened on ({reason})",
+            f"port {port} cannot be opened ({reason})",
             where="--port",
-            fix="leave --port away to get a free one",
+            fix="omit --port to use a free one",
         ) from None
     return listener
 
@@ -101,7 +76,7 @@ def serve(app: ASGIApp, listener: socket.socket) -> None:
 
 
 class _Routes:
-    """What answers each address. Work that takes time runs in threads."""
+    """Handlers of the addresses. Long work runs in threads."""
 
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session
@@ -109,7 +84,7 @@ class _Routes:
         self._model: bytes | None = None
 
     async def page(self, request: Request) -> Response:
-        response = Response(_PAGE, media_type="text/html")
+        response = Response(asset("annotate.html"), media_type="text/html")
         response.set_cookie(
             self._access.cookie, self._access.token, httponly=True, samesite="strict"
         )
@@ -126,7 +101,7 @@ class _Routes:
         return Response(data, media_type="application/octet-stream")
 
     async def photo(self, request: Request) -> Response:
-        photo = self._session.slide(request.path_params["number"]).photo
+        photo = self._session.photo_state(request.path_params["number"]).photo
         kind, data = await run_in_threadpool(photo.encoded)
         return Response(data, media_type=kind)
 
@@ -135,20 +110,20 @@ class _Routes:
 
     async def act(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            raise InputError("the body is not JSON", where="content-type")
+            raise InputError("the content type is not application/json", where="content-type")
         try:
             action = json.loads(await request.body())
         except (ValueError, RecursionError):
             raise InputError("the body is not JSON", where="body") from None
         if not isinstance(action, dict):
-            raise InputError("the body is not an object", where="body")
+            raise InputError("the body is not a JSON object", where="body")
         return await self._answer(request.path_params["number"], action)
 
     async def _answer(self, number: int, action: dict[str, Any] | None) -> Response:
         def work() -> bytes:
             with self._session.lock:
                 outcome = None if action is None else self._session.act(number, action)
-                state = state_of(self._session, number, outcome)
+                state = page_state(self._session, number, outcome)
             return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
 
         return Response(await run_in_threadpool(work), media_type="application/json")

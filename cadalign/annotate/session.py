@@ -1,77 +1,52 @@
-"""A session of annotating: the photos, what was placed in them, and every action on it."""
+"""Annotation session: the photos, their annotations, and the actions on them."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.alignment import Lens, LiveAlignment, align
-from cadalign.annotate.document import Document, FocalChoice, Pixel
-from cadalign.annotate.files import Sheet, sigmas_of, write_keypoints
+from cadalign.annotate.actions import ACTIONS, Outcome
+from cadalign.annotate.alignment import LiveAlignment, align
+from cadalign.annotate.document import Document, FocalChoice
+from cadalign.annotate.files import AnnotationFiles, sigmas_of, write_keypoints
 from cadalign.annotate.history import History
-from cadalign.annotate.keypoint_book import KeypointBook
+from cadalign.annotate.intrinsics import Intrinsics
+from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.photos import Photo
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.simulation.problems import simulate_problem
-from cadalign.io.json_file import as_index, as_numbers, as_text
-
-_FOCAL_RANGE = (0.05, 200.0)  # of a focal length, in image widths
+from cadalign.io.documents import convert
 
 
 @dataclass
-class Slide:
-    """One photo and its annotation.
-
-    Parameters
-    ----------
-    photo : Photo
-    sheet : Sheet
-        Its files.
-    lens : Lens
-    history : History
-    """
+class PhotoState:
+    """One photo, its annotation, and the outcome of the last save."""
 
     photo: Photo
-    sheet: Sheet
-    lens: Lens
+    files: AnnotationFiles
+    intrinsics: Intrinsics
     history: History
     saved_at: float | None = None
-    trouble: str = ""
-    fit_waits: bool = False
-    """Whether the alignment's file is to be written once there can be one."""
+    save_error: str = ""
+    fit_pending: bool = False
+    """True if the alignment's file is still to be written, since the solvers were not ready."""
     _live: tuple[Document, LiveAlignment, Suggestion | None] | None = field(
         default=None, repr=False
     )
 
     @property
     def document(self) -> Document:
-        """What is annotated now."""
+        """The current annotation."""
         return self.history.document
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What an action did beside changing the document.
-
-    Parameters
-    ----------
-    selected : int, optional
-        The pair that was placed or changed.
-    message : str
-        What to tell, such as that the click missed the model.
-    """
-
-    selected: int | None = None
-    message: str = ""
 
 
 class Session:
@@ -80,247 +55,121 @@ class Session:
     Parameters
     ----------
     model : CadModel
-    book : KeypointBook
-    slides : sequence of Slide
+    registry : KeypointRegistry
+    photos : list of PhotoState
     keypoints_path : Path
-        Where the model's keypoints are written.
+        File to which the model's keypoints are written.
     """
 
     def __init__(
-        self, model: CadModel, book: KeypointBook, slides: list[Slide], keypoints_path: Path
+        self,
+        model: CadModel,
+        registry: KeypointRegistry,
+        photos: list[PhotoState],
+        keypoints_path: Path,
     ) -> None:
         self.model = model
-        self.book = book
-        self.slides = slides
+        self.registry = registry
+        self.photos = photos
         self.keypoints_path = keypoints_path
         self.wireframe = Wireframe(model)
         self.lock = threading.RLock()
         self._ready = threading.Event()
-        self._actions: dict[str, Callable[[Slide, Mapping[str, Any]], Outcome]] = {
-            "place_uv": self._place_uv,
-            "place_keypoint": self._place_keypoint,
-            "pick": self._pick,
-            "suggested": self._place_suggested,
-            "move": self._move,
-            "release": self._release,
-            "delete": self._delete,
-            "rename": self._rename,
-            "focal": self._focal,
-            "undo": self._undo,
-            "redo": self._redo,
-        }
-
-    # --- readiness -------------------------------------------------------------------------
 
     @property
     def ready(self) -> bool:
-        """Whether the solvers are compiled and loaded, so that a fit takes no time."""
+        """True once the solvers are compiled and loaded, so that a fit is instant."""
         return self._ready.is_set()
 
     def warm_up(self) -> None:
-        """Have the solvers compiled or loaded, by aligning something, and the model prepared."""
+        """Compile or load the solvers by aligning a synthetic problem, and prepare the model."""
         try:
             problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
-            lens = Lens(problem.camera, calibrated=True)
+            intrinsics = Intrinsics(problem.camera, calibrated=True)
             for known in (True, False):
-                align(problem.points_3d, problem.points_2d, None, lens, FocalChoice(known=known))
-            # What the first click would wait for: on a model of millions of faces some seconds.
+                align(
+                    problem.points_3d, problem.points_2d, None, intrinsics, FocalChoice(known=known)
+                )
+            # Takes seconds on a model of millions of faces, which the first click would wait for.
             _ = self.model.scene.caster, self.model.samples
-        finally:  # what has failed here fails again, and is said, where it is needed
+        finally:  # an error here occurs again, and is reported, when the user aligns
             self._ready.set()
             with self.lock:
-                for slide in self.slides:
-                    if slide.fit_waits:
-                        self.save(slide)
+                for state in self.photos:
+                    if state.fit_pending:
+                        self.save(state)
 
-    # --- what is there ---------------------------------------------------------------------
-
-    def slide(self, number: int) -> Slide:
-        """The photo of a number, counted from 0.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
-        if not 0 <= number < len(self.slides):
+    def photo_state(self, number: int) -> PhotoState:
+        """The photo of a number, counted from 0; raises InputError if there is none."""
+        if not 0 <= number < len(self.photos):
             raise InputError(f"there is no photo {number + 1}", where="image")
-        return self.slides[number]
+        return self.photos[number]
 
-    def live(self, slide: Slide) -> tuple[LiveAlignment, Suggestion | None]:
-        """The alignment and the best next keypoint of what is annotated now."""
-        document = slide.document
-        if slide._live is not None and slide._live[0] is document:
-            return slide._live[1:]
+    def live(self, state: PhotoState) -> tuple[LiveAlignment, Suggestion | None]:
+        """Compute the alignment and the next-best keypoint of the current annotation."""
+        document = state.document
+        if state._live is not None and state._live[0] is document:
+            return state._live[1:]
         if not self.ready:
             return LiveAlignment(message="Solvers and model are being prepared."), None
         pairs = document.complete_pairs
         live = align(
-            self.book.xyz(pair.keypoint for pair in pairs if pair.keypoint is not None),
+            self.registry.xyz(pair.keypoint for pair in pairs if pair.keypoint is not None),
             np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             sigmas_of(pairs),
-            slide.lens,
+            state.intrinsics,
             document.focal,
         )
-        suggestion = suggest(self.model, self.book, document.keypoints, live)
-        slide._live = (document, live, suggestion)
+        suggestion = suggest(self.model, self.registry, document.keypoints, live)
+        state._live = (document, live, suggestion)
         return live, suggestion
 
-    # --- actions ---------------------------------------------------------------------------
-
     def act(self, number: int, action: Mapping[str, Any]) -> Outcome:
-        """Do an action on a photo and save what it changed.
+        """Do an action on a photo and save its changes.
 
         Parameters
         ----------
         number : int
-            The photo, counted from 0.
+            Number of the photo, counted from 0.
         action : mapping
-            ``do``, and what that needs.
+            ``do``, the name of the action, and its arguments.
 
         Raises
         ------
         CadalignError
-            If the action is unknown, or cannot be done.
+            If the action is unknown or invalid.
         """
         with self.lock:
-            slide = self.slide(number)
+            state = self.photo_state(number)
             name = action.get("do")
-            act = self._actions.get(name) if isinstance(name, str) else None
-            if act is None:
+            kind = ACTIONS.get(name) if isinstance(name, str) else None
+            if kind is None:
                 raise InputError(
-                    f"{name!r} is not an action",
-                    where="do",
-                    fix=f"known are {', '.join(self._actions)}",
+                    f"{name!r} is not an action", where="do", fix=f"known are {', '.join(ACTIONS)}"
                 )
-            before = slide.document
-            outcome = act(slide, action)
-            if slide.document is not before or name == "rename":
-                self.save(slide)
+            before = state.document
+            outcome: Outcome = convert(action, kind).apply(self, state)
+            if state.document is not before or name == "rename":
+                self.save(state)
             return outcome
 
-    def save(self, slide: Slide) -> None:
-        """Write the files of a photo, and those of the model; trouble is kept to be shown."""
-        document = slide.document
+    def save(self, state: PhotoState) -> None:
+        """Write the files of a photo and of the model; an error is kept for the page."""
+        document = state.document
         ready = self.ready  # asked first: it may become so at any time
-        slide.fit_waits = not ready
-        live, _ = self.live(slide)
-        # What needed assumptions is shown, but not written: `cadalign fit` would refuse it.
+        state.fit_pending = not ready
+        live, _ = self.live(state)
+        # An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
         result = None if live.provisional else live.result
-        used = frozenset[int]().union(*(other.document.keypoints for other in self.slides))
+        used = frozenset[int]().union(*(other.document.keypoints for other in self.photos))
         try:
             # First the keypoints, which the observation names.
-            write_keypoints(self.keypoints_path, self.book, used, slide.sheet.model)
-            slide.sheet.write(document, self.book, slide.lens.to_write(document.focal))
+            write_keypoints(self.keypoints_path, self.registry, used, state.files.model)
+            state.files.write(document, self.registry, state.intrinsics.to_write(document.focal))
             if ready:
-                slide.sheet.write_fit(result)
+                state.files.write_fit(result)
         except CadalignError as error:
-            slide.trouble = str(error)
+            state.save_error = str(error)
         else:
-            slide.trouble = ""
-            slide.saved_at = time.time()
-
-    def _place_uv(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        uv = self._uv(slide, action)
-        document, pair = slide.document.place_uv(uv, self._optional(action, "pair"))
-        slide.history.record(document)
-        return Outcome(pair)
-
-    def _place_keypoint(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        keypoint = self._index(action, "keypoint")
-        self.book[keypoint]
-        return self._place(slide, keypoint, action)
-
-    def _pick(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        """Place a model point by a ray; a keypoint near the click is taken if it can be seen."""
-        origin = self.model.from_display(self._numbers(action, "origin", 3))
-        direction = self._numbers(action, "direction", 3)
-        near = self._optional(action, "near")
-        if near is not None and self.model.is_seen(origin, self.book[near].xyz):
-            return self._place(slide, near, action)
-        point = self.model.pick(origin, direction)
-        if point is None:
-            return Outcome(message="That click missed the model.")
-        return self._place(slide, self.book.add(point), action)
-
-    def _place_suggested(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        _, suggestion = self.live(slide)
-        if suggestion is None:
-            raise InputError("there is none", where="suggestion", fix="place more pairs")
-        keypoint = suggestion.point.semantic_id
-        return self._place(
-            slide, self.book.add(suggestion.point) if keypoint is None else keypoint, action
-        )
-
-    def _place(self, slide: Slide, keypoint: int, action: Mapping[str, Any]) -> Outcome:
-        document, pair = slide.document.place_keypoint(keypoint, self._optional(action, "pair"))
-        slide.history.record(document)
-        return Outcome(pair)
-
-    def _move(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        pair = self._index(action, "pair")
-        gesture = self._optional(action, "gesture")
-        slide.history.record(
-            slide.document.move(pair, self._uv(slide, action)),
-            step=None if gesture is None else (pair, gesture),
-        )
-        return Outcome(pair)
-
-    def _release(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        pair = self._index(action, "pair")
-        slide.history.record(slide.document.release_keypoint(pair))
-        return Outcome(pair)
-
-    def _delete(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        slide.history.record(slide.document.delete(self._index(action, "pair")))
-        return Outcome()
-
-    def _rename(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        pair = slide.document.pair(self._index(action, "pair"))
-        if pair.keypoint is None:
-            raise InputError("this pair has no model point yet", where="pair")
-        self.book.rename(pair.keypoint, as_text(action.get("name"), where="name"))
-        return Outcome(pair.number)
-
-    def _focal(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        known, pixels = action.get("known"), action.get("pixels")
-        if not isinstance(known, bool):
-            raise InputError(f"{known!r} is neither true nor false", where="known")
-        if pixels is not None:
-            (pixels,) = as_numbers([pixels], 1, where="pixels")
-            low, high = (bound * slide.photo.width for bound in _FOCAL_RANGE)
-            if not low <= pixels <= high:
-                raise InputError(
-                    f"{pixels:g} px is no focal length of this photo",
-                    where="pixels",
-                    fix=f"give {low:.0f} to {high:.0f} px",
-                )
-        slide.history.record(slide.document.choose_focal(FocalChoice(known, pixels)))
-        return Outcome()
-
-    def _undo(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        return Outcome(message="" if slide.history.undo() else "There is nothing to undo.")
-
-    def _redo(self, slide: Slide, action: Mapping[str, Any]) -> Outcome:
-        return Outcome(message="" if slide.history.redo() else "There is nothing to redo.")
-
-    # --- fields of actions -----------------------------------------------------------------
-
-    def _uv(self, slide: Slide, action: Mapping[str, Any]) -> Pixel:
-        u, v = self._numbers(action, "uv", 2)
-        if not slide.lens.camera.contains(np.array([[u, v]]))[0]:
-            raise InputError(f"({u:.1f}, {v:.1f}) is outside the photo", where="uv")
-        return u, v
-
-    @staticmethod
-    def _numbers(action: Mapping[str, Any], name: str, count: int) -> tuple[float, ...]:
-        return as_numbers(action.get(name), count, where=name)
-
-    @staticmethod
-    def _index(action: Mapping[str, Any], name: str) -> int:
-        return as_index(action.get(name), where=name)
-
-    @staticmethod
-    def _optional(action: Mapping[str, Any], name: str) -> int | None:
-        value = action.get(name)
-        return None if value is None else as_index(value, where=name)
+            state.save_error = ""
+            state.saved_at = time.time()

@@ -1,4 +1,4 @@
-"""The lines that show a stretched model over a photo: folds, borders and outlines, where seen."""
+"""Wireframe of a stretched model over a photo: visible creases, borders and silhouette edges."""
 
 from __future__ import annotations
 
@@ -14,51 +14,47 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, simplify
+from cadalign.render.views.visibility import visible_keypoints
 
 _MOST_FACES = 30_000
-_MOST_FOLDS = 1500
+_MOST_CREASES = 1500
 _MOST_LINES = 3000
-_FOLD_ANGLE = 30.0
-_LONGEST = 1 / 24  # of a line, in diagonals: each is seen or hidden as a whole
+_CREASE_DEG = 30.0
+_LONGEST = 1 / 24  # of a line [diagonals]: each is drawn or hidden as a whole
 _BOX_PIECES = 16
 
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Edges between two triangles, and those that are lines from wherever one looks."""
+    """Smooth edges, which show only on the silhouette, and lines that always show."""
 
     ends: FloatArray  # (e, 2, 3)
-    beside: FloatArray  # (e, 2, 3), the third corners of the two triangles
+    beside: FloatArray  # (e, 2, 3), the third corners of the adjacent triangles
     lines: FloatArray  # (l, 2, 3)
 
 
 class Wireframe:
-    """The lines of a model, prepared once.
-
-    Parameters
-    ----------
-    model : CadModel
-    """
+    """Lines of a model, prepared once."""
 
     def __init__(self, model: CadModel) -> None:
-        self._model = model
+        self._scene = model.scene
         self._piece = _LONGEST * model.diagonal
         self._edges = _find_edges(model.scene.mesh, self._piece)
 
     def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
-        """The lines that a camera sees of the stretched model, (k, 2, 2) float [px]."""
+        """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
         edges = self._edges
         eye = alignment.inverse(np.zeros((1, 3)))[0]
         outline = edges.ends[_is_outline(edges, eye)]
         lines = np.concatenate([edges.lines, _cut(outline, self._piece)])[:_MOST_LINES]
         if not len(lines):
             return np.empty((0, 2, 2))
-        seen = self._model.visible(lines.mean(axis=1), camera, alignment)
+        seen = visible_keypoints(self._scene, lines.mean(axis=1), camera, alignment)
         return _project_lines(lines[seen], camera, alignment)
 
 
 def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """The edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
+    """Project the edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
     corners = Box.from_model(bounds, alignment).corners
     ends = corners[np.array(BOX_EDGES)]
     share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
@@ -68,7 +64,7 @@ def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> Float
 
 
 def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Lines (k, 2, 3) in the image, (k, 2, 2); those that begin or end behind it are left out."""
+    """Project lines (k, 2, 3) to (k, 2, 2) [px]; drop those with an end behind the camera."""
     ends = alignment.apply(lines.reshape(-1, 3)).reshape(-1, 2, 3)
     near = 1e-6 * np.abs(alignment.translation).max(initial=1.0)
     ends = ends[(ends[:, :, 2] > near).all(axis=1)]
@@ -78,10 +74,10 @@ def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> F
 
 
 def _is_outline(edges: _Edges, eye: FloatArray) -> BoolArray:
-    """Which edges have both their triangles on one side, seen from the eye, (e,) bool.
+    """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
 
-    Stretching leaves sides as they are, so this needs no pose; and it goes by the corners, since
-    the triangles of real models face either way.
+    The third corners are compared, not the normals: triangles of real models face either way.
+    Stretching does not change sides, so model coordinates suffice.
     """
     start = edges.ends[:, 0]
     sight = np.cross(start - eye, edges.ends[:, 1] - eye)
@@ -93,17 +89,17 @@ def _find_edges(mesh: Mesh, piece: float) -> _Edges:
     small = simplify(mesh, max_faces=_MOST_FACES)
     # Faces of real models seldom share vertices: weld those in one place.
     welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
-    edges = mesh_edges(welded.vertices, welded.faces, crease_angle=_FOLD_ANGLE)
+    edges = mesh_edges(welded.vertices, welded.faces, crease_angle=_CREASE_DEG)
     ends = welded.vertices[edges.ends]
     lines = ends[edges.creased]
     longest = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
-    lines = lines[np.sort(longest[:_MOST_FOLDS])]
+    lines = lines[np.sort(longest[:_MOST_CREASES])]
     beside = welded.vertices[edges.opposite[~edges.creased]]
     return _Edges(ends[~edges.creased], beside, _cut(lines, piece))
 
 
 def _cut(lines: FloatArray, piece: float) -> FloatArray:
-    """The lines (k, 2, 3) in pieces of at most that length."""
+    """Cut lines (k, 2, 3) into pieces of at most that length."""
     if not len(lines):
         return lines
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)

@@ -43,18 +43,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 on success, 1 if the input or the data were refused; a wrong command line exits with 2.
-        Runs (evaluate, simulate) exit with 3 if they are finished but some of their rows failed.
+        0 on success, 1 if the input was refused; a wrong command line exits with 2. Runs (evaluate,
+        simulate) exit with 3 if they finished with some failed rows.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    command = tyro.cli(
-        Command,
-        prog="cadalign",
-        description="Align CAD models to photos from keypoints.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
     try:
+        command = tyro.cli(
+            Command,
+            prog="cadalign",
+            description="Align CAD models to photos from keypoints.",
+            args=arguments,
+            config=(tyro.conf.OmitSubcommandPrefixes,),
+        )
         return command.run()
     except CadalignError as error:
         sys.stderr.write(f"cadalign: {error}\n")
@@ -62,5 +62,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("cadalign: interrupted; a run goes on if it is started again\n")
         return 1
-    except BrokenPipeError:  # the reader of our output has seen enough
+    except BrokenPipeError:  # the reader of the output has closed it
         return 0

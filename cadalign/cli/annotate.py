@@ -7,6 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
+
 from cadalign.cli.output import make_folder, new_console
 from cadalign.io.files import writing
 
@@ -25,7 +27,7 @@ class Annotate:
     model: Path
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     observation: Path | None = None
-    """Where a single photo's observation is kept and found again; by default beside the photo."""
+    """Observation file of a single photo, continued if it exists; by default beside the photo."""
     out: Path | None = None
     """Folder for the observations; by default the photos'."""
     camera: Path | None = None
@@ -35,7 +37,7 @@ class Annotate:
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
-    no_open: bool = False
+    no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
 
     def run(self) -> int:
@@ -43,7 +45,7 @@ class Annotate:
         import webbrowser
 
         from cadalign.annotate.guard import Access
-        from cadalign.annotate.prepare import open_session
+        from cadalign.annotate.opening import open_session
         from cadalign.annotate.server import listen, make_app, serve
 
         console = new_console()

@@ -1,4 +1,4 @@
-"""`cadalign doctor`: what works on this machine, and how to enable what does not."""
+"""`cadalign doctor`: check this machine and show how to enable missing parts."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say which renderers work here, how fast, and what would enable the others.
+    """Check the renderers and their speed, and show how to enable missing ones.
 
-    Also shows the processor cores and whether compiled solvers are kept on disk.
+    Also shows the processor cores and the cache of compiled solvers.
     """
 
     json: bool = False

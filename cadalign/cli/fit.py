@@ -4,17 +4,42 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.output import make_folder, new_console
+from cadalign.errors import InputError
+from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
-    from cadalign.fitting.noise import Sigma
     from cadalign.io.observation import Observation
+
+
+@dataclass(frozen=True)
+class _FitOptions(FitOptions):
+    """Method and model; the observation file supplies the other options."""
+
+    sigma: tyro.conf.Suppress[Sigma | None] = FitOptions.sigma
+    focal: tyro.conf.Suppress[str] = FitOptions.focal
+    focal_prior: tyro.conf.Suppress[FocalPrior | None] = FitOptions.focal_prior
+
+    def __post_init__(self) -> None:
+        with named_as_flags():
+            super().__post_init__()
+
+
+@dataclass(frozen=True)
+class _RansacOptions(RansacOptions):
+    """Search for outliers (LO-RANSAC), with --robust."""
+
+    def __post_init__(self) -> None:
+        with named_as_flags():
+            super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -24,31 +49,29 @@ class Fit:
     Prints the alignment; writes fit.json and overlay.png.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional]
+    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image and model."""
     out: Path | None = None
     """Folder to write to; by default <observation>_fit beside the file."""
     json: bool = False
     """Print the result as JSON."""
-    method: str = "optimal"
-    """Which method fits: optimal, aepnp, aepnp-paper or epnp."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     similar: bool = False
-    """The model is only similar to the object: estimate the keypoints' noise from the residuals."""
+    """Estimate sigma from the residuals: for a model that is only similar to the object."""
     robust: bool = False
-    """Some keypoints may be wrong: fit to those that agree (RANSAC)."""
-    max_reproj_error: float = 4.0
-    """With --robust, the largest reprojection error of a keypoint that is kept, in pixels."""
+    """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     focal: Literal["known", "estimate"] | None = None
-    """Whether the file's focal length is right or is to be estimated too; by default it is right,
-    where there is one."""
+    """Focal length: known (the file's) or estimate; by default known, if the file has one."""
     exif: bool = True
-    """Estimate the focal length with what the photo's EXIF data say of it, if they do."""
+    """Use the photo's EXIF data as a prior on an estimated focal length."""
+    fitting: tyro.conf.OmitArgPrefixes[_FitOptions] = _FitOptions()
+    ransac: tyro.conf.OmitArgPrefixes[_RansacOptions] = _RansacOptions()
 
     def run(self) -> int:
         """Run the fit; returns the exit code."""
         from cadalign.fitting.fit import fit
-        from cadalign.fitting.focal.prior import FocalPrior
-        from cadalign.fitting.robust import RansacOptions
+        from cadalign.io.files import write_text
         from cadalign.io.images import write_image
         from cadalign.io.observation import Observation
         from cadalign.render.drawing.fit_overlay import draw_observation
@@ -56,42 +79,51 @@ class Fit:
         observation = Observation.load(self.observation)
         console = new_console()
         focal = self.focal or ("known" if observation.camera.focal_known else "estimate")
-        prior = None
-        if focal == "estimate" and self.exif and observation.image is not None:
-            prior = FocalPrior.from_exif(observation.image)
+        prior = self._focal_prior(observation) if focal == "estimate" else None
         if prior is not None:
-            sigma = 100 * prior.relative_sigma
-            text = f"Focal length by the photo's EXIF data: {prior.focal:.4g} px +-{sigma:.2g} %"
+            share = 100 * prior.relative_sigma
+            text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
             console.print(text, markup=False)
+        options = replace(
+            self.fitting, sigma=self._sigma(observation), focal=focal, focal_prior=prior
+        )
         with console.status("fitting (the first time after an installation takes a minute)"):
             result = fit(
                 observation.points_3d,
                 observation.points_2d,
                 observation.camera,
-                method=self.method,
-                sigma=self._sigma(observation),
-                ransac=RansacOptions(max_reproj_error=self.max_reproj_error)
-                if self.robust
-                else None,
+                **vars(options),
+                ransac=self.ransac if self.robust else None,
                 confidences=observation.confidences if self.robust else None,
-                focal=focal,
-                focal_prior=prior,
             )
         picture = draw_observation(observation, result)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
         make_folder(out)
-        text = json.dumps(result.to_dict(), indent=2)
-        (out / "fit.json").write_text(text + "\n", encoding="utf-8")
+        text = json.dumps(result.to_dict(), indent=2) + "\n"
+        write_text(out / "fit.json", text)
         write_image(out / "overlay.png", picture)
         if self.json:
-            sys.stdout.write(text + "\n")
+            sys.stdout.write(text)
         else:
             new_console(stderr=False).print(str(result), markup=False)
             console.print(f"Picture: {out / 'overlay.png'}", markup=False)
         return 0
 
     def _sigma(self, observation: Observation) -> Sigma | None:
-        """The keypoints' standard deviations: to be estimated, the file's, or 1 px."""
+        """Choose the standard deviation: None to estimate it, the given one, the file's, or 1."""
         if self.similar:
+            if self.sigma is not None:
+                raise InputError(
+                    "--similar estimates the standard deviation, which --sigma gives",
+                    where="--sigma",
+                    fix="give one of the two options",
+                )
             return None
-        return 1.0 if observation.sigma is None else observation.sigma
+        if self.sigma is not None:
+            return self.sigma
+        return FitOptions.sigma if observation.sigma is None else observation.sigma
+
+    def _focal_prior(self, observation: Observation) -> FocalPrior | None:
+        if not self.exif or observation.image is None:
+            return None
+        return FocalPrior.from_exif(observation.image)

@@ -1,30 +1,34 @@
-"""`cadalign library`: make libraries of CAD models to retrieve from."""
+"""`cadalign library`: build and inspect libraries of CAD models to retrieve from."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from cadalign.cli.output import make_folder, new_console
 
+if TYPE_CHECKING:
+    from cadalign.retrieval import Library
+
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Make a library of a data set's annotated models, as one file."""
+    """Build a library of a data set's annotated models, as one file."""
 
-    root: Annotated[Path, tyro.conf.Positional]
+    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
     """Folder in KeypointNet's layout."""
     out: Path = Path("library.cadalign")
     """File to write."""
     categories: tuple[str, ...] | None = None
-    """Categories to take; all by default."""
+    """Categories to include; all by default."""
     split: str | None = None
-    """The data set's split to take, such as train; all models by default."""
+    """Split of the data set to include, such as train; all models by default."""
     shapenet: Path | None = None
-    """ShapeNetCore, for the meshes, if they are not below the root."""
+    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
@@ -50,9 +54,9 @@ class LibraryBuild:
 
 @dataclass(frozen=True)
 class LibraryShow:
-    """Say what a library holds, once its checksum has been compared."""
+    """Check a library file and list its models by category."""
 
-    library: Annotated[Path, tyro.conf.Positional]
+    library: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LIBRARY")]
     """File that `cadalign library build` wrote."""
 
     def run(self) -> int:
@@ -65,25 +69,20 @@ class LibraryShow:
 
 @dataclass(frozen=True)
 class LibraryCommand:
-    """Make and inspect libraries of CAD models."""
+    """Build and inspect libraries of CAD models."""
 
-    what: (
+    library: (
         Annotated[LibraryBuild, tyro.conf.subcommand("build")]
         | Annotated[LibraryShow, tyro.conf.subcommand("show")]
     )
 
     def run(self) -> int:
-        """Run what was chosen; returns its exit code."""
-        return self.what.run()
+        """Run the chosen command; returns its exit code."""
+        return self.library.run()
 
 
-def _describe(library: object) -> str:
-    """How many models there are of each category, in words."""
-    from collections import Counter
-
-    from cadalign.retrieval import Library
-
-    assert isinstance(library, Library)
+def _describe(library: Library) -> str:
+    """Count the models of each category."""
     counts = Counter(category for category, _ in library.keys)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
     return f"{len(library)} models: {listed}"

@@ -17,30 +17,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Observe:
-    """Pair the keypoints that a detector found in a photo with a model's.
+    """Pair the keypoints of a detector in a photo with a model's.
 
     Writes an observation for `cadalign fit`. Keypoints are paired by name, otherwise by semantic
-    id, otherwise by their order. Without --camera the focal length is unknown.
+    id, otherwise by order. Without --camera the focal length is unknown.
     """
 
-    keypoints: Annotated[Path, tyro.conf.Positional]
+    keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
     """COCO keypoint JSON (MMPose, Detectron2, ultralytics), or CSV with the columns name, u, v."""
-    model_keypoints: Annotated[Path, tyro.conf.Positional]
+    model_keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL_KEYPOINTS")]
     """The model's keypoints: model.keypoints.json."""
     image: Path | None = None
-    """The photo; it chooses among the file's images."""
+    """The photo; its name selects among the file's images."""
     camera: Path | None = None
     """JSON file with the camera in COLMAP's form: model, width, height, params."""
     out: Path | None = None
     """Observation file to write; by default <keypoints>.observation.json beside the keypoints."""
     object: int | None = None
-    """Which of the photo's objects, from 0; by default that of the highest score."""
+    """Number of the object in the photo, from 0; by default the one with the highest score."""
     min_score: float = 0.0
-    """Leave out keypoints of a lower score."""
+    """Least score of a keypoint that is kept."""
     weigh: bool = False
-    """Take the scores as weights: half the score is twice the standard deviation."""
+    """Use the scores as weights: half the score is twice the standard deviation."""
     sigma: float = 1.0
-    """With --weigh, the standard deviation of a keypoint of score 1, in pixels."""
+    """With --weigh, the standard deviation of a keypoint with score 1 [px]."""
     ignore_unknown: bool = False
     """Leave out keypoints that the model does not have."""
 
@@ -74,7 +74,7 @@ class Observe:
         return 0
 
     def _camera(self, found: ImageKeypoints) -> Camera:
-        """The given camera, or one of the photo's size without focal length.
+        """Read the camera, or make one of the photo's size without focal length.
 
         Raises
         ------
@@ -83,8 +83,8 @@ class Observe:
         """
         from cadalign.errors import DataError
         from cadalign.geometry.camera import Camera
+        from cadalign.io.documents import in_file, read_json
         from cadalign.io.images import photo_size
-        from cadalign.io.json_file import in_file, read_json
 
         sizes: dict[str, tuple[int, int]] = {}
         camera = None
@@ -99,7 +99,9 @@ class Observe:
             sizes[found.source] = found.size
         if not sizes:
             raise DataError(
-                "the photo's size is not known", where=found.source, fix="give --image or --camera"
+                "the photo's size is unknown",
+                where=found.source,
+                fix="give --image or --camera",
             )
         (first, size), *others = sizes.items()
         for name, other in others:
@@ -108,6 +110,6 @@ class Observe:
                     f"the image has {other[0]} x {other[1]} pixels, that of {first} "
                     f"{size[0]} x {size[1]}",
                     where=name,
-                    fix="give what belongs together",
+                    fix="give keypoints, photo and camera of one image",
                 )
         return camera or Camera.without_focal(*size)

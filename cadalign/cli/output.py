@@ -1,4 +1,4 @@
-"""What the commands share: consoles, progress bars, output folders."""
+"""Consoles, progress bars and output folders of the commands."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _PIPE_WIDTH = 120
 
 
 def new_console(*, stderr: bool = True) -> Console:
-    """A console; talk goes to standard error, results to standard output.
+    """Make a console: messages go to standard error, results to standard output.
 
-    Into a file or a pipe it writes lines of a fixed width that tables fit into.
+    Output to a file or a pipe has lines of a fixed width that is enough for tables.
     """
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _PIPE_WIDTH
@@ -33,7 +33,7 @@ def new_console(*, stderr: bool = True) -> Console:
 
 
 def progress_over(items: Iterable[T], *, total: int, label: str, console: Console) -> Iterator[T]:
-    """Yield the items while a progress bar shows how far they are."""
+    """Yield the items and show a progress bar."""
     with Progress(
         TextColumn(label),
         BarColumn(),
@@ -50,16 +50,12 @@ def progress_over(items: Iterable[T], *, total: int, label: str, console: Consol
 
 
 def make_folder(path: Path) -> None:
-    """Make an output folder.
-
-    Raises
-    ------
-    DataError
-        If that is not possible.
-    """
+    """Create an output folder; raises DataError on failure."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(
-            f"cannot be made ({error.strerror})", where=str(path), fix="choose another --out"
+            f"the folder cannot be created ({error.strerror})",
+            where=str(path),
+            fix="choose another --out",
         ) from None

@@ -1,4 +1,4 @@
-"""`cadalign render`: pictures of one model."""
+"""`cadalign render`: images and turntables of one model."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class Render:
     turntable.
     """
 
-    model: Annotated[Path, tyro.conf.Positional]
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     out: Path = Path("render.png")
     """File to write: .png or .mp4."""
     view: tuple[str, ...] = ("iso",)
-    """Where to look from: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
+    """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
     degrees (write --view=-30,20 if it begins with a minus), all, or a camera file (Open3D's, or
     NeRF's transforms.json)."""
     size: str = "640x480"
     """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
     style: Literal["color", "depth", "normals", "faces", "lines"] = "color"
-    """What to show."""
+    """Quantity to draw."""
     background: str = "grey"
     """grey, white, black, #rrggbb, or transparent (PNG stills)."""
     keypoints: Path | None = None
@@ -42,11 +42,11 @@ class Render:
     samples: int = 16
     """Rays per pixel at edges; 1 turns antialiasing off."""
     renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
-    """What draws the colour."""
+    """Renderer of the colour."""
     seconds: float = 4.0
-    """Length of a turntable."""
+    """Duration of a turntable [s]."""
     fps: int = 30
-    """Its frames per second."""
+    """Frames per second of a turntable."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""

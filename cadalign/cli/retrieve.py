@@ -1,21 +1,35 @@
-"""`cadalign retrieve`: which model of a library one image's keypoints show."""
+"""`cadalign retrieve`: rank the models of a library by an image's keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json
+from cadalign.errors import InputError
+from cadalign.fitting.options import Sigma
+from cadalign.retrieval.options import RetrievalOptions
 
 if TYPE_CHECKING:
-    from cadalign.fitting.noise import Sigma
     from cadalign.io.observation import Observation
     from cadalign.retrieval import Match
+
+
+@dataclass(frozen=True)
+class _RetrievalOptions(RetrievalOptions):
+    """Ranking of the models; the observation file supplies the standard deviation."""
+
+    sigma: tyro.conf.Suppress[Sigma] = RetrievalOptions.sigma
+
+    def __post_init__(self) -> None:
+        with named_as_flags():
+            super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -27,66 +41,57 @@ class Retrieve:
     match, and index.html, which shows them side by side.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional]
+    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image."""
     library: Path
     """File that `cadalign library build` wrote."""
-    top: int = 10
-    """How many matches to show."""
     out: Path | None = None
     """Folder to write to."""
-    category: str | None = None
-    """The only category to compare with; all by default."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints in pixels; by default the file's, or 1."""
-    shape_sigma: float = 0.0
-    """How far a model's keypoints may lie off the object's, as a share of the object's extent; for
-    libraries with similar models only, 0.03, say."""
-    robust: bool = False
-    """Some keypoints may be wrong (Cauchy loss)."""
-    symmetries: bool = False
-    """Left and right may be confused: try the labels mirrored, too."""
-    mask: Path | None = None
-    """Picture whose white pixels are the object's: ranks the matches anew by their silhouettes."""
-    silhouette: bool = False
-    """The same with what is cut out of the image, or its opacity."""
-    max_stretch: float = 4.0
-    """No model is stretched more than this, or less than one over it."""
-    workers: int = -1
-    """Threads; -1 for one for each core."""
     json: bool = False
     """Print the matches as JSON."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    robust: bool = False
+    """Not available here: use --loss cauchy against outliers."""
+    mask: Path | None = None
+    """Image of the object's pixels in white: ranks the matches again by their silhouettes."""
+    silhouette: bool = False
+    """The same with the photo's opacity, or with what is segmented around the keypoints."""
+    workers: int = -1
+    """Number of threads; -1 for one per core."""
+    ranking: tyro.conf.OmitArgPrefixes[_RetrievalOptions] = _RetrievalOptions()
 
     def run(self) -> int:
         """Run the retrieval; returns the exit code."""
         from cadalign.io.images import read_image
         from cadalign.retrieval import Library
+        from cadalign.retrieval.mask_files import read_mask, read_opacity
         from cadalign.retrieval.page import write_retrieval
-        from cadalign.retrieval.pictures import read_mask, read_opacity
         from cadalign.retrieval.query import read_query
 
+        if self.robust:
+            raise InputError(
+                "the robust search (RANSAC) is an option of `cadalign fit` only",
+                where="--robust",
+                fix="use --loss cauchy",
+            )
         query = read_query(self.observation)
         assert query.semantic_ids is not None
         library = Library.open(self.library)
         camera = query.camera
         mask = None if self.mask is None else read_mask(self.mask, camera)
         image = read_opacity(query.image, camera) if self.silhouette else None
-        # A table needs no photo, which may have moved.
-        shown = None if self.out is None else query.image
-        photo = None if shown is None else read_image(shown, camera)
+        # The table needs no photo, which may have been moved.
+        photo = None
+        if self.out is not None and query.image is not None:
+            photo = read_image(query.image, camera)
         console = new_console()
         with console.status("retrieving (the first time after an installation takes a minute)"):
             matches = library.retrieve(
                 query.points_2d,
                 query.semantic_ids,
                 camera,
-                top=self.top,
-                category=self.category,
-                sigma=self._sigma(query),
-                shape_sigma=self.shape_sigma,
-                loss="cauchy" if self.robust else "linear",
-                symmetries=self.symmetries,
-                max_stretch=self.max_stretch,
+                **vars(replace(self.ranking, sigma=self._sigma(query))),
                 mask=mask,
                 image=image,
                 workers=self.workers,
@@ -109,10 +114,10 @@ class Retrieve:
         return 0
 
     def _sigma(self, query: Observation) -> Sigma:
-        """The keypoints' standard deviations: as given, the file's, or 1 px."""
+        """Choose the standard deviation: the given one, the file's, or 1."""
         if self.sigma is not None:
             return self.sigma
-        return 1.0 if query.sigma is None else query.sigma
+        return RetrievalOptions.sigma if query.sigma is None else query.sigma
 
 
 def _print_table(matches: Sequence[Match]) -> None:
@@ -128,10 +133,10 @@ def _print_table(matches: Sequence[Match]) -> None:
         table.add_column(name, no_wrap=True)
     for name in ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", *["IoU"][: int(with_masks)]):
         table.add_column(name, justify="right", no_wrap=True)
-    for place, match in enumerate(matches, start=1):
+    for rank, match in enumerate(matches, start=1):
         overlap = match.silhouette_iou
         table.add_row(
-            str(place),
+            str(rank),
             match.category,
             match.model_id + (" (mirrored)" if match.mirrored else ""),
             score_text(match.score),

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import FitOptions
+from cadalign.solvers.constants import NOT_FOUND, TOO_FEW
 from cadalign.solvers.linear import describe_plane
-from cadalign.solvers.status import NOT_FOUND, TOO_FEW
 
 
 def solver_error(
-    status: int, undetermined: int, points_3d: FloatArray, options: Options
+    status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
 ) -> DegenerateError:
     """The error that a solver's status stands for.
 
     Parameters
     ----------
     status : int
-        See `cadalign.solvers.status`.
+        See `cadalign.solvers.constants`.
     undetermined : int
         Which of the solvers' unknowns is not determined, or -1.
     points_3d : (n, 3) float
-    options : Options
+    options : FitOptions
     """
     if status == TOO_FEW:
         return _too_few_error(len(points_3d), options)
@@ -67,7 +67,7 @@ def no_redundancy_error(count: int) -> DegenerateError:
     )
 
 
-def _too_few_error(count: int, options: Options) -> DegenerateError:
+def _too_few_error(count: int, options: FitOptions) -> DegenerateError:
     if options.method == "optimal":
         what = f"{count} keypoints are too few for {options.unknowns} unknowns"
         fix = f"give at least {options.min_points}, fewer unknowns by stretch=, or a prior"

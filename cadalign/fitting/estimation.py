@@ -12,12 +12,12 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError
 from cadalign.fitting.degeneracy import no_redundancy_error, solver_error
 from cadalign.fitting.focal.search import Minima, search_focal
-from cadalign.fitting.noise import Sigma, rays_of, whitening_of
-from cadalign.fitting.options import LOSSES, Options
+from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.batch import aepnp_batch, optimal_batch, reproject_batch
-from cadalign.solvers.minimal import POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
 
 _SIGMA_ROUNDS = 20
 _SIGMA_TOLERANCE = 1e-3
@@ -76,7 +76,9 @@ class Solutions:
         return camera if self.focals is None else camera.with_focal(self.focals[0, minimum])
 
 
-def solve(problems: Problems, options: Options, sigmas: Sequence[Sigma] | None = None) -> Solutions:
+def solve(
+    problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None = None
+) -> Solutions:
     """Solve every problem with the method of the options.
 
     ``sigmas``, one for each problem, takes the place of the options' sigma.
@@ -129,7 +131,7 @@ def _rays(problems: Problems, errors: dict[int, CadalignError]) -> FloatArray:
 
 
 def _whitening(
-    problems: Problems, options: Options, rays: FloatArray, sigmas: Sequence[Sigma] | None
+    problems: Problems, options: FitOptions, rays: FloatArray, sigmas: Sequence[Sigma] | None
 ) -> FloatArray:
     """Weights (1 or n, 3) of the residuals of all problems."""
     if sigmas is None and len(problems.cameras) == 1:
@@ -144,7 +146,7 @@ def _whitening(
 
 def _solve_optimal(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     points: FloatArray,
     sigmas: Sequence[Sigma] | None,
     errors: dict[int, CadalignError],
@@ -190,7 +192,7 @@ def _solve_optimal(
 
 def _search_at_known_focal(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     points: FloatArray,
     sigmas: Sequence[Sigma] | None,
     errors: dict[int, CadalignError],
@@ -218,7 +220,7 @@ def _search_at_known_focal(
 
 
 def _estimate_sigmas(
-    problems: Problems, options: Options, points: FloatArray, poses: FloatArray
+    problems: Problems, options: FitOptions, points: FloatArray, poses: FloatArray
 ) -> FloatArray:
     """Standard deviations (B,) of the keypoints from their residuals [px].
 
@@ -257,7 +259,7 @@ def _sort_exact_solutions(minima: Minima, problem: int) -> None:
 
 def _solve_one_by_one(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     points: FloatArray,
     rays: FloatArray,
     errors: dict[int, CadalignError],
@@ -310,7 +312,7 @@ def unpack(pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return pose[:9].reshape(3, 3).copy(), pose[9:12].copy(), pose[12:].copy()
 
 
-def _restore_axes(solutions: Solutions, options: Options) -> None:
+def _restore_axes(solutions: Solutions, options: FitOptions) -> None:
     """Turn alignments of the reordered model into alignments of the model."""
     place = np.argsort(options.axis_order)
     poses = solutions.poses

@@ -17,11 +17,9 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.estimation import solve
 from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.noise import Sigma
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 from cadalign.fitting.problems import Problems, pack_many, pack_one
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.fitting.single import fit_all, fit_robustly
 from cadalign.geometry.camera import Camera
 
@@ -121,16 +119,16 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    options = Options(
-        method,
-        sigma,
-        loss,
-        loss_scale,
-        stretch,
-        scale_prior_sigma,
-        known_axis,
-        focal,
-        focal_prior,
+    options = FitOptions(
+        method=method,
+        sigma=sigma,
+        loss=loss,
+        loss_scale=loss_scale,
+        stretch=stretch,
+        scale_prior_sigma=scale_prior_sigma,
+        known_axis=known_axis,
+        focal=focal,
+        focal_prior=focal_prior,
     )
     problems = pack_one(points_3d, points_2d, camera)
     if ransac is None:
@@ -200,16 +198,16 @@ def fit_batch(
     (2, 3)
     """
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
-    options = Options(
-        method,
-        1.0 if per_problem else sigma,  # type: ignore[arg-type]
-        loss,
-        loss_scale,
-        stretch,
-        scale_prior_sigma,
-        known_axis,
-        focal,
-        focal_prior,
+    options = FitOptions(
+        method=method,
+        sigma=1.0 if per_problem else sigma,  # type: ignore[arg-type]
+        loss=loss,
+        loss_scale=loss_scale,
+        stretch=stretch,
+        scale_prior_sigma=scale_prior_sigma,
+        known_axis=known_axis,
+        focal=focal,
+        focal_prior=focal_prior,
     )
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
@@ -256,7 +254,7 @@ def _refuse_confidences(confidences: object) -> None:
 
 def _fits(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     ransac: RansacOptions | None,
     sigmas: Sequence[Sigma] | None,
     confidences: Sequence[npt.ArrayLike] | None,

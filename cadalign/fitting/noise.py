@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
+from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import pinhole_rays
-
-Sigma = float | npt.ArrayLike
 
 
 def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:

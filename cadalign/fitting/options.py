@@ -1,75 +1,89 @@
-"""How to fit: the options that `fit` and `fit_batch` share, checked."""
+"""Options of `fit` and `fit_batch`: names, defaults, units and meaning, in this one place.
+
+The command line nests these dataclasses, and shows the text below each field as its help.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.noise import Sigma
-from cadalign.solvers.objective import CAUCHY, HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
 FOCALS = ("known", "estimate")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
+MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
+
+Sigma = float | npt.ArrayLike
 
 
 @dataclass(frozen=True)
-class Options:
-    """How to fit, checked; see `cadalign.fit` for what each means."""
+class FitOptions:
+    """Options of a fit.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or unknown, or options exclude each other.
+    """
 
     method: str = "optimal"
+    """Solver: optimal (maximum likelihood, searched globally), aepnp (linear), aepnp-paper (linear,
+    as published) or epnp (OpenCV's, without stretch)."""
     sigma: Sigma | None = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint; None estimates it from the residuals, for a model that is only similar to the
+    object."""
     loss: str = "linear"
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy."""
     loss_scale: float = 2.0
+    """Length at which a robust loss begins to bend [sigma]."""
     stretch: str | None = None
+    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
+    "none"."""
     scale_prior_sigma: float | None = None
+    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1."""
     known_axis: str = "x"
+    """Axis of the model whose length is right: x, y or z."""
     focal: str = "known"
+    """Focal length: known (the camera's) or estimate."""
     focal_prior: FocalPrior | None = None
+    """Prior on a focal length to be estimated, from EXIF data for example."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise InputError(
-                f"unknown method {self.method!r}",
-                where="method",
-                fix=f"known are {', '.join(METHODS)}",
-            )
-        if self.loss not in LOSSES:
-            raise InputError(
-                f"unknown loss {self.loss!r}", where="loss", fix=f"known are {', '.join(LOSSES)}"
-            )
+        _check_choice("method", self.method, METHODS)
+        _check_choice("loss", self.loss, tuple(LOSSES))
+        _check_choice("known_axis", self.known_axis, ("x", "y", "z"))
+        _check_choice("focal", self.focal, FOCALS)
         if not isinstance(self.loss_scale, int | float) or not 0 < self.loss_scale < np.inf:
             raise InputError(f"{self.loss_scale} is not positive", where="loss_scale")
-        if self.known_axis not in ("x", "y", "z"):
-            raise InputError(
-                f"{self.known_axis!r} is not an axis", where="known_axis", fix="give x, y or z"
-            )
-        if self.stretch is not None:
-            self._check_stretch()
         prior = self.scale_prior_sigma
         if prior is not None and not 0 < prior < np.inf:
             raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
-        if self.focal != "known" or self.focal_prior is not None:
-            self._check_focal()
+        self._check_stretch()
+        self._check_focal()
         if self.method != "optimal" and (
             self.loss != "linear"
             or prior is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
         ):
             raise InputError(
-                f"the method {self.method!r} knows neither loss, stretch nor scale prior",
+                f"the method {self.method!r} supports neither loss, stretch nor scale prior",
                 where="method",
-                fix="use the method 'optimal', or leave these options alone",
+                fix="use the method 'optimal', or leave these options at their defaults",
             )
 
     def _check_stretch(self) -> None:
         axes = [axis for axis in "xyz" if axis != self.known_axis]
         allowed = ("".join(axes), axes[0], axes[1], "none")
-        if self.stretch not in allowed:
+        if self.stretch is not None and self.stretch not in allowed:
             raise InputError(
                 f"{self.stretch!r} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",
@@ -77,10 +91,6 @@ class Options:
             )
 
     def _check_focal(self) -> None:
-        if self.focal not in FOCALS:
-            raise InputError(
-                f"unknown choice {self.focal!r}", where="focal", fix=f"give {' or '.join(FOCALS)}"
-            )
         if self.focal == "estimate" and self.method != "optimal":
             raise InputError(
                 f"the method {self.method!r} needs a known focal length",
@@ -110,13 +120,13 @@ class Options:
 
     @property
     def axis_order(self) -> list[int]:
-        """The model's axes as the solvers want them: the known one first, no reflection."""
+        """The model's axes in the solvers' order: the known one first, no reflection."""
         first = "xyz".index(self.known_axis)
         return [first, (first + 1) % 3, (first + 2) % 3]
 
     @property
     def free(self) -> FloatArray:
-        """1 for each of the solvers' 8 unknowns that is estimated."""
+        """1 for each of the solvers' 8 unknowns that is estimated, 0 for the others."""
         free = np.ones(UNKNOWNS)
         for place, axis in enumerate(self.axis_order[1:]):
             free[6 + place] = float("xyz"[axis] in self.stretched_axes)
@@ -124,12 +134,18 @@ class Options:
 
     @property
     def prior_weight(self) -> float:
-        """Inverse variance of the prior on the log scales."""
+        """Inverse variance of the prior on the log scales; 0 for none."""
         return 0.0 if self.scale_prior_sigma is None else self.scale_prior_sigma**-2
 
     @property
+    def log_focal_prior(self) -> tuple[float, float]:
+        """Mean and inverse variance of the prior on the log focal length; (0, 0) for none."""
+        prior = self.focal_prior
+        return (0.0, 0.0) if prior is None else (math.log(prior.focal), prior.relative_sigma**-2)
+
+    @property
     def estimates_in_rounds(self) -> bool:
-        """Whether sigma is estimated, and the optimum depends on it."""
+        """True if sigma is estimated and the optimum depends on it."""
         return (
             self.method == "optimal"
             and self.sigma is None
@@ -138,14 +154,65 @@ class Options:
 
     @property
     def unknowns(self) -> int:
-        """How many unknowns are estimated."""
+        """The number of unknowns that are estimated."""
         return 6 + len(self.stretched_axes) + (self.focal == "estimate")
 
     @property
     def min_points(self) -> int:
-        """How many keypoints the method needs."""
+        """The number of keypoints that the method needs."""
         if self.method == "optimal":
             prior = len(self.stretched_axes) if self.scale_prior_sigma is not None else 0
             prior += self.focal_prior is not None
             return (self.unknowns - prior + 1) // 2
         return 4 if self.method == "epnp" else 6
+
+
+@dataclass(frozen=True)
+class RansacOptions:
+    """Options of the robust search (LO-RANSAC) for keypoints with outliers.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or unknown.
+    """
+
+    max_reproj_error: float = 4.0
+    """Largest reprojection error of an inlier [px]."""
+    max_iterations: int = 10_000
+    """Largest number of samples. With few points all subsets are tried once instead."""
+    min_iterations: int = 100
+    """Least number of samples."""
+    success_prob: float = 0.9999
+    """Probability of drawing a sample without outliers before the search ends."""
+    seed: int = 0
+    """Seed of the samples; the same seed gives the same result, bit for bit."""
+    minimal: str = "ap4p"
+    """Minimal solver: ap4p on 4 points, or the linear aepnp on 6 as in the AEPnP paper, which needs
+    a known focal length. Neither finds anything where all keypoints lie in one plane."""
+    refine: bool = True
+    """Optimise new best hypotheses locally, and the last one on all its inliers; otherwise return
+    the best hypothesis as the minimal solver left it."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_reproj_error < np.inf:
+            raise InputError(f"{self.max_reproj_error} is not positive", where="max_reproj_error")
+        for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < least:
+                raise InputError(f"{value!r} is not a number of at least {least}", where=name)
+        if not 0 < self.success_prob < 1:
+            raise InputError(f"{self.success_prob} is not between 0 and 1", where="success_prob")
+        if self.minimal not in MINIMAL_SOLVERS:
+            raise InputError(
+                f"unknown minimal solver {self.minimal!r}",
+                where="minimal",
+                fix=f"known are {', '.join(MINIMAL_SOLVERS)}",
+            )
+
+
+def _check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise InputError(
+            f"unknown {name} {value!r}", where=name, fix=f"known are {', '.join(known)}"
+        )

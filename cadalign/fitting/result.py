@@ -1,4 +1,4 @@
-"""What a fit returns."""
+"""The result of a fit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_doubt
 from cadalign.fitting.uncertainty import Deviation, deviation_of, warnings_of
@@ -39,7 +39,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class FitStats:
-    """What a fit took.
+    """Effort of a fit.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class FitResult:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What the keypoints do not determine, in words; empty where all is well."""
+        """Statements on what the keypoints do not determine; empty where all is well."""
         std = self.std
         if std is None:
             return ()
@@ -218,39 +218,9 @@ class FitResult:
         InputError
             If a field is missing or invalid.
         """
-        try:
-            covariance = data["covariance"]
-            prior = data["focal_prior"]
-            unknowns = 8 if data["focal"] == "known" else 9
-            return cls(
-                alignment=Alignment.from_dict(data["alignment"]),
-                points_3d=as_points(data["points_3d"], name="points_3d", dimension=3),
-                residuals=as_floats(data["residuals"], name="residuals", shape=(None, 2)),
-                inliers=np.array(data["inliers"], dtype=bool),
-                method=data["method"],
-                camera=Camera.from_dict(data["camera"]),
-                sigma=data["sigma"],
-                covariance=None
-                if covariance is None
-                else as_floats(covariance, name="covariance", shape=(unknowns, unknowns)),
-                known_axis=data["known_axis"],
-                stretched_axes=data["stretched_axes"],
-                focal=data["focal"],
-                focal_prior=None if prior is None else FocalPrior(**prior),
-                alternatives=tuple(
-                    Alternative(
-                        Alignment.from_dict(other["alignment"]),
-                        other["relative_likelihood"],
-                        Camera.from_dict(other["camera"]),
-                    )
-                    for other in data["alternatives"]
-                ),
-                stats=FitStats(**data["stats"]),
-            )
-        except KeyError as error:
-            raise InputError(f"missing {error}", where="fit result") from None
-        except TypeError as error:
-            raise InputError(f"malformed ({error})", where="fit result") from None
+        from cadalign.fitting.document import read_result  # takes the validation library with it
+
+        return read_result(data)
 
     def to_json(self) -> str:
         """The result as JSON text; see `to_dict`."""
@@ -267,6 +237,7 @@ class FitResult:
         """
         try:
             data = json.loads(text)
-        except ValueError as error:
-            raise InputError(f"not valid JSON: {error}", where="fit result") from None
+        except (ValueError, RecursionError) as error:
+            what = f"not valid JSON: {str(error)[:200]}"
+            raise InputError(what, where="fit result") from None
         return cls.from_dict(data)

@@ -11,74 +11,22 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.fitting.estimation import unpack
-from cadalign.fitting.focal.grid import focal_views, log_limits, log_prior
+from cadalign.fitting.focal.grid import focal_views, log_limits
 from cadalign.fitting.noise import rays_of, whitening_of
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.fitting.problems import Problems
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import LINEAR, SAMPLE_SIZES
 from cadalign.solvers.focal_ransac import ransac_focal_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.objective import LINEAR, Objective
-from cadalign.solvers.ransac import AEPNP, AP4P, SAMPLE_SIZES, ransac_kernel
+from cadalign.solvers.objective import Objective
+from cadalign.solvers.ransac import ransac_kernel
 
-MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.1  # expected number of models with as much support by chance
 _FLAT = 1e-6  # thickness over extent of what counts as a plane
 _LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
-
-
-@dataclass(frozen=True)
-class RansacOptions:
-    """How to search where some keypoints are wrong.
-
-    Parameters
-    ----------
-    max_reproj_error : float
-        Largest reprojection error of an inlier [px].
-    max_iterations, min_iterations : int
-        Bounds on the number of samples. With few points all subsets are tried once instead.
-    success_prob : float
-        Probability of drawing a sample without outliers before the search ends.
-    seed : int
-        The same seed gives the same result, bit for bit.
-    minimal : {"ap4p", "aepnp"}
-        The minimal solver: on 4 points, or the linear one on 6, as in the AEPnP paper, which wants
-        the focal length known. Neither finds anything where all keypoints lie in one plane.
-    refine : bool
-        Optimise new best hypotheses locally, and the final one on all its inliers. Without it the
-        best hypothesis is returned as the minimal solver left it.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range.
-    """
-
-    max_reproj_error: float = 4.0
-    max_iterations: int = 10_000
-    min_iterations: int = 100
-    success_prob: float = 0.9999
-    seed: int = 0
-    minimal: str = "ap4p"
-    refine: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0 < self.max_reproj_error < np.inf:
-            raise InputError(f"{self.max_reproj_error} is not positive", where="max_reproj_error")
-        for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
-            value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < least:
-                raise InputError(f"{value!r} is not a number of at least {least}", where=name)
-        if not 0 < self.success_prob < 1:
-            raise InputError(f"{self.success_prob} is not between 0 and 1", where="success_prob")
-        if self.minimal not in MINIMAL_SOLVERS:
-            raise InputError(
-                f"unknown minimal solver {self.minimal!r}",
-                where="minimal",
-                fix=f"known are {', '.join(MINIMAL_SOLVERS)}",
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +54,7 @@ class Consensus:
 
 def find_consensus(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     ransac: RansacOptions,
     confidences: npt.ArrayLike | None = None,
 ) -> Consensus:
@@ -115,7 +63,7 @@ def find_consensus(
     Parameters
     ----------
     problems : Problems
-    options : Options
+    options : FitOptions
         Known axis, stretch, and whether the focal length is known.
     ransac : RansacOptions
     confidences : (n,) float, optional
@@ -185,7 +133,7 @@ def find_consensus(
             views.whitening,
             np.log(views.focals),
             *log_limits(camera, options.focal_prior),
-            *log_prior(options.focal_prior),
+            *options.log_focal_prior,
             threshold,
             max_iterations,
             min_iterations,
@@ -228,7 +176,7 @@ def find_consensus(
 
 
 def _objective(
-    points: FloatArray, rays: FloatArray, whitening: FloatArray, options: Options
+    points: FloatArray, rays: FloatArray, whitening: FloatArray, options: FitOptions
 ) -> Objective:
     return Objective(points, rays, whitening, LINEAR, 1.0, options.prior_weight, options.free)
 

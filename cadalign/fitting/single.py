@@ -11,10 +11,10 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray
 from cadalign.errors import InputError
 from cadalign.fitting.estimation import Solutions, solve
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import FitOptions, RansacOptions
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.result import Alternative, FitResult, FitStats
-from cadalign.fitting.robust import Consensus, RansacOptions, find_consensus, residuals_of
+from cadalign.fitting.robust import Consensus, find_consensus, residuals_of
 from cadalign.geometry.alignment import Alignment
 
 LEAST_LIKELIHOOD = 1e-3
@@ -24,7 +24,7 @@ _INLIER_ROUNDS = 5
 
 def fit_robustly(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     ransac: RansacOptions,
     confidences: npt.ArrayLike | None,
     start: float,
@@ -67,7 +67,7 @@ def fit_robustly(
 
 
 def _fit_inliers(
-    problems: Problems, options: Options, inliers: BoolArray, start: float
+    problems: Problems, options: FitOptions, inliers: BoolArray, start: float
 ) -> FitResult:
     """The optimum for some of the only problem's keypoints."""
     sigma = options.sigma
@@ -82,7 +82,7 @@ def _fit_inliers(
     return fit_all(some, replace(options, sigma=sigma), start)
 
 
-def _unrefined(problems: Problems, options: Options, consensus: Consensus) -> FitResult:
+def _unrefined(problems: Problems, options: FitOptions, consensus: Consensus) -> FitResult:
     """The best hypothesis as the minimal solver left it."""
     count = len(problems.points_3d)
     return FitResult(
@@ -99,7 +99,7 @@ def _unrefined(problems: Problems, options: Options, consensus: Consensus) -> Fi
     )
 
 
-def fit_all(problems: Problems, options: Options, start: float) -> FitResult:
+def fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult:
     """Fit the only problem to all its keypoints."""
     solutions = solve(problems, options)
     if solutions.errors:
@@ -126,7 +126,7 @@ def fit_all(problems: Problems, options: Options, start: float) -> FitResult:
 
 
 def _alternatives(
-    problems: Problems, solutions: Solutions, minima: int, options: Options
+    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
 ) -> tuple[Alternative, ...]:
     """The other minima that are likely enough."""
     costs = solutions.costs[0, :minima]

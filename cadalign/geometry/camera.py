@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_points
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.distortion import distort, undistort
 
@@ -74,12 +74,13 @@ class Camera:
         for name in ("width", "height"):
             size = getattr(self, name)
             if not _is_number(size) or int(size) != size or size < 1:
-                raise InputError(f"{size!r} is not a size", where=f"camera.{name}", fix=_SIZE_FIX)
+                what = f"{quote(size)} is not a size"
+                raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
             object.__setattr__(self, name, int(size))
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
             if not _is_number(value):
-                raise InputError(f"{value!r} is not a finite number", where=f"camera.{name}")
+                raise InputError(f"{quote(value)} is not a finite number", where=f"camera.{name}")
             object.__setattr__(self, name, float(value))
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
@@ -94,7 +95,7 @@ class Camera:
             raise InputError("not a sequence of numbers", where="camera.distortion") from None
         if len(coefficients) not in (0, 4, 5, 8) or not np.isfinite(coefficients).all():
             raise InputError(
-                f"{coefficients!r} are not distortion coefficients",
+                f"{quote(coefficients)} are not distortion coefficients",
                 where="camera.distortion",
                 fix="give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6",
             )
@@ -117,7 +118,7 @@ class Camera:
         320.0
         """
         if not _is_number(fov_x) or not 0 < fov_x < 180:
-            raise InputError(f"{fov_x!r} is not between 0 and 180 degrees", where="fov_x")
+            raise InputError(f"{quote(fov_x)} is not between 0 and 180 degrees", where="fov_x")
         focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
@@ -155,7 +156,9 @@ class Camera:
         """
         if not _is_number(width) or not _is_number(height) or min(width, height) < 1:
             raise InputError(
-                f"{width!r} x {height!r} is not a size", where="camera.width", fix=_SIZE_FIX
+                f"{quote(width)} x {quote(height)} is not a size",
+                where="camera.width",
+                fix=_SIZE_FIX,
             )
         placeholder = float(max(width, height))
         return cls(
@@ -364,13 +367,13 @@ class Camera:
         if not isinstance(model, str) or model not in COLMAP_PARAMS:
             known = ", ".join(COLMAP_PARAMS)
             raise InputError(
-                f"unknown model {model!r}", where="camera.model", fix=f"known are {known}"
+                f"unknown model {quote(model)}", where="camera.model", fix=f"known are {known}"
             )
         names = COLMAP_PARAMS[model]
         params = data["params"]
         if not isinstance(params, list | tuple | np.ndarray) or len(params) != len(names):
             raise InputError(
-                f"{params!r} are not the parameters of {model}",
+                f"{quote(params)} are not the parameters of {model}",
                 where="camera.params",
                 fix=f"give {', '.join(names)}",
             )
@@ -379,7 +382,8 @@ class Camera:
         is_known = any(values[name] is not None for name in focals)
         for name, value in values.items():
             if not _is_number(value) and (is_known or name not in focals):
-                raise InputError(f"{name} is {value!r}, not a finite number", where="camera.params")
+                what = f"{name} is {quote(value)}, not a finite number"
+                raise InputError(what, where="camera.params")
         coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
         cx, cy = values["cx"] - PIXEL_CENTRE, values["cy"] - PIXEL_CENTRE
         distortion = coefficients if any(coefficients[4:]) else coefficients[:4]

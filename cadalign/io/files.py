@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and errors that say what to do."""
+"""Atomic writes: a file is there whole or as it was, and errors name it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import DataError
+
+_MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -28,8 +30,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         If that is not possible.
     """
     # The true ending stays last: some writers go by it.
-    unfinished = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
+    name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
     with writing(path):
+        unfinished = path.with_name(f".unfinished-{os.getpid()}-{name}")
         try:
             write(unfinished)
             os.replace(unfinished, path)
@@ -72,7 +75,9 @@ def _finite(value: Any) -> Any:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into ours."""
+    """Convert errors of the file system to `DataError`."""
+    if "\0" in str(path):
+        raise DataError("the path holds a NUL character", where=repr(str(path))[:200])
     try:
         yield
     except OSError as error:

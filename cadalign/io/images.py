@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import DataError
+from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -35,13 +36,18 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """
     from PIL import Image, UnidentifiedImageError
 
+    path = Path(path)
     try:
+        # Waiting for the other end of a pipe could take for ever, and images need random access.
+        if path.exists() and not path.is_file():
+            raise OSError("not a regular file")
         with Image.open(path) as image:
             yield image
     except FileNotFoundError:
         raise DataError("no such file", where=str(path)) from None
     except (
         OSError,
+        ValueError,  # a NUL in the path
         SyntaxError,  # Pillow's word for a broken PNG
         UnidentifiedImageError,
         Image.DecompressionBombError,
@@ -97,19 +103,17 @@ def read_image(path: Path, camera: Camera) -> ByteImage:
 
 
 def write_image(path: Path, image: ByteImage) -> None:
-    """Write an RGB image (h, w, 3) uint8 as PNG.
+    """Write an RGB image (h, w, 3) uint8, or RGBA (h, w, 4), as PNG, whole or not at all.
 
     Raises
     ------
     DataError
         If the file cannot be written.
     """
-    import cv2
+    import cv2  # on first use: it takes longer to import than all the rest
 
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    try:
-        if not encoded:
-            raise OSError("the picture could not be encoded")
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise DataError(f"cannot be written ({error})", where=str(path)) from None
+    colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, colors))
+    if not encoded:
+        raise DataError("the picture cannot be encoded as PNG", where=str(path))
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))

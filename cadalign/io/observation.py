@@ -28,28 +28,50 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
+from msgspec import Meta
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import DataError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import write_json
-from cadalign.io.json_file import (
-    as_index,
-    as_number,
-    as_object,
-    as_text,
+from cadalign.io.documents import (
+    Document,
+    Index,
+    NotNegative,
+    PathText,
+    Point2,
+    Point3,
+    Positive,
+    Text,
+    convert,
     in_file,
+    path_from,
     read_json,
-    refuse_unknown,
     written_path,
 )
+from cadalign.io.files import write_json
 
-_FIELDS = {"camera", "keypoints", "image", "model"}
-_KEYPOINT_FIELDS = {"xyz", "uv", "sigma", "semantic_id", "name", "confidence"}
+
+class _Keypoint(Document):
+    """One entry of ``keypoints``, as the module's documentation describes it."""
+
+    xyz: Point3
+    uv: Point2
+    sigma: Positive | None = None
+    semantic_id: Index | None = None
+    name: Text | None = None
+    confidence: NotNegative | None = None
+
+
+class _ObservationFile(Document):
+    """The file's only object."""
+
+    camera: Any  # in the form of `Camera.from_dict`
+    keypoints: Annotated[list[_Keypoint], Meta(min_length=1)]
+    image: PathText | None = None
+    model: PathText | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +88,11 @@ class Observation:
     sigma : (n,) float, optional
         Standard deviation of each image point [px].
     semantic_ids : (n,) int, optional
-        What each keypoint means; the same number on all models of a category.
+        Meaning of each keypoint; the same number on all models of a category.
     names : tuple of n str, optional
-        What each keypoint is called.
+        Name of each keypoint.
     confidences : (n,) float, optional
-        How much each keypoint is trusted, for the ``confidences`` of `cadalign.fit`.
+        Trust in each keypoint, for the ``confidences`` of `cadalign.fit`.
     image, model : Path, optional
         The photo and the CAD model.
     """
@@ -114,27 +136,19 @@ class Observation:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        data = as_object(data, where=None)
-        refuse_unknown(data, _FIELDS, where="top level")
-        for name in ("camera", "keypoints"):
-            if name not in data:
-                raise DataError("missing", where=name)
-        keypoints = data["keypoints"]
-        if not isinstance(keypoints, list) or not keypoints:
-            raise DataError("expected a list of at least one keypoint", where="keypoints")
-        for i, keypoint in enumerate(keypoints):
-            _check_keypoint(keypoint, where=f"keypoints[{i}]")
-        names = _column(keypoints, "name", np.str_)
+        read: _ObservationFile = convert(data, _ObservationFile)
+        names = _column(read.keypoints, "name")
+        ids = _column(read.keypoints, "semantic_id")
         return cls(
-            points_3d=np.array([keypoint["xyz"] for keypoint in keypoints], dtype=float),
-            points_2d=np.array([keypoint["uv"] for keypoint in keypoints], dtype=float),
-            camera=Camera.from_dict(data["camera"]),
-            sigma=_column(keypoints, "sigma", np.float64),
-            semantic_ids=_column(keypoints, "semantic_id", np.int64),
-            names=None if names is None else tuple(names.tolist()),
-            confidences=_column(keypoints, "confidence", np.float64),
-            image=_path(data, "image", folder),
-            model=_path(data, "model", folder),
+            points_3d=np.array([keypoint.xyz for keypoint in read.keypoints]),
+            points_2d=np.array([keypoint.uv for keypoint in read.keypoints]),
+            camera=Camera.from_dict(read.camera),
+            sigma=_column(read.keypoints, "sigma"),
+            semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
+            names=None if names is None else tuple(names),
+            confidences=_column(read.keypoints, "confidence"),
+            image=None if read.image is None else path_from(read.image, folder),
+            model=None if read.model is None else path_from(read.model, folder),
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
@@ -164,40 +178,16 @@ class Observation:
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
 
-def _check_keypoint(keypoint: Any, *, where: str) -> None:
-    """Refuse a keypoint that lacks a field or holds something else than finite numbers."""
-    keypoint = as_object(keypoint, where=where)
-    refuse_unknown(keypoint, _KEYPOINT_FIELDS, where=where)
-    for name, length in (("xyz", 3), ("uv", 2)):
-        if name not in keypoint:
-            raise DataError("missing", where=f"{where}.{name}")
-        as_floats(keypoint[name], name=f"{where}.{name}", shape=(length,))
-    if "sigma" in keypoint and not as_number(keypoint["sigma"], where=f"{where}.sigma") > 0:
-        raise DataError("is not positive", where=f"{where}.sigma")
-    if as_number(keypoint.get("confidence", 0.0), where=f"{where}.confidence") < 0:
-        raise DataError("is negative", where=f"{where}.confidence")
-    as_text(keypoint.get("name", "none"), where=f"{where}.name")
-    as_index(keypoint.get("semantic_id", 0), where=f"{where}.semantic_id")
-
-
-def _column(keypoints: list[Any], name: str, kind: Any) -> npt.NDArray[Any] | None:
-    """One optional field of all keypoints."""
-    present = [name in keypoint for keypoint in keypoints]
-    if not any(present):
+def _column(keypoints: list[_Keypoint], name: str) -> Any:
+    """One optional field of all keypoints as a list; None where none has it."""
+    values = [getattr(keypoint, name) for keypoint in keypoints]
+    missing = [row for row, value in enumerate(values) if value is None]
+    if len(missing) == len(values):
         return None
-    if not all(present):
+    if missing:
         raise DataError(
             "missing, though other keypoints have it",
-            where=f"keypoints[{present.index(False)}].{name}",
+            where=f"keypoints[{missing[0]}].{name}",
             fix="give it for all keypoints or for none",
         )
-    return np.array([keypoint[name] for keypoint in keypoints], dtype=kind)
-
-
-def _path(data: Mapping[str, Any], name: str, folder: Path | None) -> Path | None:
-    value = data.get(name)
-    if value is None:
-        return None
-    if not isinstance(value, str):
-        raise DataError(f"{value!r} is not a path", where=name)
-    return folder / value if folder is not None else Path(value)
+    return values

@@ -1,56 +1,33 @@
-"""Headline tables: their columns and rows, the best values, the failures by reason."""
+"""Headline tables: their rows, the best values, the failures by reason."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-
 from cadalign.evaluation.accuracy.methods import LIMIT
-from cadalign.evaluation.accuracy.outcome import FAILED
-from cadalign.report.looks import HIGH, LOW
+from cadalign.evaluation.metrics import HIGH, Metric
+from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.registry import spec_of
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.summary import Line, group_name
 
 _MOST_REASONS = 200
 OTHER_REASONS = "other reasons"
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of numbers.
-
-    Parameters
-    ----------
-    key, label, unit : str
-    digits : int
-        Shown after the point.
-    better : {"low", "high"}, optional
-        Which values are better; None for those that are no quality, such as counts.
-    factor : float
-        Of the summary's value.
-    """
-
-    key: str
-    label: str
-    unit: str = ""
-    digits: int = 2
-    better: str | None = LOW
-    factor: float = 1.0
-
-
-@dataclass(frozen=True)
 class HeadlineRow:
-    """What one method reached.
+    """Numbers of one method on one group of tasks.
 
     Parameters
     ----------
     run : int
-        Which of the runs.
+        Place of the run.
     category : str
-        Or the value that was varied.
+        The group: a category, or the value that was varied.
     method : str
     cells : dict of str to float
         By column, as displayed; None where there is none.
@@ -64,10 +41,16 @@ class HeadlineRow:
     cells: dict[str, float | None]
     best: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, run: int, line: Line, columns: Sequence[Metric]) -> HeadlineRow:
+        """A row of a line's values, in the columns' units."""
+        cells = {column.key: column.shown(line.values.get(column.key)) for column in columns}
+        return cls(run, line.group, line.method, cells)
+
 
 @dataclass(frozen=True)
 class Failure:
-    """Why instances failed, and how many."""
+    """A reason of failures, and their number."""
 
     run: int
     category: str
@@ -83,87 +66,93 @@ class Headline:
     Parameters
     ----------
     group : str
-        What ``category`` is.
-    columns : tuple of Column
+        Name of the groups, which is the head of their column.
+    columns : tuple of Metric
     rows : list of HeadlineRow
     failures : list of Failure
     paper : list of HeadlineRow
-        What the AEPnP paper states on the same categories.
+        Published numbers on the same groups.
     note : str
     """
 
     group: str
-    columns: tuple[Column, ...]
+    columns: tuple[Metric, ...]
     rows: list[HeadlineRow]
     failures: list[Failure] = field(default_factory=list)
     paper: list[HeadlineRow] = field(default_factory=list)
     note: str = ""
 
-
-COUNTS = (
-    Column("instances", "instances", digits=0, better=None),
-    Column("failed", "failed", digits=0, better=None),
-)
-
-
-def varied(column: str, value: float) -> str:
-    """A value that was varied, as its axis has it."""
-    return f"{100 * value:g}" if column in ("outliers", "outlier_share") else f"{value:g}"
-
-
-def headline_row(
-    run: int, category: str, method: str, values: dict[str, Any], columns: Sequence[Column]
-) -> HeadlineRow:
-    """A row of a summary's values by column, in the columns' units."""
-    cells: dict[str, float | None] = {}
-    for column in columns:
-        value = values.get(column.key)
-        known = value is not None and np.isfinite(value)
-        cells[column.key] = column.factor * value if known and value is not None else None
-    return HeadlineRow(run, category, method, cells)
+    def to_dict(self) -> dict[str, Any]:
+        """The table for the page."""
+        return {
+            "group": self.group,
+            "columns": [column.column() for column in self.columns],
+            "rows": [asdict(row) for row in self.rows],
+            "failures": [asdict(failure) for failure in self.failures],
+            "paper": [
+                {"category": row.category, "method": row.method, "cells": row.cells}
+                for row in self.paper
+            ],
+            "note": self.note,
+        }
 
 
-def with_best(rows: Sequence[HeadlineRow], columns: Sequence[Column]) -> list[HeadlineRow]:
-    """The rows with the best ones marked, among methods on the same; the limit is out of it."""
+def headline_of(runs: Sequence[Run]) -> Headline:
+    """The headline table of runs of one kind."""
+    spec, group = spec_of(runs[0]), spec_of(runs[0]).group(runs[0])
+    lines = [list(spec.lines(spec.summarize(run))) for run in runs]
+    columns = spec.shown_columns([line for found in lines for line in found])
+    rows, failures = [], []
+    for index, run in enumerate(runs):
+        rows += _with_best([HeadlineRow.of(index, line, columns) for line in lines[index]], columns)
+        failures += _failures(index, run, group)
+    stated = spec.reference(runs, {row.category for row in rows})
+    return Headline(
+        group=group.heading,
+        columns=tuple(columns),
+        rows=rows,
+        failures=failures,
+        paper=[HeadlineRow.of(0, line, columns) for line in stated.lines],
+        note=f"{spec.note} {stated.note}".strip(),
+    )
+
+
+def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
+    """The rows with the best ones marked, among methods on the same, without the bound."""
     best: dict[tuple[str, str], float] = {}
-    rivals = Counter(row.category for row in rows if row.method != LIMIT)
+    rivals = [row for row in rows if row.method != LIMIT]
     for column in columns:
-        for row in rows:
+        choose = max if column.better == HIGH else min
+        for row in rivals:
             value = row.cells[column.key]
-            if column.better is None or row.method == LIMIT or value is None:
-                continue
-            place = (row.category, column.key)
-            choose = max if column.better == HIGH else min
-            best[place] = choose(best.get(place, value), value)
-    return [
-        HeadlineRow(
-            row.run,
-            row.category,
-            row.method,
-            row.cells,
-            tuple(
-                column.key
-                for column in columns
-                if row.method != LIMIT
-                and rivals[row.category] > 1
-                and row.cells[column.key] is not None
-                and row.cells[column.key] == best.get((row.category, column.key))
-            ),
+            if column.better is not None and value is not None:
+                place = (row.category, column.key)
+                best[place] = choose(best.get(place, value), value)
+    counts = Counter(row.category for row in rivals)
+
+    def marked(row: HeadlineRow) -> tuple[str, ...]:
+        if row.method == LIMIT or counts[row.category] < 2:
+            return ()
+        return tuple(
+            column.key
+            for column in columns
+            if row.cells[column.key] is not None
+            and row.cells[column.key] == best.get((row.category, column.key))
         )
-        for row in rows
-    ]
+
+    return [replace(row, best=marked(row)) for row in rows]
 
 
-def failures_of(run: int, results: pa.Table, group: str) -> list[Failure]:
+def _failures(index: int, run: Run, group: Metric) -> list[Failure]:
     """Reasons with their numbers, the most frequent first; rare ones beyond a number as one."""
-    chosen = [results[name].to_pylist() for name in (group, "method", "status", "reason")]
+    chosen = [run.results[name].to_pylist() for name in (group.key, "method", "status", "reason")]
     counts = Counter(
-        (category if isinstance(category, str) else varied(group, category), method, reason)
-        for category, method, status, reason in zip(*chosen, strict=True)
+        (group_name(group, value), method, reason)
+        for value, method, status, reason in zip(*chosen, strict=True)
         if status == FAILED
     )
     listed = counts.most_common(_MOST_REASONS)
     rest: Counter[tuple[str, str, str]] = Counter()
     for (category, method, _), count in counts.most_common()[_MOST_REASONS:]:
         rest[category, method, OTHER_REASONS] += count
-    return [Failure(run, *names, count) for names, count in (*listed, *rest.items())]
+    return [Failure(index, *names, count) for names, count in (*listed, *rest.items())]

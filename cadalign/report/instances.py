@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from cadalign.evaluation.accuracy.outcome import OK
-from cadalign.report.looks import METRICS
-from cadalign.report.runs import Run
+from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.plots import compact
+from cadalign.evaluation.runs.opened import Run
 
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
-_DIGITS = 6
 _TEXTS = ("category", "model", "visibility", "symmetry")
 
 
@@ -45,8 +42,10 @@ class InstanceTable:
         return {"strings": self.strings, "instances": self.instances, "rows": self.rows}
 
 
-def instance_table(runs: Sequence[Run], methods: Sequence[str]) -> InstanceTable:
-    """The table of runs over views of models; ``methods`` are all of theirs."""
+def instance_table(
+    runs: Sequence[Run], methods: Sequence[str], metrics: Sequence[Metric]
+) -> InstanceTable:
+    """The table of runs over views of models, their methods and metrics of the rows."""
     texts = _Texts()
     columns = (
         *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
@@ -54,12 +53,12 @@ def instance_table(runs: Sequence[Run], methods: Sequence[str]) -> InstanceTable
     )
     instances: dict[str, list[Any]] = {name: [] for name in columns}
     rows: dict[str, list[Any]] = {name: [] for name in ("instance", "method", "status", "reason")}
-    rows |= {metric.key: [] for metric in METRICS}
+    rows |= {metric.key: [] for metric in metrics}
     places: dict[tuple[int, InstanceName], int] = {}
     ids: dict[InstanceName, int] = {}
     number = {name: place for place, name in enumerate(methods)}
     for run_index, run in enumerate(runs):
-        cells = _cells(run)
+        cells = _cells(run, metrics)
         names = list(zip(cells["category"], cells["model_id"], cells["view"], strict=True))
         for row, name in enumerate(names):
             key = (run_index, name)
@@ -86,7 +85,7 @@ def instance_table(runs: Sequence[Run], methods: Sequence[str]) -> InstanceTable
             rows["reason"].append(texts.place(reason) if reason else -1)
         rows["method"] += [number[name] for name in cells["method"]]
         rows["status"] += [int(status != OK) for status in cells["status"]]
-        for metric in METRICS:
+        for metric in metrics:
             rows[metric.key] += cells[metric.key]
     return InstanceTable(texts.found, instances, rows, places)
 
@@ -110,27 +109,13 @@ def _append(columns: dict[str, list[Any]], **cells: Any) -> None:
         columns[name].append(cell)
 
 
-def _cells(run: Run) -> dict[str, list[Any]]:
+def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     """The columns of a run's results as lists; None where an older run has none."""
     table = run.results
     wanted = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
-    numbers = ("stretch_y", "stretch_z", *(metric.key for metric in METRICS))
+    numbers = ("stretch_y", "stretch_z", *(metric.key for metric in metrics))
     cells = {name: table[name].to_pylist() for name in (*wanted, "visibility", "symmetry")}
     for name in numbers:
-        if name in table.column_names:
-            cells[name] = compact(table[name].to_numpy(zero_copy_only=False))
-        else:
-            cells[name] = [None] * len(table)
+        known = name in table.column_names
+        cells[name] = compact(run.column(name)) if known else [None] * len(table)
     return cells
-
-
-def compact(values: npt.ArrayLike) -> list[float | None]:
-    """Numbers with 6 digits; None for what is not finite.
-
-    Examples
-    --------
-    >>> compact([1 / 3, float("nan"), 2.0])
-    [0.333333, None, 2.0]
-    """
-    numbers = np.asarray(values, dtype=float).tolist()
-    return [float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in numbers]

@@ -1,4 +1,4 @@
-"""Pictures, models and details of instances: inside the page, or in files beside it."""
+"""Pictures, mesh previews and records of instances: inside the page, or in files beside it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 from urllib.parse import quote
 
 from cadalign.errors import DataError
-from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.evaluation.instances.record import record_stem
+from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import dense_json, write_text, write_whole, writing
 from cadalign.report.instances import InstanceName, InstanceTable
-from cadalign.report.runs import Run
 
 INLINE_LIMIT = 60_000_000
 """A page that would be larger has its pictures in files beside it [bytes]."""
@@ -25,21 +25,21 @@ _PER_FILE = 64
 
 
 def inline_bytes(runs: Sequence[Run]) -> int:
-    """About how large a page with everything inside is [bytes]."""
+    """Rough size of a page with everything inside [bytes]."""
     files = [
         path
         for run in runs
-        for folder in (run.folder.pictures, run.folder.thumbs, run.folder.sketches)
+        for folder in (run.folder.pictures, run.folder.thumbs, run.folder.previews)
         if folder.is_dir()
         for path in folder.iterdir()
     ]
     pictures = sum(path.stat().st_size for path in files)
-    return sum(run.exhibit_bytes() for run in runs) + pictures * 4 // 3
+    return sum(run.record_bytes() for run in runs) + pictures * 4 // 3
 
 
 @dataclass
-class Shelf:
-    """Where pictures, models and exhibits of a page are put.
+class AssetStore:
+    """Pictures, mesh previews and instance records of a page.
 
     Parameters
     ----------
@@ -54,11 +54,11 @@ class Shelf:
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)
-    exhibits: dict[str, str] = field(default_factory=dict)
+    records: dict[str, str] = field(default_factory=dict)
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
-        """Take in what runs have to show, and note in the table where it is.
+        """Take in the pictures and records of runs, and enter their keys in the table.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class Shelf:
                     for old in self.assets.glob(pattern):
                         old.unlink()
         for index, run in enumerate(runs):
-            for row in run.exhibits():
+            for row in run.records():
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
                 if place is None:
@@ -85,10 +85,10 @@ class Shelf:
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
                 # As text: there may be many. Both are objects, joined to one.
-                self.exhibits[str(place)] = f"{dense_json(keys)[:-1]},{row['exhibit'][1:]}"
+                self.records[str(place)] = f"{dense_json(keys)[:-1]},{row['exhibit'][1:]}"
 
     def to_dict(self) -> dict[str, Any]:
-        """What the page is told; writes the files that are beside it.
+        """The page's part of it; writes the files that are beside the page.
 
         Raises
         ------
@@ -97,11 +97,11 @@ class Shelf:
         """
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
-            exhibits = {key: json.loads(text) for key, text in self.exhibits.items()}
+            exhibits = {key: json.loads(text) for key, text in self.records.items()}
             return {**found, "exhibits": exhibits, "meshes": self.meshes}
         return {
             **found,
-            "exhibit_files": self._write_exhibits(),
+            "exhibit_files": self._write_records(),
             "exhibits_per_file": _PER_FILE,
             "mesh_files": {
                 key: self._write_script(
@@ -111,20 +111,20 @@ class Shelf:
             },
         }
 
-    def _image(self, folder: Path, name: InstanceName, shelf: dict[str, str]) -> str | None:
-        """Put a picture of an instance on one of the shelves; its key, None where there is none."""
-        data = _read(folder / f"{exhibit_stem(*name)}.webp")
+    def _image(self, folder: Path, name: InstanceName, store: dict[str, str]) -> str | None:
+        """Store a picture of an instance; its key, None where there is none."""
+        data = _read(folder / f"{record_stem(*name)}.webp")
         if data is None:
             return None
         digest = (folder.name, hashlib.sha256(data).digest())  # compared runs show the same ones
         if digest not in self._known:
-            key = str(len(shelf))
-            shelf[key] = self._stored(data, f"{folder.name[:-1]}_{int(key):06d}.webp")
+            key = str(len(store))
+            store[key] = self._stored(data, f"{folder.name[:-1]}_{int(key):06d}.webp")
             self._known[digest] = key
         return self._known[digest]
 
     def _mesh(self, run: Run, name: InstanceName) -> str | None:
-        data = _read(run.folder.sketches / f"{exhibit_stem(*name[:2])}.json")
+        data = _read(run.folder.previews / f"{record_stem(*name[:2])}.json")
         if data is None:
             return None
         digest = ("mesh", hashlib.sha256(data).digest())
@@ -141,9 +141,9 @@ class Shelf:
         write_whole(self.assets / name, lambda path: path.write_bytes(data))
         return self._address(name)
 
-    def _write_exhibits(self) -> list[str]:
+    def _write_records(self) -> list[str]:
         files: list[list[str]] = []
-        for key, text in self.exhibits.items():
+        for key, text in self.records.items():
             index = int(key) // _PER_FILE
             files += [[] for _ in range(index + 1 - len(files))]
             files[index].append(f"cadalignExhibit({key}, {text})")

@@ -9,34 +9,16 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from cadalign.evaluation.registry import spec_of
 from cadalign.io.files import dense_json, write_text, writing
-from cadalign.report.headlines import headline_of
+from cadalign.report.headline import headline_of
 from cadalign.report.instances import instance_table
-from cadalign.report.media import INLINE_LIMIT, Shelf, inline_bytes
-from cadalign.report.payload import all_methods, payload_of
-from cadalign.report.runs import INSTANCES, read_runs
-from cadalign.report.words import title_of
-from cadalign.web import asset
+from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
+from cadalign.report.payload import payload_of
+from cadalign.report.runs import all_methods, read_runs
+from cadalign.report.text import title_of
+from cadalign.web import asset, fill
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta name="generator" content="cadalign">
-<link rel="icon" href="data:,">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<noscript>This page needs JavaScript. The same tables without it: cadalign report --format md
-</noscript>
-<script type="application/json" id="payload">{payload}</script>
-<script>{script}</script>
-</body>
-</html>
-"""
 # JSON may have these escaped anywhere they can stand; HTML must not see them.
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -73,7 +55,7 @@ def write_report(
     path : path-like
         The page to write.
     assets : bool
-        Whether pictures go into a folder beside the page, named after it; they do so in any case if
+        Put pictures into a folder beside the page, named after it; they go there in any case if
         the page were larger than 60 MB.
     title : str, optional
         By default it says what was run on what.
@@ -100,13 +82,14 @@ def write_report(
         page.parent.mkdir(parents=True, exist_ok=True)
     table, media = None, {}
     folder = None
-    if found[0].family == INSTANCES:
-        table = instance_table(found, all_methods(found))
+    metrics = spec_of(found[0]).metrics
+    if metrics:
+        table = instance_table(found, all_methods(found), metrics)
         if assets or inline_bytes(found) > INLINE_LIMIT:
             folder = page.with_name(f"{page.stem}_assets")
-        shelf = Shelf(page, folder)
-        shelf.fill(found, table)
-        media = shelf.to_dict()
+        store = AssetStore(page, folder)
+        store.fill(found, table)
+        media = store.to_dict()
     payload = payload_of(found, headline_of(found), table, media, title=title or title_of(found))
     write_text(page, render_page(payload))
     return Report(page, folder)
@@ -114,7 +97,8 @@ def write_report(
 
 def render_page(payload: dict[str, Any]) -> str:
     """The HTML of a payload; texts in it cannot become part of the page."""
-    return _PAGE.format(
+    return fill(
+        "report.html",
         title=escape(str(payload["title"])),
         style=asset("report.css"),
         payload=dense_json(payload).translate(_ESCAPES),

@@ -1,12 +1,11 @@
-"""What the page is told: one JSON object. Its reader is ``cadalign/web/report``.
+"""Payload of the page: one JSON object. Its reader is ``cadalign/web/report``.
 
 ::
 
     {
       "format": 1,
       "title": "...", "summary": "one paragraph of plain text",
-      "runs": [{"name", "what": "keypointnet" | "demo" | "simulation" | "correspondences"
-                         | "retrieval",
+      "runs": [{"name", "what": the experiment's name,
                 "state": "finished" | "unfinished", "done", "total", "settings": [[name, value]]}],
       "methods": [{"key", "label", "color", "color_dark", "dash": "solid" | "dash", "is_limit"}],
       "metrics": [{"key", "label", "unit", "factor", "digits", "better": "low" | "high", "log",
@@ -34,12 +33,11 @@ of several runs; ``true_y`` and ``true_z`` are what the model was stretched by. 
 as results have them: shown is the value times the metric's ``factor``. ``limit``, the cells of the
 headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
 
-``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is what
-`cadalign.evaluation.instances.record` describes, with the keys of its ``picture``, which has no
-boxes drawn in as thumbs have, and of its
-``mesh``, both null where there is none. A mesh is what
-`cadalign.evaluation.instances.preview` makes of the
-dataset's model: that, times the exhibit's ``stretch``, is the model that methods were given.
+``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is an instance record
+(`cadalign.evaluation.instances.record`) with the keys of its ``picture``, which has no boxes drawn
+in as thumbs have, and of its ``mesh``, both null where there is none. A mesh is a preview
+(`cadalign.evaluation.instances.preview`) of the dataset's model: that, times the exhibit's
+``stretch``, is the model that methods were given.
 
 Where pictures are in a folder beside the page, instead of ``exhibits`` and ``meshes`` there are
 ``exhibit_files``, scripts that call ``cadalignExhibit(key, exhibit)`` for ``exhibits_per_file``
@@ -50,15 +48,15 @@ keys each (key k is in file k / exhibits_per_file), and ``mesh_files``, by key, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
-from cadalign.report.headline import Column, Headline
+from cadalign.evaluation.registry import spec_of
+from cadalign.evaluation.runs.opened import Run
+from cadalign.report.headline import Headline
 from cadalign.report.instances import InstanceTable
-from cadalign.report.looks import METRICS, method_dict
-from cadalign.report.plots import line_plots
-from cadalign.report.runs import INSTANCES, Run
-from cadalign.report.words import settings_of, summary_of
+from cadalign.report.looks import method_dict
+from cadalign.report.runs import all_methods
+from cadalign.report.text import settings_of, summary_of
 
 _FORMAT = 1
 
@@ -76,14 +74,16 @@ def payload_of(
     Parameters
     ----------
     runs : sequence of Run
-        Of one family.
+        Of one kind.
     headline : Headline
     table : InstanceTable, optional
         For runs that have instances.
     media : dict
-        Pictures, thumbs, exhibits and meshes; see `cadalign.report.media.Shelf`.
+        Pictures, thumbs, instance records and mesh previews; see
+        `cadalign.report.media.AssetStore`.
     title : str
     """
+    spec = spec_of(runs[0])
     return {
         "format": _FORMAT,
         "title": title,
@@ -91,7 +91,7 @@ def payload_of(
         "runs": [
             {
                 "name": run.name,
-                "what": run.experiment if run.family == INSTANCES else run.family,
+                "what": run.experiment,
                 "state": "finished" if run.is_finished else "unfinished",
                 "done": run.done,
                 "total": run.total,
@@ -100,34 +100,9 @@ def payload_of(
             for run in runs
         ],
         "methods": [method_dict(name) for name in all_methods(runs)],
-        "metrics": [metric.to_dict() for metric in METRICS] if table is not None else [],
-        "headline": _headline(headline),
+        "metrics": [metric.page() for metric in spec.metrics],
+        "headline": headline.to_dict(),
         "tables": None if table is None else table.to_dict(),
-        "plots": line_plots(runs),
+        "plots": [plot.to_dict() for plot in spec.plots(runs)],
         **media,
     }
-
-
-def all_methods(runs: Sequence[Run]) -> list[str]:
-    """The methods of all runs, in the order of the first that has them."""
-    return list(dict.fromkeys(name for run in runs for name in run.methods))
-
-
-def _headline(headline: Headline) -> dict[str, Any]:
-    return {
-        "group": headline.group,
-        "columns": [_column(column) for column in headline.columns],
-        "rows": [asdict(row) for row in headline.rows],
-        "failures": [asdict(failure) for failure in headline.failures],
-        "paper": [
-            {"category": row.category, "method": row.method, "cells": row.cells}
-            for row in headline.paper
-        ],
-        "note": headline.note,
-    }
-
-
-def _column(column: Column) -> dict[str, Any]:
-    found = asdict(column)
-    del found["factor"]  # the cells are as shown
-    return found

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from cadalign.errors import InputError
 from cadalign.evaluation.accuracy.style import look_of
-from cadalign.report.headline import Column, Headline, HeadlineRow
-from cadalign.report.headlines import headline_of
+from cadalign.evaluation.metrics import Metric
+from cadalign.report.headline import Headline, HeadlineRow, headline_of
 from cadalign.report.runs import read_runs
 
 FORMATS = ("md", "csv", "latex")
@@ -85,7 +85,7 @@ def _csv(headline: Headline, names: Sequence[str]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     runs = ["run"] if len(names) > 1 else []
-    head = [_with_unit(column) for column in headline.columns]
+    head = [column.heading for column in headline.columns]
     writer.writerow([*runs, headline.group, "method", *head])
     for row, name in _rows(headline, names):
         cells = [row.cells[column.key] for column in headline.columns]
@@ -142,7 +142,7 @@ def _latex_line(cells: Sequence[str]) -> str:
 def _table(headline: Headline, names: Sequence[str]) -> tuple[list[str], list[list[_Cell]]]:
     """The head and the rows as text, numbers rounded."""
     runs = ["run"] if len(names) > 1 else []
-    head = [*runs, headline.group, "method", *(_with_unit(c) for c in headline.columns)]
+    head = [*runs, headline.group, "method", *(c.heading for c in headline.columns)]
     rows = []
     for row, name in _rows(headline, names):
         labels = [_Cell(name)] if runs else []
@@ -160,15 +160,11 @@ def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, s
     return rows
 
 
-def _number(row: HeadlineRow, column: Column) -> _Cell:
+def _number(row: HeadlineRow, column: Metric) -> _Cell:
     value = row.cells[column.key]
     if value is None:
         return _Cell(_NOTHING)
     return _Cell(f"{value:.{column.digits}f}", column.key in row.best)
-
-
-def _with_unit(column: Column) -> str:
-    return f"{column.label} [{column.unit}]" if column.unit else column.label
 
 
 def _in_markdown(text: str) -> str:

@@ -1,6 +1,6 @@
-"""Which model of a library is it, and how must it be stretched?
+"""Retrieval of CAD models: rank a library's models by an image's keypoints.
 
-`Library` holds the models, `Library.retrieve` ranks them; `Match` is what it returns.
+`Library` holds the models, `Library.retrieve` ranks them and returns each as a `Match`.
 """
 
 from importlib import import_module

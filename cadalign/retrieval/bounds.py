@@ -1,4 +1,4 @@
-"""A lower bound of what a model's errors can be, whatever its pose and stretch."""
+"""Lower bound of a model's squared errors over all poses and stretches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CANCELLATION = 1e-10
 
 @kernel
 def least_weights(whitening: FloatArray, count: int) -> FloatArray:
-    """How much a squared error of a ray counts at least, whatever its direction, (n,)."""
+    """Smallest weight of a squared error of each ray, over all directions, (n,)."""
     weights = np.empty(count)
     for i in range(count):
         w = i if whitening.shape[0] > 1 else 0
@@ -26,7 +26,7 @@ def least_weights(whitening: FloatArray, count: int) -> FloatArray:
 
 @kernel
 def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: FloatArray) -> float:
-    """A lower bound of the sum of squared whitened errors over all poses and stretches.
+    """Bound the sum of squared whitened errors over all poses and stretches from below.
 
     Let a_i = (1, x_i), and let a general linear camera take it to (c_x . a_i, c_y . a_i) / d_i with
     the depth d_i = c_z . a_i; poses of stretched models are some of these cameras. With w_i the

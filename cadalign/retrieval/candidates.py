@@ -1,4 +1,4 @@
-"""What a query is compared with: models, with their labels as they are or mirrored."""
+"""Candidates of a query: models with their own or mirrored keypoint labels."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Observed:
         [px]
     camera : Camera
     query : Query
-        The same for the kernels.
+        The keypoints for the kernels.
     spurious : float
-        Log-likelihood of all keypoints if none of them is the model's.
+        Log-likelihood of the keypoints if all of them are spurious.
     """
 
     semantic_ids: IntArray
@@ -83,7 +83,7 @@ def observe(
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
-    """Covariances of noise and shape together, (n, 2, 2) float [px^2], in the given order."""
+    """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
     count = len(pixels)
     dimensions = np.ndim(options.sigma)
     if dimensions == 3:
@@ -92,44 +92,44 @@ def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray)
         shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
         deviations = np.broadcast_to(as_floats(options.sigma, name="sigma", shape=shape), count)
         if not (deviations > 0).all():
-            raise InputError("has values that are not positive", where="sigma")
+            raise InputError("all values must be > 0", where="sigma")
         covariances = deviations[order][:, None, None] ** 2 * np.eye(2)
     extent = float(np.linalg.norm(np.ptp(pixels, axis=0))) if count else 0.0
     return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class CandidateSet:
     """The candidates of a query that share enough keypoints with it.
 
     Parameters
     ----------
-    candidates : Candidates
-        For the kernels.
+    keypoints : Candidates
+        Keypoints for the kernels.
     models : (c,) int
-        Of which row of the table each candidate is.
+        Row of each candidate's model in the table.
     mirrored : (c,) bool
     base : (c,) float
         Log-likelihood of a candidate that fits without error.
     bounds : (c,) float
-        Lower bounds of what twice the log-likelihood falls short of that.
+        Lower bounds of the costs, twice the loss of log-likelihood.
     """
 
-    candidates: Candidates
+    keypoints: Candidates
     models: IntArray
     mirrored: npt.NDArray[np.bool_]
     base: FloatArray
     bounds: FloatArray
 
 
-def gather_field(
+def gather_candidates(
     table: ModelTable,
     observed: Observed,
     options: RetrievalOptions,
     *,
     exclude: Collection[ModelKey] = (),
-) -> Field:
-    """Find the candidates of a query.
+) -> CandidateSet:
+    """Gather the candidates of a query.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def gather_field(
             fix=f"at least {LEAST_SHARED} are needed to align a model",
         )
     if observed.query.loss != _LINEAR:
-        bounds[:] = 0.0  # holds for squared errors only
+        bounds[:] = 0.0  # the bound is valid for squared errors only
     counts = candidates.spans[:, 1] - candidates.spans[:, 0]
     base = (
         gains
@@ -160,7 +160,7 @@ def gather_field(
         - np.log(labelings)
     )
     spans = np.ascontiguousarray(candidates.spans[kept])
-    return Field(
+    return CandidateSet(
         candidates._replace(spans=spans),
         models[kept],
         spans[:, 0] != spans[:, 2],
@@ -172,7 +172,7 @@ def gather_field(
 def _chosen_models(
     table: ModelTable, category: str | None, exclude: Collection[ModelKey]
 ) -> IntArray:
-    """Rows of the models that are compared, in the table's order."""
+    """Select the rows of the models to compare, in the table's order."""
     from cadalign.datasets.models.categories import require_category
 
     if not len(table):
@@ -189,7 +189,7 @@ def _chosen_models(
 
 
 def _check_known(table: ModelTable, ids: IntArray, chosen: IntArray, category: str | None) -> None:
-    """Refuse a semantic id that none of the models has."""
+    """Refuse a semantic id that no model has."""
     if category is None:
         known = table.known_ids
     else:
@@ -208,7 +208,7 @@ def _check_known(table: ModelTable, ids: IntArray, chosen: IntArray, category: s
 def _candidates(
     table: ModelTable, chosen: IntArray, symmetries: bool
 ) -> tuple[IntArray, Candidates, IntArray]:
-    """Models (c,), candidates, and how many labelings the model of each has, (c,)."""
+    """List the candidates: models (c,), keypoints, and numbers of labelings of each model (c,)."""
     first, last = table.offsets[chosen], table.offsets[chosen + 1]
     spans = np.stack([first, last, first], axis=1)
     rows = table.places
@@ -228,7 +228,7 @@ def _candidates(
 
 
 def _ranges(ids: IntArray) -> str:
-    """Rising numbers as text: 0-8, 11.
+    """Format ascending numbers as ranges.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Compiled kernels of retrieval: a lower bound of a candidate's cost, and the search for its pose.
+"""Compiled kernels of retrieval: lower bounds of candidates' costs, and the search for poses.
 
-A candidate is a model of the library with its keypoints' labels as they are or mirrored. The
-library's keypoints lie one after the other, each model's in the order of their semantic ids.
+A candidate is a model of the library with its own or mirrored keypoint labels. The library's
+keypoints are concatenated, each model's in the order of their semantic ids.
 """
 
 from __future__ import annotations
@@ -13,28 +13,31 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
-from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
+from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts
 
 LEAST_SHARED = 4
-"""Fewer keypoints than this determine no alignment."""
+"""Least number of shared keypoints that determine an alignment."""
 _BOUNDED_FROM = 6  # a general linear camera passes through fewer points exactly
 _PROBE_ITERATIONS = 4
 _GRID_ROTATIONS = 48
-_HOPELESS = 2.0  # so many times the least cost, and ...
-_HOPELESS_EXCESS = 20.0  # ... so much more of it, is not made up for after the first steps
+# A start is given up after the first steps if its cost exceeds the least one by this factor and
+# this excess.
+_HOPELESS = 2.0
+_HOPELESS_EXCESS = 20.0
 _SAME_CHORD = 1e-3
 
 
 class Query(NamedTuple):
-    """What an image shows, its keypoints in the order of their semantic ids.
+    """Keypoints of an image, in the order of their semantic ids.
 
     Parameters
     ----------
     ids : (n,) int
-        Semantic ids, rising.
+        Semantic ids, ascending.
     rays : (n, 2) float
         Normalised image coordinates.
     whitening : (1 or n, 3) float
@@ -43,9 +46,9 @@ class Query(NamedTuple):
     loss_scale, prior_weight : float
     free : (8,) float
     max_stretch : float
-        Scales lie between one over this and this.
+        Largest scale; its inverse is the smallest.
     gains : (n,) float
-        What a candidate gains by sharing each keypoint, errors aside [log-likelihood].
+        Gain in log-likelihood of a candidate that shares the keypoint without error.
     """
 
     ids: IntArray
@@ -60,7 +63,7 @@ class Query(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """The candidates' keypoints.
+    """Keypoints of the candidates.
 
     Parameters
     ----------
@@ -69,11 +72,9 @@ class Candidates(NamedTuple):
     ids : (k,) int
         Their semantic ids.
     rows : (r,) int
-        Which rows of ``xyz`` take the places of a candidate's labels: with labels as they are, the
-        rows themselves.
+        Rows of ``xyz`` in the order of a candidate's labels: ascending unless labels are mirrored.
     spans : (c, 3) int
-        Of each candidate: where its labels begin in ``ids``, where they end, and where its ``rows``
-        begin.
+        For each candidate: start and end of its labels in ``ids``, and start of its ``rows``.
     """
 
     xyz: FloatArray
@@ -84,7 +85,7 @@ class Candidates(NamedTuple):
 
 @kernel
 def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Lower bounds of the costs (c,), gains (c,), and numbers of shared keypoints (c,)."""
+    """Compute lower bounds of the costs, gains, and numbers of shared keypoints, (c,) each."""
     count = candidates.spans.shape[0]
     bounds = np.zeros(count)
     gains = np.zeros(count)
@@ -114,9 +115,9 @@ def search_all(
 ) -> tuple[FloatArray, FloatArray]:
     """Search for the poses of the chosen candidates (m,); packed poses (m, 15) and costs (m,).
 
-    The linear solver proposes a pose, the minimal solver some more for each of ``subsets``
-    4-subsets of the keypoints; the best ``refined`` of them are refined, in at most so many
-    ``iterations``. The cost is infinite where no pose was found.
+    The linear solver proposes one pose, the minimal solver several for each of ``subsets``
+    4-subsets of the keypoints; the best ``refined`` poses are refined in at most ``iterations``
+    steps. The cost is infinite if no pose was found.
     """
     poses = np.zeros((chosen.shape[0], POSE_SIZE))
     costs = np.full(chosen.shape[0], np.inf)
@@ -142,7 +143,7 @@ def search_all(
 def _centred_objective(
     query: Query, points: FloatArray, seen: IntArray, mean: FloatArray
 ) -> Objective:
-    """What a pose of the gathered points, less their mean, is measured against."""
+    """Objective for a pose of the gathered points relative to their mean."""
     n = points.shape[0]
     each = query.whitening.shape[0] > 1
     centred = np.empty((n, 3))
@@ -163,7 +164,7 @@ def _centred_objective(
 def _gather(
     query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
 ) -> int:
-    """Write the model points that the image shows, and which of its keypoints they are."""
+    """Write the shared model points and their rows in the image; returns their number."""
     first, last, row = candidates.spans[c, 0], candidates.spans[c, 1], candidates.spans[c, 2]
     n = 0
     i = 0
@@ -193,12 +194,12 @@ def _search(
     iterations: int,
     pose: FloatArray,
 ) -> float:
-    """Write the pose of the least cost that is found; returns the cost, or infinity."""
+    """Write the best pose found; returns its cost, or infinity."""
     starts = np.empty((subsets * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = _propose(objective, subsets, starts)
     probed = np.empty((refined, POSE_SIZE))
     costs = _probe(objective, starts[:count], probed)
-    if not costs.min() < np.inf:  # all have points behind the camera
+    if not costs.min() < np.inf:  # all starts have points behind the camera
         count = rotation_starts(objective.points, objective.rays, starts[:_GRID_ROTATIONS])
         costs = _probe(objective, starts[:count], probed)
     least = np.inf
@@ -224,7 +225,7 @@ def _search(
 def _within_limits(
     objective: Objective, max_stretch: float, iterations: int, pose: FloatArray, cost: float
 ) -> float:
-    """Hold scales that lie beyond the limits at these, and refine the rest; returns the cost."""
+    """Clamp scales to the limits and refine the other unknowns; returns the cost."""
     free = objective.free.copy()
     for _ in range(2):
         beyond = False
@@ -251,13 +252,13 @@ def _within_limits(
 
 @kernel
 def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
-    """Write where a refinement may start; returns how many."""
+    """Write starting poses of the refinement; returns their number."""
     points, rays, free = objective.points, objective.rays, objective.free
     chosen = np.empty((subsets, 4), dtype=np.int64)
     count = minimal_starts(points, rays, chosen, choose_subsets(points, chosen), starts)
     if linear_start(points, rays, starts[count]):
         count += 1
-    # Other starts serve coplanar points, and where the unstretched model is a better guess.
+    # Other starts are for coplanar points, and for fixed scales.
     if count == 0 or free[6] == 0.0 or free[7] == 0.0:
         count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
     for k in range(count):
@@ -269,7 +270,7 @@ def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
 
 @kernel
 def _probe(objective: Objective, starts: FloatArray, probed: FloatArray) -> FloatArray:
-    """Take a few steps from each of the best starts; their costs, infinite where there are none."""
+    """Take a few steps from each of the best starts; returns their costs, or infinity."""
     scores = np.empty(starts.shape[0])
     for k in range(starts.shape[0]):
         scores[k] = evaluate_cost(objective, starts[k])

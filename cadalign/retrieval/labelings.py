@@ -1,4 +1,4 @@
-"""Mirrored labels: what a model's keypoints are called if left and right are confused."""
+"""Mirrored labels of a model's keypoints, for detections that confuse left and right."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
 
 
 def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) -> list[IntArray]:
-    """The ways in which a model's keypoints trade labels under its reflections.
+    """List the permutations of a model's keypoint labels under its reflections.
 
-    The pairs that mirror each other across a plane x = const trade labels all together; so do those
-    across y = const and z = const, and any of these at once. Pairs along no axis, and planes by
-    which one keypoint would get two labels, are left out.
+    All pairs that mirror each other across a plane x = const swap labels together; so do those
+    across y = const and z = const, and any combination of these. Pairs along no axis, and planes
+    that give a keypoint two labels, are left out.
 
     Parameters
     ----------
@@ -28,8 +28,8 @@ def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) 
     Returns
     -------
     list of (k,) int
-        For each way, which keypoint takes the place of which; the labels as they are not among
-        them.
+        For each permutation, the row of ``xyz`` that takes each row's label; the identity is left
+        out.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""`cadalign.Library`: annotated models that an image's keypoints are compared with."""
+"""`cadalign.Library`: annotated CAD models, ranked by an image's keypoints."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy.typing as npt
 
 from cadalign.errors import DataError, InputError
-from cadalign.fitting.noise import Sigma
+from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
-from cadalign.retrieval.candidates import gather_field, observe
+from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
@@ -28,9 +28,9 @@ logger = logging.getLogger("cadalign")
 class Library:
     """Annotated CAD models to retrieve from: keypoints, symmetries, bounds and mesh paths.
 
-    The models are kept sorted by category and id, so that nothing depends on the order in which
-    they came. `Library.from_dataset` and `Library.from_models` make one, `Library.open` maps a
-    saved one into memory.
+    The models are sorted by category and id, so that results do not depend on their order.
+    `Library.from_dataset` and `Library.from_models` make a library, `Library.open` maps a saved one
+    into memory.
 
     Parameters
     ----------
@@ -61,13 +61,7 @@ class Library:
 
     @classmethod
     def from_models(cls, models: Iterable[LibraryModel]) -> Library:
-        """A library of these models.
-
-        Raises
-        ------
-        InputError
-            If two have the same category and id.
-        """
+        """Make a library; raises InputError if two models have the same category and id."""
         return cls(ModelTable.of(models))
 
     @classmethod
@@ -78,11 +72,11 @@ class Library:
         categories: Iterable[str] | None = None,
         on_model: Callable[[], object] = lambda: None,
     ) -> Library:
-        """A library of a data set's annotated models.
+        """Make a library of a data set's annotated models.
 
-        Meshes are read for their bounds; of a model whose mesh is missing or cannot be read, with a
-        warning (logger "cadalign"), the keypoints' bounds are taken. Malformed models are left out,
-        as by the data set itself.
+        Meshes are read for their bounds. If a mesh is missing or cannot be read, the keypoints'
+        bounds are used, with a warning (logger "cadalign"). Malformed models are left out, as by
+        the data set itself.
 
         Parameters
         ----------
@@ -90,7 +84,7 @@ class Library:
         categories : iterable of str, optional
             Names or synset ids; by default all.
         on_model : callable
-            Told of every model.
+            Called after every model, for progress.
 
         Raises
         ------
@@ -108,7 +102,7 @@ class Library:
                 models.append(LibraryModel.of_annotated(model, with_mesh=False))
             on_model()
         if not models:
-            raise DataError("there are no models to make a library of", where=str(dataset.root))
+            raise DataError("the data set has no such models", where=str(dataset.root))
         return cls.from_models(models)
 
     @classmethod
@@ -118,18 +112,12 @@ class Library:
         Raises
         ------
         DataError
-            If the file is missing, cut short, damaged, of another version, or something else.
+            If the file is missing, truncated, damaged, of another version, or of another format.
         """
         return cls(read_library(path))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the library to a file; see `cadalign.retrieval.library_file`.
-
-        Raises
-        ------
-        DataError
-            If it cannot be written.
-        """
+        """Write the library to a file atomically; raises DataError on failure."""
         write_library(path, self._table)
 
     def __len__(self) -> int:
@@ -139,13 +127,7 @@ class Library:
         return (self._table.model(row) for row in range(len(self)))
 
     def __getitem__(self, key: ModelKey) -> LibraryModel:
-        """``library["chair", model_id]``
-
-        Raises
-        ------
-        InputError
-            If there is no such model.
-        """
+        """Find a model, as ``library["chair", model_id]``; raises InputError if there is none."""
         row = self._table.find(key)
         if row is None:
             raise InputError(f"no model {key[1]!r} of {key[0]!r}", where="library")
@@ -156,22 +138,22 @@ class Library:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The categories' names, sorted."""
+        """Names of the categories, sorted."""
         return self._table.categories
 
     @property
     def keys(self) -> tuple[ModelKey, ...]:
-        """(category, model id) of every model, sorted."""
+        """Category and model id of every model, sorted."""
         return tuple(self._table.keys)
 
     @property
     def nbytes(self) -> int:
-        """How much memory the models take; of an opened library, shared among processes."""
+        """Memory of the models in bytes; an opened library shares it among processes."""
         return int(self._table.table.nbytes)
 
     @property
     def fingerprint(self) -> str:
-        """A text that changes with anything that is in the library."""
+        """Hash of the library's content, as text."""
         return fingerprint(self._table)
 
     def retrieve(
@@ -201,62 +183,34 @@ class Library:
     ) -> list[Match]:
         """Rank the models by how well each, posed and stretched, explains an image's keypoints.
 
-        The likelihood that models are compared by, also such with different sets of keypoints, is
-        described in `cadalign.retrieval.options`. Only models whose best possible likelihood (a
-        bound) leaves them a chance are searched for their pose: every match with a score above 1e-8
-        is where it would be if all were searched, and up to 768 more are searched to fill the rest
-        of the list. Ties are broken by category and id.
+        Models are compared by their likelihood, also with different sets of keypoints; see
+        `cadalign.retrieval.options`. Poses are searched only for models whose bound on the
+        likelihood leaves them a chance: every match with a score above 1e-8 has the rank of an
+        exhaustive search, and up to 768 more models are searched to fill the list. Ties are broken
+        by category and id.
 
         Parameters
         ----------
         points_2d : (n, 2) float
             Keypoints in the image [px]; integers are pixel centres.
         semantic_ids : (n,) int
-            What each keypoint means; every id at most once. An id means something else in every
-            category, so without ``category`` each model reads them in its own category's sense.
+            Semantic ids of the keypoints, without repetition. Ids differ by category: without
+            ``category`` each model reads them in its own category's sense.
         camera : Camera
             The calibrated camera. Lens distortion is honoured.
-        top : int
-            How many matches to return at most.
-        category : str, optional
-            Name or synset id of the only category to compare with.
-        method : {"optimal", "epnp"}
-            ``optimal`` stretches models; ``epnp`` is OpenCV's EPnP, which doesn't.
-        sigma : float, (n,) float or (n, 2, 2) float
-            Standard deviation of the keypoints, of each, or covariance of each [px].
-        shape_sigma : float
-            How far the keypoints of a model may lie off the object's, as a share of the extent of
-            the keypoints in the image: for objects of which only similar models are in the library.
-        loss : {"linear", "huber", "cauchy"}
-            How the length of a residual counts: squared, or less beyond ``loss_scale``, so that
-            some wrong keypoints are tolerated. Robust losses take all models' search.
-        loss_scale : float
-            Where a robust loss begins to bend [sigma].
-        stretch : str, optional
-            Axes that stretch: ``"yz"`` (the default), ``"y"``, ``"z"`` or ``"none"``.
-        scale_prior_sigma : float, optional
-            Standard deviation of the prior on the logarithm of each stretch; None for no prior.
-        max_stretch : float
-            No model is stretched beyond this, or below one over it.
-        symmetries : bool
-            Whether to try also labels with left and right (front and back) exchanged, by the
-            models' reflections.
-        missing_prob : float
-            Probability that a keypoint of the object is not marked in the image.
-        spurious : float
-            How many keypoints an image shows, on average, that the object does not have.
+        top, category, method, sigma, shape_sigma, loss, loss_scale, stretch, scale_prior_sigma, \
+        max_stretch, symmetries, missing_prob, spurious, exhaustive
+            Options, described at `cadalign.retrieval.options.RetrievalOptions`.
         mask : (h, w) bool, optional
-            The object's pixels: the best matches that have a mesh are compared with it, too, and
-            ranked anew; see `cadalign.retrieval.silhouettes`.
+            The object's pixels: reranks the best matches that have a mesh by their silhouettes; see
+            `cadalign.retrieval.silhouettes`.
         image : (h, w, 3) or (h, w, 4) uint8, optional
-            The image, instead of a mask: its opacity, or what is cut out of it around the
-            keypoints, is the mask.
+            The image instead of a mask: its opacity, or a segmentation around the keypoints, is
+            the mask.
         exclude : collection of (category, model id)
             Models to leave out.
-        exhaustive : bool
-            Search all models, bounds or not.
         workers : int
-            How many threads share the search; -1 for as many as there are cores.
+            Number of threads; -1 for one per core.
 
         Returns
         -------
@@ -288,9 +242,9 @@ class Library:
             exhaustive=exhaustive,
         )
         observed = observe(points_2d, semantic_ids, camera, options)
-        field = gather_field(self._table, observed, options, exclude=exclude)
-        ranking = rank(field, observed, options, workers=workers)
-        matches = make_matches(self._table, field, observed, ranking, top=top)
+        candidates = gather_candidates(self._table, observed, options, exclude=exclude)
+        ranking = rank(candidates, observed, options, workers=workers)
+        matches = make_matches(self._table, candidates, observed, ranking, top=top)
         if mask is None and image is None:
             return matches
         from cadalign.retrieval.silhouettes import mask_of, rerank

@@ -1,4 +1,4 @@
-"""What a retrieval returns."""
+"""Result of a retrieval."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cadalign.geometry.box import Box
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A model of the library, posed and stretched so as to explain an image's keypoints.
+    """A model of the library, posed and stretched to explain an image's keypoints.
 
     Parameters
     ----------
@@ -22,28 +22,28 @@ class Match:
     rms : float
         Root mean square length of the shared keypoints' residuals [px].
     log_likelihood : float
-        Of all keypoints, marked and missing ones; see `cadalign.retrieval.options`.
+        Log-likelihood of all keypoints, marked and missing; see `cadalign.retrieval.options`.
     score : float
-        The probability that this is the model, if one of the library (of the category, if one was
-        named) is and all are equally likely beforehand: the likelihood over the sum of all models'.
-        It is calibrated as far as the assumptions hold: of matches with the score 0.9, nine in ten
-        are right.
+        Probability that this is the model, given that it is in the library (in the category, if
+        one was named) and that all are equally likely a priori: the likelihood over the sum of
+        all models'. It is calibrated as far as the assumptions hold: nine in ten matches with the
+        score 0.9 are correct.
     box : Box
-        The model's box in the camera frame.
+        Box of the model in the camera frame.
     bounds : (2, 3) float
-        The same in the model's own frame.
+        Lowest and highest coordinates in the model's frame.
     semantic_ids : (n,) int
-        The shared keypoints.
+        Ids of the shared keypoints.
     points_3d : (n, 3) float
-        These on the model.
+        Shared keypoints on the model.
     points_2d : (n, 2) float
-        These in the image [px].
+        Shared keypoints in the image [px].
     residuals : (n, 2) float
         Projected minus observed [px].
     missing_ids : tuple of int
-        The image's keypoints that the model does not have.
+        Ids of the image's keypoints that the model lacks.
     mirrored : bool
-        Whether the labels fit better with left and right exchanged.
+        True if the labels fit better with left and right exchanged.
     mesh_path : Path or None
     silhouette_iou : float, optional
         With a mask: intersection over union with the model's silhouette; None without a mesh.
@@ -68,7 +68,7 @@ class Match:
 
     @property
     def shared(self) -> int:
-        """How many keypoints model and image share."""
+        """Number of keypoints that model and image share."""
         return len(self.semantic_ids)
 
     def __repr__(self) -> str:

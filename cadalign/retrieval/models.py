@@ -1,4 +1,4 @@
-"""The models of a library: one by itself, and all of them as the columns of an Arrow table."""
+"""Models of a library: `LibraryModel`, and `ModelTable` of all as an Arrow table."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from cadalign.errors import DataError, InputError
 from cadalign.retrieval.labelings import mirrored_labelings
 
 if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel, Symmetries
+    from cadalign.datasets import AnnotatedModel, Circle, Symmetries
     from cadalign.geometry.mesh import Mesh
 
 ModelKey = tuple[str, str]
-"""A category's name and a model's id."""
+"""Category name and model id."""
 
 SCHEMA = pa.schema(
     [
@@ -34,7 +34,7 @@ SCHEMA = pa.schema(
         ("bounds", pa.list_(pa.float64(), 6)),
         ("keypoints", pa.list_(pa.list_(pa.float64(), 3))),
         ("semantic_ids", pa.list_(pa.int64())),
-        # Rows that take the places of the rows, labelling after labelling.
+        # Concatenated permutations of the rows, one for each mirrored labelling.
         ("labelings", pa.list_(pa.int64())),
         ("symmetries", pa.string()),
     ]
@@ -51,12 +51,11 @@ class LibraryModel:
     xyz : (k, 3) float
         Keypoints [model units].
     semantic_ids : (k,) int
-        What each keypoint means; an id means the same on all models of a category, and nothing in
-        other categories.
+        Semantic ids, valid for all models of the category.
     bounds : (2, 3) float
-        Lowest and highest coordinates of the mesh; of the keypoints where there is none.
+        Lowest and highest coordinates of the mesh; of the keypoints without a mesh.
     symmetries : Symmetries, optional
-        Which keypoints, as rows of ``xyz``, trade places under reflections and rotations.
+        Reflections and rotations, as rows of ``xyz`` that exchange places.
     mesh_path : Path, optional
 
     Raises
@@ -83,12 +82,9 @@ class LibraryModel:
 
     @classmethod
     def of_annotated(cls, model: AnnotatedModel, *, with_mesh: bool = True) -> LibraryModel:
-        """A data set's model; its mesh, if it has one and is wanted, is read for its bounds.
+        """Make a library model of a data set's model; the bounds are those of its mesh.
 
-        Raises
-        ------
-        DataError
-            If the mesh cannot be read.
+        Raises DataError if the mesh cannot be read; see ``with_mesh``.
         """
         from cadalign.datasets import load_mesh
 
@@ -109,34 +105,22 @@ class LibraryModel:
 
     @property
     def key(self) -> ModelKey:
-        """(category, model id)"""
+        """Category and model id."""
         return self.category, self.model_id
 
     def load_mesh(self) -> Mesh:
-        """Read the mesh.
-
-        Raises
-        ------
-        DataError
-            If there is none, or it cannot be read.
-        """
+        """Read the mesh; raises DataError if there is none or it cannot be read."""
         from cadalign.datasets import load_mesh
 
         if self.mesh_path is None:
             raise DataError(
-                "there is no mesh of this model", where=f"{self.category}, model {self.model_id}"
+                "the model has no mesh", where=f"{self.category}, model {self.model_id}"
             )
         return load_mesh(self.mesh_path)
 
 
 def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
-    """Semantic ids (count,) as integers.
-
-    Raises
-    ------
-    InputError
-        If they are something else, or one occurs twice.
-    """
+    """Convert semantic ids to (count,) int; raises InputError if invalid or repeated."""
     ids = np.asarray(value)
     if ids.shape != (count,) or (count and ids.dtype.kind not in "iu"):
         raise InputError(
@@ -150,26 +134,14 @@ def check_semantic_ids(value: Any, count: int, *, where: str) -> IntArray:
 
 
 class ModelTable:
-    """All models of a library, sorted by category and id; an Arrow table seen as arrays.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        Of the columns of `SCHEMA`, as `ModelTable.of` makes it.
-    """
+    """All models of a library, sorted by category and id: arrays on an Arrow table of `SCHEMA`."""
 
     def __init__(self, table: pa.Table) -> None:
         self.table = table.combine_chunks()
 
     @classmethod
     def of(cls, models: Iterable[LibraryModel]) -> ModelTable:
-        """The table of these models.
-
-        Raises
-        ------
-        InputError
-            If two have the same category and id.
-        """
+        """Make a table; raises InputError if two models have the same category and id."""
         in_order = sorted(models, key=lambda model: model.key)
         for first, second in pairwise(in_order):
             if first.key == second.key:
@@ -186,18 +158,18 @@ class ModelTable:
 
     @cached_property
     def keys(self) -> Sequence[ModelKey]:
-        """(category, model id) of every model."""
+        """Category and model id of every model."""
         names = self.table["category"].to_pylist()
         return list(zip(names, self.table["model_id"].to_pylist(), strict=True))
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
-        """The categories' names, sorted."""
+        """Names of the categories, sorted."""
         return tuple(sorted(self.table["category"].unique().to_pylist()))
 
     @cached_property
     def offsets(self) -> IntArray:
-        """Model m has the keypoints ``offsets[m]`` to ``offsets[m + 1]``, (n + 1,) int."""
+        """Start of each model's keypoints, and the end of the last, (n + 1,) int."""
         return _offsets(self._column("semantic_ids"))
 
     @cached_property
@@ -207,7 +179,7 @@ class ModelTable:
 
     @cached_property
     def semantic_ids(self) -> IntArray:
-        """Their semantic ids, (k,) int."""
+        """Semantic ids of `xyz`, (k,) int."""
         return _numbers(self._column("semantic_ids").flatten())
 
     @cached_property
@@ -217,33 +189,33 @@ class ModelTable:
 
     @cached_property
     def labeling_offsets(self) -> IntArray:
-        """Model m has the labelings' rows ``[m]`` to ``[m + 1]``, (n + 1,) int."""
+        """Start of each model's mirrored labelings, and the end of the last, (n + 1,) int."""
         return _offsets(self._column("labelings"))
 
     @cached_property
     def places(self) -> IntArray:
-        """Rows of `xyz`: each keypoint's own, then `labeling_offsets` those of mirrored labels."""
+        """Rows of `xyz`: the identity, then at `labeling_offsets` those of mirrored labels."""
         first = np.repeat(self.offsets[:-1], np.diff(self.labeling_offsets))
         mirrored = _numbers(self._column("labelings").flatten()) + first
         return read_only(np.concatenate([np.arange(len(self.xyz)), mirrored]))
 
     @cached_property
     def known_ids(self) -> IntArray:
-        """The semantic ids that any model has, rising."""
+        """Semantic ids of all models, ascending."""
         return np.unique(self.semantic_ids)
 
     def rows_of(self, category: str) -> slice:
-        """Which models are of a category."""
+        """Rows of a category's models."""
         names = [name for name, _ in self.keys]
         return slice(bisect_left(names, category), bisect_right(names, category))
 
     def find(self, key: ModelKey) -> int | None:
-        """The row of a model; None if there is none."""
+        """Row of a model; None if there is none."""
         row = bisect_left(self.keys, key)
         return row if row < len(self) and self.keys[row] == key else None
 
     def model(self, row: int) -> LibraryModel:
-        """One of the models."""
+        """Make the model of a row."""
         own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
         category, model_id = self.keys[row]
         path = self.table["mesh"][row].as_py()
@@ -253,7 +225,9 @@ class ModelTable:
             xyz=self.xyz[own],
             semantic_ids=self.semantic_ids[own],
             bounds=self.bounds[row],
-            symmetries=_symmetries_from(self.table["symmetries"][row].as_py()),
+            symmetries=_symmetries_from(
+                self.table["symmetries"][row].as_py(), own.stop - own.start
+            ),
             mesh_path=None if path is None else Path(path),
         )
 
@@ -263,7 +237,7 @@ class ModelTable:
 
 
 def _row(model: LibraryModel) -> dict[str, Any]:
-    """A model as a row of the table, its keypoints in the order of their ids."""
+    """Convert a model to a row of the table, its keypoints in the order of their ids."""
     order = np.argsort(model.semantic_ids)
     place = np.argsort(order)
     symmetries = model.symmetries
@@ -271,17 +245,8 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     xyz = model.xyz[order]
     labelings = mirrored_labelings(xyz, reflections)
     rotations = [
-        {
-            "keypoints": [int(place[row]) for row in rotation.keypoints],
-            "circle": None
-            if rotation.circle is None
-            else [
-                rotation.circle.center.tolist(),
-                rotation.circle.radius,
-                rotation.circle.normal.tolist(),
-            ],
-        }
-        for rotation in symmetries.rotations
+        {"keypoints": [int(place[row]) for row in each.keypoints], "circle": _written(each.circle)}
+        for each in symmetries.rotations
     ]
     return {
         "category": model.category,
@@ -295,26 +260,41 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     }
 
 
-def _symmetries_from(text: str) -> Symmetries:
+def _written(circle: Circle | None) -> list[Any] | None:
+    return (
+        None if circle is None else [circle.center.tolist(), circle.radius, circle.normal.tolist()]
+    )
+
+
+def _symmetries_from(text: str, count: int) -> Symmetries:
+    """Read a model's symmetries and check their rows of its ``count`` keypoints."""
+    try:
+        symmetries = _parse_symmetries(text)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
+    rows = [row for pair in symmetries.reflections for row in pair]
+    rows += [row for rotation in symmetries.rotations for row in rotation.keypoints]
+    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
+        raise DataError("names a keypoint that does not exist", where="symmetries")
+    return symmetries
+
+
+def _parse_symmetries(text: str) -> Symmetries:
     from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
+    def read_circle(written: list[Any] | None) -> Circle | None:
+        if written is None:
+            return None
+        center, radius, normal = written
+        return Circle(np.array(center), radius, np.array(normal))
+
     data = json.loads(text)
-    return Symmetries(
-        reflections=tuple((first, second) for first, second in data["reflections"]),
-        rotations=tuple(
-            RotationalSymmetry(
-                keypoints=tuple(rotation["keypoints"]),
-                circle=None
-                if rotation["circle"] is None
-                else Circle(
-                    np.array(rotation["circle"][0]),
-                    rotation["circle"][1],
-                    np.array(rotation["circle"][2]),
-                ),
-            )
-            for rotation in data["rotations"]
-        ),
+    rotations = (
+        RotationalSymmetry(tuple(each["keypoints"]), read_circle(each["circle"]))
+        for each in data["rotations"]
     )
+    reflections = ((first, second) for first, second in data["reflections"])
+    return Symmetries(tuple(reflections), tuple(rotations))
 
 
 def _no_symmetries() -> Symmetries:
@@ -324,7 +304,7 @@ def _no_symmetries() -> Symmetries:
 
 
 def _numbers(array: Any) -> npt.NDArray[Any]:
-    """An Arrow array's numbers without a copy, read-only."""
+    """View an Arrow array as a read-only NumPy array, without a copy."""
     numbers = array.to_numpy(zero_copy_only=True)
     numbers.flags.writeable = False
     return np.asarray(numbers)

@@ -1,13 +1,13 @@
-"""How to retrieve: the options of `cadalign.Library.retrieve`, checked, and the model behind it.
+"""Options of `cadalign.Library.retrieve`, and the likelihood behind the ranking.
 
-A model of the library is scored by the likelihood of everything the image shows, under these
+A model of the library is scored by the likelihood of everything in the image, under these
 assumptions:
 
 - A keypoint of the object is marked in the image with the probability ``1 - missing_prob``,
   independently of the others; it may be hidden, or overlooked.
-- A marked keypoint lies where the model's keypoint projects to, with Gaussian noise of the standard
-  deviation ``sigma``, to which ``shape_sigma`` adds what the shapes differ by. With a robust loss,
-  that takes the place of the squared error.
+- A marked keypoint lies at the projection of the model's keypoint, with Gaussian noise of the
+  standard deviation ``sigma``, to which ``shape_sigma`` adds the differences of shape. A robust
+  loss takes the place of the squared error.
 - An image shows ``spurious`` keypoints, on average, that the object does not have, anywhere in the
   image with equal density: each costs ``log(spurious / area)``.
 - The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
@@ -22,25 +22,24 @@ number of the model's keypoints that the image lacks and e of the image's that t
                      + log density of the stretches
 
 at the pose and stretch that maximise it. A model that lacks keypoints of the image has fewer errors
-to explain, and pays for each of them some 15 units; one that has keypoints which the image does not
-show pays 0.7 each.
+to explain, but each of them costs some 15 units; each keypoint of a model that the image does not
+show costs 0.7.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.fitting.noise import Sigma
-from cadalign.fitting.options import Options
+from cadalign.fitting.options import FitOptions, Sigma
 
 METHODS = ("optimal", "epnp")
 
 
 @dataclass(frozen=True)
 class RetrievalOptions:
-    """How to retrieve; see `cadalign.Library.retrieve` for what each option means.
+    """Options of a retrieval.
 
     Raises
     ------
@@ -49,20 +48,38 @@ class RetrievalOptions:
     """
 
     top: int = 10
+    """Largest number of matches to return."""
     category: str | None = None
+    """Name or synset id of the only category to compare with; by default all."""
     method: str = "optimal"
+    """Method of alignment: optimal stretches models, epnp (OpenCV's) does not."""
     sigma: Sigma = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint."""
     shape_sigma: float = 0.0
-    loss: str = "linear"
-    loss_scale: float = 2.0
-    stretch: str | None = None
+    """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
+    in the image: above 0, say 0.03, for libraries with only similar models."""
+    loss: str = FitOptions.loss
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    tolerate outliers and search all models, which takes longer."""
+    loss_scale: float = FitOptions.loss_scale
+    """Length at which a robust loss begins to bend [sigma]."""
+    stretch: str | None = FitOptions.stretch
+    """Axes that stretch: yz (the default), y, z or none."""
     scale_prior_sigma: float | None = 0.4
+    """Standard deviation of a Gaussian prior on the logarithm of each stretch; None for no
+    prior."""
     max_stretch: float = 4.0
+    """Largest stretch of a model; its inverse is the smallest."""
     symmetries: bool = False
+    """Also try labels with left and right (front and back) exchanged, by the models'
+    reflections."""
     missing_prob: float = 0.5
+    """Probability that a keypoint of the object is not marked in the image."""
     spurious: float = 0.01
+    """Average number of keypoints in an image that the object does not have."""
     exhaustive: bool = False
-    fitting: Options = field(init=False, compare=False)
+    """Search all models, also those that the bound on their likelihood excludes."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -72,36 +89,42 @@ class RetrievalOptions:
                 fix=f"known are {', '.join(METHODS)}",
             )
         if not isinstance(self.top, int) or self.top < 1:
-            raise InputError(f"{self.top!r} is not a number of matches", where="top")
+            raise InputError(f"must be a whole number >= 1, not {self.top!r}", where="top")
         if self.sigma is None:
             raise InputError(
                 "the noise must be known to compare models",
                 where="sigma",
                 fix="give pixels, and shape_sigma where shapes differ",
             )
-        for name, low, high in (
-            ("shape_sigma", 0.0, math.inf),
-            ("missing_prob", 1e-9, 1 - 1e-9),
-            ("spurious", 1e-9, math.inf),
-            ("max_stretch", 1.0, 1000.0),
+        for name, is_valid, rule in (
+            ("shape_sigma", 0 <= self.shape_sigma < math.inf, ">= 0"),
+            (
+                "missing_prob",
+                1e-9 <= self.missing_prob <= 1 - 1e-9,
+                "between 0 and 1, both excluded",
+            ),
+            ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
+            ("max_stretch", 1 <= self.max_stretch <= 1000, "between 1 and 1000"),
         ):
-            value = getattr(self, name)
-            if not (low <= value <= high and value < math.inf):
-                raise InputError(f"{value} is out of range", where=name)
+            if not is_valid:
+                raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
         if self.method == "epnp" and (self.loss != "linear" or self.stretch not in (None, "none")):
             raise InputError(
-                "the method 'epnp' knows neither loss nor stretch",
+                "the method 'epnp' supports neither loss nor stretch",
                 where="method",
-                fix="use the method 'optimal', or leave these options alone",
+                fix="use the method 'optimal', or leave these options at their defaults",
             )
-        stretch = "none" if self.method == "epnp" else self.stretch
-        options = Options(
+        _ = self.fitting  # checks the options that it shares with a fit
+
+    @property
+    def fitting(self) -> FitOptions:
+        """Options of the fit of each model; its sigma is not used."""
+        return FitOptions(
             loss=self.loss,
             loss_scale=self.loss_scale,
-            stretch=stretch,
+            stretch="none" if self.method == "epnp" else self.stretch,
             scale_prior_sigma=self.scale_prior_sigma,
         )
-        object.__setattr__(self, "fitting", options)
 
     @property
     def log_scale_constant(self) -> float:

@@ -1,4 +1,4 @@
-"""Reading what is asked for: an observation file whose keypoints need no model points."""
+"""Reading of queries: observation files whose keypoints need no model points."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cadalign.errors import CadalignError, DataError
-from cadalign.io.json_file import read_json
+from cadalign.errors import DataError
+from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation
 
 _ORIGIN = [0.0, 0.0, 0.0]
@@ -16,48 +16,27 @@ _ORIGIN = [0.0, 0.0, 0.0]
 def read_query(path: Path) -> Observation:
     """Read an observation file for retrieval.
 
-    It is the file that `cadalign.io.observation` describes, but keypoints may lack ``xyz``, since
-    the model is not known, and must have a ``semantic_id``.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    Observation
-        Model points that are not given are zero; retrieval doesn't look at them.
+    The format is that of `cadalign.io.observation`, but keypoints must have a ``semantic_id`` and
+    may lack ``xyz``, which is zero in the returned observation and not used.
 
     Raises
     ------
     DataError
-        If the file is missing, is not JSON, or a field is missing, unknown or invalid; the message
-        names file and field.
+        If the file is missing, is not JSON, or a field is missing, unknown or invalid.
     """
-    try:
-        query = Observation.from_dict(_with_model_points(read_json(path)), folder=path.parent)
-    except DataError as error:
-        if error.where is not None and error.where.startswith(str(path)):
-            raise
-        raise _in_file(path, error) from None
-    except CadalignError as error:
-        raise _in_file(path, error) from None
-    if query.semantic_ids is None:
-        raise DataError(
-            "the keypoints have no semantic_id",
-            where=str(path),
-            fix="give each the id that its category's models have for it",
-        )
+    data = _with_model_points(read_json(path))
+    with in_file(path):
+        query = Observation.from_dict(data, folder=path.parent)
+        if query.semantic_ids is None:
+            raise DataError(
+                "the keypoints have no semantic_id",
+                fix="give each the id of the library's models for it",
+            )
     return query
 
 
-def _in_file(path: Path, error: CadalignError) -> DataError:
-    where = f"{path}: {error.where}" if error.where else str(path)
-    return DataError(error.what, where=where, fix=error.fix)
-
-
 def _with_model_points(data: Any) -> Any:
-    """The parsed file with model points for keypoints that have none."""
+    """Fill in model points for keypoints that have none."""
     keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
     if not isinstance(keypoints, list):
         return data

@@ -1,14 +1,13 @@
-"""Ranking: the most promising candidates are searched first, until no other can matter.
+"""Ranking of candidates by a best-first search with bounds.
 
-A candidate's log-likelihood is at most what a lower bound of its errors leaves of it
-(`kernels.bound_all`). In the order of these limits candidates are searched in growing batches,
-until the limits of all others lie 20 below the best log-likelihood found. So every match that has
-a score of more than 1e-8 is where it would be if all candidates had been searched. If these are
-fewer than the top list holds, up to 768 more candidates are searched to fill it, so that in a
-library of that size the whole list is exact.
+The lower bound of a candidate's errors (`kernels.bound_all`) gives an upper bound of its
+log-likelihood. Candidates are searched in growing batches, in the order of their bounds, until the
+bounds of all others lie 20 below the best log-likelihood found. So every match with a score above
+1e-8 has the rank of an exhaustive search. If these do not fill the top list, up to 768 more
+candidates are searched, so that in a library of that size the whole list is exact.
 
-Each candidate is searched by itself, in the same way: nothing depends on the order of the library
-or on how many threads share the work.
+Candidates are searched independently: the result does not depend on the order of the library or on
+the number of threads.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,49 +25,49 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.fitting.fit import fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-from cadalign.retrieval.candidates import Field, Observed
-from cadalign.retrieval.kernels import search_all
+from cadalign.retrieval.candidates import CandidateSet, Observed
+from cadalign.retrieval.kernels import Candidates, Query, search_all
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.solvers.minimal import POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
 
 _FIRST_BATCH = 64
 _LARGEST_BATCH = 4096
 _PIECE = 32  # candidates that a thread gets at a time
-# Models this far below the best in log-likelihood don't count: 50,000 of them have 1e-4 of its
-# probability.
+# Candidates this far below the best in log-likelihood are negligible: 50,000 of them together have
+# 1e-4 of its probability.
 _NEGLIGIBLE = 20.0
-# How many candidates are searched at most to fill the rest of the top list.
+# Largest number of candidates that are searched to fill the rest of the top list.
 _TO_FILL = 768
 _FILL_BATCH = 256
 _GUESS = 3.0  # errors are some 6 times their bound
 # 4-subsets for the minimal solver, refined starts, iterations. 1 to 3 % of all candidates miss
 # their optimum, less than 1 % of the best 30 of a query.
 _EFFORT = (5, 4, 20)
-# With outliers, subsets without any must be among them.
+# With outliers, some of the subsets must be without any.
 _ROBUST_EFFORT = (30, 10, 50)
-# For the top list and as many behind it, once more, so that what is shown is the optimum.
+# For the top list and as many behind it, searched again so that the result is the optimum.
 _FINAL_EFFORT = (35, 12, 200)
 
 Search = Callable[[IntArray], tuple[FloatArray, FloatArray]]
-"""From candidates (m,) to their packed poses (m, 15) and costs (m,)."""
+"""Function from candidates (m,) to their packed poses (m, 15) and costs (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """The candidates that were searched, one for each model, the best first.
+    """Searched candidates, one for each model, the best first.
 
     Parameters
     ----------
     candidates : (m,) int
-        Rows of the field.
+        Rows of the candidate set.
     poses : (m, 15) float
     log_likelihoods : (m,) float
     scores : (m,) float
         Probabilities of the models.
     searched : int
-        How many candidates were searched for a pose.
+        Number of candidates that were searched for a pose.
     """
 
     candidates: IntArray
@@ -78,72 +78,65 @@ class Ranking:
 
 
 def rank(
-    field: Field, observed: Observed, options: RetrievalOptions, *, workers: int = -1
+    candidates: CandidateSet, observed: Observed, options: RetrievalOptions, *, workers: int = -1
 ) -> Ranking:
-    """Rank the models of a field.
+    """Rank the models of a candidate set.
 
     Raises
     ------
     InputError
-        If the number of workers is none.
+        If ``workers`` is neither positive nor -1.
     DegenerateError
         If no model can be aligned.
     """
     if workers == -1:
         workers = os.cpu_count() or 1
     if workers < 1:
-        raise InputError(f"{workers} is not a number of threads", where="workers", fix="or -1")
-    found = _Found(field)
+        raise InputError(f"must be >= 1, or -1 for all cores, not {workers}", where="workers")
+    found = _SearchState(candidates)
     if options.method == "epnp":
-        _search_in_order(found, options, lambda some: _search_unstretched(field, observed, some))
+        _search_in_order(found, options, partial(_search_unstretched, candidates, observed))
         return found.ranking()
     with ThreadPoolExecutor(workers) as pool:
-
-        def search(effort: tuple[int, int, int]) -> Search:
-            def search_together(chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-                pieces = [chosen[k : k + _PIECE] for k in range(0, len(chosen), _PIECE)]
-                parts = list(
-                    pool.map(
-                        lambda piece: search_all(observed.query, field.candidates, piece, *effort),
-                        pieces,
-                    )
-                )
-                return (
-                    np.concatenate([poses for poses, _ in parts]),
-                    np.concatenate([costs for _, costs in parts]),
-                )
-
-            return search_together
-
-        is_robust = options.loss != "linear"
-        _search_in_order(found, options, search(_ROBUST_EFFORT if is_robust else _EFFORT))
-        found.search(found.ranking().candidates[: 2 * options.top], search(_FINAL_EFFORT))
+        search = partial(_search_in_pieces, pool, observed.query, candidates.keypoints)
+        effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
+        _search_in_order(found, options, partial(search, effort))
+        found.search(found.ranking().candidates[: 2 * options.top], partial(search, _FINAL_EFFORT))
     return found.ranking()
 
 
-class _Found:
-    """What the search has found so far.
+def _search_in_pieces(
+    pool: ThreadPoolExecutor,
+    query: Query,
+    keypoints: Candidates,
+    effort: tuple[int, int, int],
+    chosen: IntArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Search the chosen candidates in the threads of a pool; see `Search`."""
+    pieces = [chosen[k : k + _PIECE] for k in range(0, len(chosen), _PIECE)]
+    parts = list(pool.map(lambda piece: search_all(query, keypoints, piece, *effort), pieces))
+    poses, costs = zip(*parts, strict=True)
+    return np.concatenate(poses), np.concatenate(costs)
 
-    Parameters
-    ----------
-    field : Field
-    """
 
-    def __init__(self, field: Field) -> None:
-        self.limits = field.base - 0.5 * field.bounds
-        self.guesses = field.base - _GUESS * field.bounds
+class _SearchState:
+    """Best pose of every candidate searched so far."""
+
+    def __init__(self, candidates: CandidateSet) -> None:
+        self.limits = candidates.base - 0.5 * candidates.bounds
+        self.guesses = candidates.base - _GUESS * candidates.bounds
         self.best = -np.inf
-        self._field = field
+        self._candidates = candidates
         self._poses = np.empty((len(self.limits), POSE_SIZE))
         self._reached = np.full(len(self.limits), -np.inf)
         self._searched = np.zeros(len(self.limits), dtype=bool)
 
     def search(self, chosen: IntArray, search: Search) -> None:
-        """Search candidates; one that was searched before keeps what is better."""
+        """Search candidates; of a repeated search the better pose is kept."""
         if not len(chosen):
             return
         poses, costs = search(chosen)
-        reached = self._field.base[chosen] - 0.5 * costs
+        reached = self._candidates.base[chosen] - 0.5 * costs
         better = reached > self._reached[chosen]
         self._poses[chosen[better]] = poses[better]
         self._reached[chosen[better]] = reached[better]
@@ -151,20 +144,17 @@ class _Found:
         self.best = max(self.best, float(reached.max()))
 
     def last_of(self, top: int) -> float:
-        """The log-likelihood of the last model of a top list; minus infinity if it is not full."""
-        models = self._field.models[self._searched]
-        best = np.full(int(self._field.models[-1]) + 1, -np.inf)
+        """Log-likelihood of the last model of the top list; minus infinity if it is not full."""
+        models = self._candidates.models[self._searched]
+        best = np.full(int(self._candidates.models[-1]) + 1, -np.inf)
         np.maximum.at(best, models, self._reached[self._searched])
         best = best[np.isfinite(best)]
         return float(np.partition(best, -top)[-top]) if len(best) >= top else -np.inf
 
     def ranking(self) -> Ranking:
-        """The models that were found, each with its best labels; ties in the library's order.
+        """Rank the models, each with its best labels; ties in the library's order.
 
-        Raises
-        ------
-        DegenerateError
-            If there are none.
+        Raises DegenerateError if no model has a pose.
         """
         order = np.argsort(-self._reached, kind="stable")
         order = order[np.isfinite(self._reached[order])]
@@ -172,9 +162,9 @@ class _Found:
             raise DegenerateError(
                 "no model can be aligned with the keypoints",
                 where="points_2d",
-                fix="check them, their ids, and the camera",
+                fix="check the keypoints, their semantic ids and the camera",
             )
-        _, first = np.unique(self._field.models[order], return_index=True)
+        _, first = np.unique(self._candidates.models[order], return_index=True)
         order = order[np.sort(first)]
         reached = self._reached[order]
         weights = np.exp(reached - reached[0])
@@ -182,8 +172,8 @@ class _Found:
         return Ranking(order, self._poses[order], reached, weights / weights.sum(), searched)
 
 
-def _search_in_order(found: _Found, options: RetrievalOptions, search: Search) -> None:
-    """Search the candidates that matter, or all; the module says which."""
+def _search_in_order(found: _SearchState, options: RetrievalOptions, search: Search) -> None:
+    """Search the candidates in the order of their bounds; see the module."""
     order = np.argsort(-found.limits, kind="stable")
     done = 0
     size = _FIRST_BATCH
@@ -204,12 +194,12 @@ def _search_in_order(found: _Found, options: RetrievalOptions, search: Search) -
 
 
 def _search_unstretched(
-    field: Field, observed: Observed, chosen: IntArray
+    candidates: CandidateSet, observed: Observed, chosen: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses and costs of OpenCV's EPnP."""
+    """Compute poses and costs by OpenCV's EPnP."""
     points, seen = [], []
     for candidate in chosen.tolist():
-        on_model, in_image = shared_keypoints(field, observed, candidate)
+        on_model, in_image = shared_keypoints(candidates, observed, candidate)
         points.append(on_model)
         seen.append(in_image)
     batch = fit_batch(
@@ -229,26 +219,31 @@ def _search_unstretched(
 
 
 def shared_keypoints(
-    field: Field, observed: Observed, candidate: int
+    candidates: CandidateSet, observed: Observed, candidate: int
 ) -> tuple[FloatArray, IntArray]:
-    """A candidate's keypoints that the image shows, (n, 3), and their rows in the image, (n,)."""
-    candidates = field.candidates
-    first, last, row = candidates.spans[candidate].tolist()
+    """Select a candidate's keypoints in the image, (n, 3), and their rows there, (n,)."""
+    keypoints = candidates.keypoints
+    first, last, row = keypoints.spans[candidate].tolist()
     _, on_model, in_image = np.intersect1d(
-        candidates.ids[first:last], observed.semantic_ids, return_indices=True
+        keypoints.ids[first:last], observed.semantic_ids, return_indices=True
     )
-    return candidates.xyz[candidates.rows[row + on_model]], in_image
+    return keypoints.xyz[keypoints.rows[row + on_model]], in_image
 
 
 def make_matches(
-    table: ModelTable, field: Field, observed: Observed, ranking: Ranking, *, top: int
+    table: ModelTable,
+    candidates: CandidateSet,
+    observed: Observed,
+    ranking: Ranking,
+    *,
+    top: int,
 ) -> list[Match]:
-    """The first of a ranking as matches."""
+    """Make matches of the first models of a ranking."""
     matches = []
     for place in range(min(top, len(ranking.candidates))):
         candidate = int(ranking.candidates[place])
-        points_3d, rows = shared_keypoints(field, observed, candidate)
-        model = table.model(int(field.models[candidate]))
+        points_3d, rows = shared_keypoints(candidates, observed, candidate)
+        model = table.model(int(candidates.models[candidate]))
         alignment = Alignment.from_packed(ranking.poses[place])
         residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
         matches.append(
@@ -266,7 +261,7 @@ def make_matches(
                 points_2d=observed.points_2d[rows],
                 residuals=residuals,
                 missing_ids=tuple(np.delete(observed.semantic_ids, rows).tolist()),
-                mirrored=bool(field.mirrored[candidate]),
+                mirrored=bool(candidates.mirrored[candidate]),
                 mesh_path=model.mesh_path,
             )
         )

@@ -1,4 +1,4 @@
-"""How far the keypoints of two models are apart once one is stretched to be like the other."""
+"""Distance of two models' shapes by their keypoints, after stretching one to the other."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cadalign.errors import InputError
 from cadalign.retrieval.models import LibraryModel
 
 SAME_SHAPE = 0.01
-"""Models closer than this cannot be told apart by their keypoints: they count as the same."""
+"""Distance below which two models count as the same shape."""
 
 
 def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     """Root mean square distance of the shared keypoints, as a share of the true ones' extent.
 
-    The one model is moved, and stretched along y and z (x is taken as known), so as to be as near
-    as possible to the other; it is not turned.
+    The estimated model is moved, and stretched along y and z (x is taken as known), to be closest
+    to the true one; it is not rotated.
 
     Parameters
     ----------
@@ -25,8 +25,7 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     Returns
     -------
     float
-        0 for models that differ by nothing but their stretch; NaN where less than 2 keypoints are
-        shared.
+        0 for models that differ only by their stretch; NaN with fewer than 2 shared keypoints.
 
     Raises
     ------
@@ -43,29 +42,27 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     0.0
     """
     if est.category != gt.category:
-        raise InputError(
-            f"the one is of {est.category!r}, the other of {gt.category!r}", where="est"
-        )
+        raise InputError(f"the categories {est.category!r} and {gt.category!r} differ", where="est")
     _, mine, theirs = np.intersect1d(est.semantic_ids, gt.semantic_ids, return_indices=True)
     return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
 
 
 def is_same_shape(est: LibraryModel, gt: LibraryModel) -> bool:
-    """Whether the one is the other to within 1 % after stretch, with the same set of keypoints."""
+    """True if two models have the same ids and differ by at most `SAME_SHAPE` after stretch."""
     if est.category != gt.category or set(est.semantic_ids) != set(gt.semantic_ids):
         return False
     return shape_distance(est, gt) <= SAME_SHAPE
 
 
 def distances(est: FloatArray, gt: FloatArray) -> FloatArray:
-    """The distance of each of some models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
+    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
     if len(gt) < 2:
         return np.full(len(est), np.nan)
     moved = est - est.mean(axis=1, keepdims=True)
     wanted = gt - gt.mean(axis=0)
     squares = (moved**2).sum(axis=1)
     products = (moved * wanted).sum(axis=1)
-    # A mirrored or flat model cannot be stretched to be like the other.
+    # A mirrored or flat model cannot be stretched to the other.
     scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
     scale[:, 0] = 1.0
     gaps = moved * scale[:, None] - wanted

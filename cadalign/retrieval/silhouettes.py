@@ -1,10 +1,9 @@
-"""Ranking the best matches anew by their silhouettes.
+"""Reranking of the best matches by their silhouettes.
 
 The silhouette of each match's mesh, posed and stretched, is compared with the object's pixels. The
-intersection over union of the right model falls short of 1 by 0.05 on average, exponentially
-distributed: so a match gains ``IoU / 0.05`` in log-likelihood over one without overlap. A match
-without a mesh gains the mean of what the others gain: its silhouette is not known, which is no
-reason to prefer or to reject it.
+intersection over union of the correct model falls short of 1 by 0.05 on average, exponentially
+distributed, so a match gains ``IoU / 0.05`` in log-likelihood over one without overlap. A match
+without a mesh gains the mean of the others' gains, so that it is neither preferred nor rejected.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ _MARGIN = 0.15  # around keypoints and boxes, as a share of their extent
 
 
 def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
-    """The matches in the order of keypoints and silhouettes together.
+    """Rank matches by keypoints and silhouettes together.
 
     Parameters
     ----------
     matches : sequence of Match
-        The best by their keypoints.
+        The best matches by their keypoints.
     mask : (h, w) bool
         The object's pixels, as `cadalign.render.silhouette_iou` takes them.
     camera : Camera
@@ -46,13 +45,13 @@ def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> lis
     Returns
     -------
     list of Match
-        With ``silhouette_iou`` and, shared out among them anew, ``score``. The likelihood remains
-        that of the keypoints.
+        With ``silhouette_iou``, and ``score`` redistributed among them. The likelihood remains that
+        of the keypoints.
     """
     overlaps = [_overlap(match, mask, camera) for match in matches]
     known = [overlap for overlap in overlaps if overlap is not None]
     if not known:
-        logger.warning("none of the matches has a mesh: the mask tells nothing")
+        logger.warning("none of the matches has a mesh: the mask is not used")
         return list(matches)
     mean = float(np.mean(known))
     gains = np.array([(mean if overlap is None else overlap) / _SHORTFALL for overlap in overlaps])
@@ -72,26 +71,26 @@ def mask_of(
     matches: Sequence[Match],
     camera: Camera,
 ) -> npt.NDArray[Any]:
-    """The object's pixels: as given, or from the image's opacity, or cut out of the image.
+    """Choose the object's pixels: the given mask, the image's opacity, or a segmentation.
 
-    What is cut out starts from the box around the keypoints and the best match (OpenCV's GrabCut).
+    The segmentation (OpenCV's GrabCut) starts from the box around the keypoints and the best match.
 
     Parameters
     ----------
     mask : (h, w) bool, optional
-        Of numbers, what is above half of the largest possible value counts.
+        For numbers, values above half of the largest possible one count.
     image : (h, w, 3) or (h, w, 4) uint8, optional
     matches : sequence of Match
     camera : Camera
 
     Returns
     -------
-    (h, w) of truth values or opacities
+    (h, w) bool or uint8
 
     Raises
     ------
     InputError
-        If both or neither are given, or one is of another kind or size, or shows nothing.
+        If both or neither are given, or one has the wrong type or size, or no pixel of the object.
     """
     if (mask is None) == (image is None):
         raise InputError("give a mask or an image, not both", where="mask")
@@ -104,14 +103,14 @@ def mask_of(
             where=where,
         )
     if np.isnan(silhouette_iou(est=found, gt=found)):
-        raise InputError("it shows no pixel of the object", where=where)
+        raise InputError("contains no pixel of the object", where=where)
     return found
 
 
 def _object_in(
     pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera
 ) -> npt.NDArray[Any]:
-    """An image's opacity, or what is cut out of it."""
+    """Take an image's opacity, or segment the image."""
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise InputError(
             f"{pixels.dtype} of shape {pixels.shape}, expected an RGB or RGBA image of uint8",
@@ -119,7 +118,7 @@ def _object_in(
         )
     if pixels.shape[2] == 4:
         return np.asarray(pixels[:, :, 3])
-    return _cut_out(pixels, matches, camera)
+    return _segment(pixels, matches, camera)
 
 
 def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:
@@ -134,8 +133,8 @@ def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:
     return silhouette_iou(est=cast_geometry(scene, camera, match.alignment).mask, gt=mask)
 
 
-def _cut_out(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:
-    """Tell the object from its surroundings by their colours, starting from a box."""
+def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:
+    """Segment the object by its colours, starting from a box."""
     corners = camera.project(matches[0].box.corners)
     points = np.concatenate([matches[0].points_2d, corners])
     margin = _MARGIN * np.ptp(points, axis=0)
@@ -148,6 +147,6 @@ def _cut_out(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera)
         cv2.setRNGSeed(0)
         bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
         colors = np.zeros((2, 1, 65))
-        whole = (0, 0, 1, 1)  # not looked at with a mask
+        whole = (0, 0, 1, 1)  # not used with a mask
         cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))

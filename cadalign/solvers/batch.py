@@ -10,11 +10,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import DEGENERATE, NOT_FOUND, OK, POSE_SIZE, TOO_FEW, UNKNOWNS
 from cadalign.solvers.linear import MIN_POINTS, aepnp_kernel
-from cadalign.solvers.minimal import POSE_SIZE
-from cadalign.solvers.objective import UNKNOWNS, Objective
+from cadalign.solvers.objective import Objective
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_kernel
-from cadalign.solvers.status import DEGENERATE, NOT_FOUND, OK, TOO_FEW
 
 
 @kernel

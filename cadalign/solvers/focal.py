@@ -13,12 +13,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import OK, UNKNOWNS
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.linear import MIN_POINTS, affine_rows, moments
-from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate, jacobian_rows
+from cadalign.solvers.objective import BLOCK, Objective, evaluate, jacobian_rows
 from cadalign.solvers.optimal import covariance_of
 from cadalign.solvers.refine import move_pose, refine
-from cadalign.solvers.status import OK
 
 _ROUNDS = 60
 _POSE_ITERATIONS = 100

@@ -11,12 +11,11 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import AP4P, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.focal import at_focal, refine_focal
-from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
+from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective
 from cadalign.solvers.ransac import (
-    AP4P,
-    SAMPLE_SIZES,
     draw_sample,
     find_inliers,
     inliers_of,

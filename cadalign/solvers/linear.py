@@ -8,6 +8,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.errors import DegenerateError
+from cadalign.solvers.constants import DEGENERATE, OK
 from cadalign.solvers.linalg import (
     cholesky,
     eigenvectors_4,
@@ -16,7 +17,6 @@ from cadalign.solvers.linalg import (
     rotation_from_quaternion,
     solve_cholesky,
 )
-from cadalign.solvers.status import DEGENERATE, OK
 
 MIN_POINTS = 6
 _CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error

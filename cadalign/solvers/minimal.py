@@ -7,12 +7,11 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.linalg import polish_rotation
 from cadalign.solvers.polynomial import multiply_add, real_roots
 
 MAX_SOLUTIONS = 8
-POSE_SIZE = 15
-"""Length of a packed solution: rotation row by row (9), translation (3), scale (3)."""
 
 _TOUCHING = 1e-7
 _POLISH_STEPS = 5

@@ -12,9 +12,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
+from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 
-LINEAR, HUBER, CAUCHY = 0, 1, 2
-UNKNOWNS = 8
 BLOCK = 32
 
 

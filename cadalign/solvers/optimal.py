@@ -6,9 +6,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS
 from cadalign.solvers.linalg import cholesky, polish_rotation, solve_cholesky
-from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE
-from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate, evaluate_cost
+from cadalign.solvers.minimal import MAX_SOLUTIONS
+from cadalign.solvers.objective import BLOCK, Objective, evaluate, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import (
     choose_subsets,

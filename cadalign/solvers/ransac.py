@@ -12,8 +12,9 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, POSE_SIZE, ap4p_kernel
+from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
 from cadalign.solvers.objective import Objective
 from cadalign.solvers.refine import refine
 from cadalign.solvers.sampling import (
@@ -25,10 +26,6 @@ from cadalign.solvers.sampling import (
     shuffle,
     start_pool,
 )
-from cadalign.solvers.status import OK
-
-AP4P, AEPNP = 0, 1
-SAMPLE_SIZES = (4, 6)
 
 _FEW_POINTS = 24  # so few are always all looked at
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first

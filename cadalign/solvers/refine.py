@@ -6,8 +6,9 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.linalg import cholesky, solve_cholesky
-from cadalign.solvers.objective import BLOCK, UNKNOWNS, Objective, evaluate
+from cadalign.solvers.objective import BLOCK, Objective, evaluate
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16

@@ -6,10 +6,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.constants import OK
 from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
-from cadalign.solvers.status import OK
 
 _DRAWS_PER_SUBSET = 4
 

@@ -1,7 +1,8 @@
-// Bundles each page's script and style into `dist`, the same bytes on every machine.
+// Bundles each page's script and style, and copies its HTML, into `dist`: the same bytes on every
+// machine.
 // Usage: npm ci && npm run build   (or `make web`); `--out DIR` writes elsewhere.
 import { build } from "esbuild";
-import { readFile, writeFile, mkdir } from "node:fs/promises";
+import { copyFile, mkdir, readdir, readFile, writeFile } from "node:fs/promises";
 import { fileURLToPath } from "node:url";
 import path from "node:path";
 
@@ -10,10 +11,17 @@ const flag = process.argv.indexOf("--out");
 const out = flag < 0 ? path.join(here, "dist") : path.resolve(process.argv[flag + 1]);
 
 await mkdir(out, { recursive: true });
-for (const page of ["report", "annotate"]) {
+for (const [page, entry] of [
+  ["report", "main.js"],
+  ["annotate", "main.js"],
+  ["retrieval", "main.css"],
+]) {
+  for (const name of await readdir(path.join(here, page))) {
+    if (name.endsWith(".html")) await copyFile(path.join(here, page, name), path.join(out, name));
+  }
   await build({
     absWorkingDir: here,
-    entryPoints: { [page]: `${page}/main.js` },
+    entryPoints: { [page]: `${page}/${entry}` },
     outdir: out,
     bundle: true,
     minify: true,

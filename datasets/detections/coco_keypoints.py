@@ -20,30 +20,94 @@ COCO, integer coordinates are pixel centres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
-from cadalign.arrays import FloatArray, as_floats
+from cadalign.arrays import FloatArray
 from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
-from cadalign.errors import DataError
-from cadalign.io.json_file import as_number, as_object, as_text, in_file, read_json
+from cadalign.errors import DataError, InputError, quote
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    Text,
+    convert,
+    in_file,
+    read_json,
+)
 
-_FIX = "is it COCO's keypoint JSON, or a detector's? see datasets/detections/coco_keypoints.py"
+_FIX = (
+    "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco_keypoints"
+)
+_Id = int | str
+_Size = Annotated[float, Meta(ge=1, le=2**31)]
+
+
+class _ByAxis(ForeignDocument):
+    """The keypoints of one object as ultralytics writes them."""
+
+    x: list[Finite]
+    y: list[Finite]
+    visible: list[Finite] | None = None
+
+
+class _Object(ForeignDocument):
+    """One object of any form, or one frame of a video with its objects."""
+
+    keypoints: list[Any] | _ByAxis | None = None
+    keypoint_scores: list[Finite] | None = None
+    score: Finite | None = None
+    bbox_score: Finite | None = None
+    confidence: Finite | None = None
+    image_id: _Id | None = None
+    category_id: _Id | None = None
+    num_keypoints: int | None = None
+    frame_id: _Id | None = None
+    instances: list[_Object] | None = None
+
+
+class _Image(ForeignDocument):
+    id: _Id
+    file_name: Text | None = None
+    width: _Size | None = None
+    height: _Size | None = None
+
+
+class _Category(ForeignDocument):
+    id: _Id
+    keypoints: list[Text] | None = None
+
+    def __post_init__(self) -> None:
+        names = self.keypoints or []
+        for row, name in enumerate(names):
+            if names.index(name) != row:
+                raise InputError(f"{quote(name)} occurs twice", where=f"keypoints[{row}]")
+
+
+class _Annotations(ForeignDocument):
+    """COCO annotations."""
+
+    annotations: list[_Object]
+    images: list[_Image] | None = None
+    categories: list[_Category] | None = None
+
+
+class _Meta(ForeignDocument):
+    keypoint_id2name: dict[str, Text] | None = None
+
+
+class _Predictions(ForeignDocument):
+    """MMPose's file of predictions."""
+
+    instance_info: list[_Object]
+    meta_info: _Meta | None = None
 
 
 def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read any of the four forms, one entry for each object in each image.
-
-    Raises
-    ------
-    DataError
-        If it is missing, is not JSON or of another form, or a field is missing or invalid; names
-        file and field.
-    """
+    """Read any of the four forms, one entry for each object in each image."""
     data = read_json(path)
     with in_file(path):
         objects = _read(data)
@@ -54,129 +118,116 @@ def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
 
 def _read(data: Any) -> list[ImageKeypoints]:
     if isinstance(data, list):
-        return [_detection(entry, f"[{row}]") for row, entry in enumerate(data)]
-    data = as_object(data, where=None)
-    if "annotations" in data:
-        return _annotations(data)
-    if "instance_info" in data:
-        return _mmpose_predictions(data)
+        return [
+            _image_keypoints(entry, f"[{row}]")
+            for row, entry in enumerate(convert(data, list[_Object]))
+        ]
+    if isinstance(data, dict) and "annotations" in data:
+        return _from_annotations(convert(data, _Annotations))
+    if isinstance(data, dict) and "instance_info" in data:
+        return _from_predictions(convert(data, _Predictions))
+    if not isinstance(data, dict):
+        raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
     raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
 
 
-def _annotations(data: Mapping[str, Any]) -> list[ImageKeypoints]:
-    """COCO annotations."""
-    images = {
-        _key(image, "id", where): (image, where)
-        for image, where in _entries(data, "images", required=False)
-    }
-    names = {
-        _key(category, "id", where): _names(category.get("keypoints"), f"{where}.keypoints")
-        for category, where in _entries(data, "categories", required=False)
-    }
+def _from_annotations(data: _Annotations) -> list[ImageKeypoints]:
+    images = {image.id: image for image in data.images or []}
+    names = {category.id: category.keypoints for category in data.categories or []}
     objects = []
-    for entry, where in _entries(data, "annotations"):
-        if entry.get("num_keypoints") == 0:
+    for row, entry in enumerate(data.annotations):
+        if entry.num_keypoints == 0:
             continue
-        has_category = entry.get("category_id") is not None
-        category = names.get(_key(entry, "category_id", where)) if has_category else None
-        found = _detection(entry, where, names=category)
+        where = f"annotations[{row}]"
+        category = None if entry.category_id is None else names.get(entry.category_id)
+        found = _image_keypoints(entry, where, names=category)
         if images:
-            image_id = _key(entry, "image_id", where)
-            if image_id not in images:
-                raise DataError(f"there is no image {image_id!r}", where=f"{where}.image_id")
-            found = replace(_in_image(found, *images[image_id]), images=len(images))
+            if entry.image_id is None:
+                raise DataError("missing", where=f"{where}.image_id")
+            image = images.get(entry.image_id)
+            if image is None:
+                what = f"there is no image {quote(entry.image_id)}"
+                raise DataError(what, where=f"{where}.image_id")
+            size = None
+            if image.width is not None and image.height is not None:
+                size = int(image.width), int(image.height)
+            name = image.file_name or found.image
+            found = replace(found, image=name, size=size, images=len(images))
         objects.append(found)
     return objects
 
 
-def _in_image(found: ImageKeypoints, image: Mapping[str, Any], where: str) -> ImageKeypoints:
-    size = None
-    if "width" in image and "height" in image:
-        width, height = (as_number(image[n], where=f"{where}.{n}") for n in ("width", "height"))
-        size = int(width), int(height)
-    name = image.get("file_name")
-    return replace(
-        found,
-        image=found.image if name is None else as_text(name, where=f"{where}.file_name"),
-        size=size,
-    )
-
-
-def _mmpose_predictions(data: Mapping[str, Any]) -> list[ImageKeypoints]:
-    """MMPose's file of predictions, with the keypoints' names in its ``meta_info``."""
-    meta = as_object(data.get("meta_info", {}), where="meta_info")
-    by_number = meta.get("keypoint_id2name")
+def _from_predictions(data: _Predictions) -> list[ImageKeypoints]:
+    by_number = data.meta_info.keypoint_id2name if data.meta_info else None
     names = None
     if by_number is not None:
-        by_number = as_object(by_number, where="meta_info.keypoint_id2name")
-        listed = [by_number.get(str(number)) for number in range(len(by_number))]
-        names = _names(listed, "meta_info.keypoint_id2name")
+        keys = [str(number) for number in range(len(by_number))]
+        names = convert([by_number.get(key) for key in keys], list[Text], where="meta_info.names")
     objects = []
-    for entry, where in _entries(data, "instance_info"):
-        # One entry for each frame of a video, or the objects of the only image themselves.
-        frame = entry.get("frame_id")
-        instances = _entries(entry, "instances", within=where) if "instances" in entry else None
-        for instance, place in [(entry, where)] if instances is None else instances:
-            found = _detection(instance, place, names=names)
-            objects.append(found if frame is None else replace(found, image=str(frame)))
+    for row, entry in enumerate(data.instance_info):
+        where = f"instance_info[{row}]"
+        if entry.instances is None:
+            objects.append(_image_keypoints(entry, where, names=names))
+            continue
+        for place, instance in enumerate(entry.instances):
+            found = _image_keypoints(instance, f"{where}.instances[{place}]", names=names)
+            image = found.image if entry.frame_id is None else str(entry.frame_id)
+            objects.append(replace(found, image=image))
     return objects
 
 
-def _detection(entry: Any, where: str, *, names: tuple[str, ...] | None = None) -> ImageKeypoints:
-    """One object of any form."""
-    entry = as_object(entry, where=where)
-    if "keypoints" not in entry:
-        raise DataError("missing", where=f"{where}.keypoints", fix=_FIX)
-    points, scores = _points(entry, f"{where}.keypoints")
+def _image_keypoints(
+    entry: _Object, where: str, *, names: list[str] | None = None
+) -> ImageKeypoints:
+    points, third = _points(entry, f"{where}.keypoints")
     if names is not None and len(names) != len(points):
         raise DataError(
             f"{len(points)} keypoints, but the category names {len(names)}",
             where=f"{where}.keypoints",
         )
-    score = next((entry[n] for n in ("score", "bbox_score", "confidence") if n in entry), None)
-    image = entry.get("image_id")
+    if third is not None and len(third) != len(points):
+        raise DataError(
+            f"{len(third)} scores of {len(points)} keypoints", where=f"{where}.keypoints"
+        )
+    given = (entry.score, entry.bbox_score, entry.confidence)
     return ImageKeypoints(
         points_2d=points,
-        scores=scores,
-        names=names,
-        image=None if image is None else str(image),
-        score=None if score is None else as_number(score, where=f"{where}.score"),
+        scores=None if third is None else _scores(np.asarray(third, dtype=float)),
+        names=None if names is None else tuple(names),
+        image=None if entry.image_id is None else str(entry.image_id),
+        score=next((score for score in given if score is not None), None),
         source=where,
     )
 
 
-def _points(entry: Mapping[str, Any], where: str) -> tuple[FloatArray, FloatArray | None]:
-    """Pixels (k, 2) and scores (k,) of one object."""
-    value = entry["keypoints"]
-    if isinstance(value, Mapping):
-        for name in ("x", "y"):
-            if name not in value:
-                raise DataError("missing", where=f"{where}.{name}")
-        x = as_floats(value["x"], name=f"{where}.x", shape=(None,))
-        y = as_floats(value["y"], name=f"{where}.y", shape=(len(x),))
-        third = value.get("visible")
-        points = np.stack([x, y], axis=1)
-        where = f"{where}.visible"
+def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
+    """Pixels (k, 2), and visibility flags or scores (k,) if there are any."""
+    value = entry.keypoints
+    if value is None:
+        raise DataError("missing", where=where, fix=_FIX)
+    if isinstance(value, _ByAxis):
+        if len(value.x) != len(value.y):
+            raise DataError(f"{len(value.y)} values, but x has {len(value.x)}", where=f"{where}.y")
+        return np.column_stack([value.x, value.y]), value.visible
+    if not value:
+        raise DataError("expected a list of numbers", where=where)
+    if isinstance(value[0], list):
+        rows = convert(value, list[list[Finite]], where=where)
+        width = len(rows[0])
+        if width not in (2, 3) or any(len(row) != width for row in rows):
+            raise DataError(f"{quote(rows)} are not x, y and score of each keypoint", where=where)
+        numbers = np.array(rows)
     else:
-        rows = np.ndim(_as_list(value, where)[0]) > 0
-        third = entry.get("keypoint_scores")
-        if rows:
-            numbers = as_floats(value, name=where, shape=(None, None))
-        else:
-            flat = as_floats(value, name=where, shape=(None,))
-            if len(flat) % 3:
-                raise DataError(
-                    f"{len(flat)} numbers are not x, y and visibility of keypoints", where=where
-                )
-            numbers = flat.reshape(-1, 3)
-        if numbers.shape[1] not in (2, 3):
-            raise DataError(f"{numbers.shape[1]} numbers for a keypoint", where=where)
-        points = np.ascontiguousarray(numbers[:, :2])
-        if third is None and numbers.shape[1] == 3:
-            third = numbers[:, 2]
-    if third is None:
-        return points, None
-    return points, _scores(as_floats(third, name=where, shape=(len(points),)))
+        flat = convert(value, list[Finite], where=where)
+        if len(flat) % 3:
+            raise DataError(
+                f"{len(flat)} numbers are not x, y and visibility of keypoints", where=where
+            )
+        numbers = np.reshape(flat, (-1, 3))
+    third: Any = entry.keypoint_scores
+    if third is None and numbers.shape[1] == 3:
+        third = numbers[:, 2]
+    return np.ascontiguousarray(numbers[:, :2]), third
 
 
 def _scores(third: FloatArray) -> FloatArray:
@@ -184,47 +235,3 @@ def _scores(third: FloatArray) -> FloatArray:
     if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
         return np.choose(third.astype(int), [0.0, OCCLUDED_SCORE, 1.0])
     return third
-
-
-def _as_list(value: Any, where: str) -> list[Any]:
-    if not isinstance(value, list) or not value:
-        raise DataError("expected a list of numbers", where=where)
-    return value
-
-
-def _entries(
-    data: Mapping[str, Any], name: str, *, required: bool = True, within: str = ""
-) -> list[tuple[Mapping[str, Any], str]]:
-    """The objects of a list, each with its place."""
-    place = f"{within}.{name}" if within else name
-    values = data.get(name)
-    if values is None and not required:
-        return []
-    if not isinstance(values, list):
-        raise DataError("expected a list", where=place)
-    return [
-        (as_object(value, where=f"{place}[{row}]"), f"{place}[{row}]")
-        for row, value in enumerate(values)
-    ]
-
-
-def _key(entry: Mapping[str, Any], name: str, where: str) -> str | int:
-    value = entry.get(name)
-    if not isinstance(value, str | int):
-        raise DataError(
-            "missing" if value is None else f"{value!r} is no id", where=f"{where}.{name}"
-        )
-    return value
-
-
-def _names(value: Any, where: str) -> tuple[str, ...] | None:
-    """A category's names of keypoints; None where it has none."""
-    if value is None:
-        return None
-    if not isinstance(value, list):
-        raise DataError("expected a list of names", where=where)
-    names = tuple(as_text(name, where=f"{where}[{row}]") for row, name in enumerate(value))
-    for row, name in enumerate(names):
-        if name in names[:row]:
-            raise DataError(f"{name!r} occurs twice", where=f"{where}[{row}]")
-    return names

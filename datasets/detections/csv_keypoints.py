@@ -28,125 +28,108 @@ Only ``u`` and ``v`` must be there. Example::
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError, quote
+from cadalign.io.documents import Document, Finite, Text, convert, in_file
 
-_COLUMNS = ("image", "name", "semantic_id", "u", "v", "score", "visibility", "sigma")
 _OTHER_NAMES = {"x": "u", "y": "v"}
-_VISIBILITY_SCORES = {0: 0.0, 1: OCCLUDED_SCORE, 2: 1.0}
+_VISIBILITY_SCORES = (0.0, OCCLUDED_SCORE, 1.0)
+
+
+class _Row(Document):
+    """One line, as the module's documentation describes its columns."""
+
+    u: Finite
+    v: Finite
+    image: str = ""
+    # UNSET, not None: the library reads None out of the text "null".
+    name: Text | UnsetType = UNSET
+    semantic_id: Finite | UnsetType = UNSET
+    score: Finite | UnsetType = UNSET
+    visibility: Finite | UnsetType = UNSET
+    sigma: Finite | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        # Programs write whole numbers as 2.0 in columns with gaps.
+        if self.semantic_id is not UNSET and self.semantic_id % 1:
+            raise InputError(f"{self.semantic_id} is not a whole number", where="semantic_id")
+        if self.visibility is not UNSET and self.visibility not in (0, 1, 2):
+            raise InputError(f"{self.visibility:g} is not 0, 1 or 2", where="visibility")
 
 
 def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image.
-
-    Raises
-    ------
-    DataError
-        If it is missing, lacks a column, or a value is invalid; names file and line.
-    """
+    """Read a CSV file, one object for each image."""
+    by_image: dict[str | None, list[_Row]] = {}
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file, strict=True)
-            header = _header(next(lines, []), path)
-            rows = [(lines.line_num, row) for row in lines if any(cell.strip() for cell in row)]
+            header = _header(next(lines, []), f"{path}, line 1")
+            for line in lines:
+                row = _row(header, line, f"{path}, line {lines.line_num}")
+                if row is not None:
+                    by_image.setdefault(row.image or None, []).append(row)
     except FileNotFoundError:
         raise DataError("no such file", where=str(path)) from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:  # not UTF-8, or a NUL in the path
         raise DataError(f"cannot be read ({error})", where=str(path)) from None
-    by_image: dict[str | None, list[tuple[str, dict[str, str]]]] = {}
-    for line, row in rows:
-        where = f"{path}, line {line}"
-        if len(row) != len(header):
-            raise DataError(f"{len(row)} values for {len(header)} columns", where=where)
-        cells = {name: cell.strip() for name, cell in zip(header, row, strict=True)}
-        if not cells["u"] and not cells["v"]:
-            continue
-        by_image.setdefault(cells.get("image") or None, []).append((where, cells))
     if not by_image:
         raise DataError("there are no keypoints", where=str(path))
-    return [_object(path, header, image, found) for image, found in by_image.items()]
+    return [_object(path, image, rows) for image, rows in by_image.items()]
 
 
-def _header(cells: list[str], path: Path) -> list[str]:
+def _header(cells: list[str], where: str) -> list[str]:
     names = [_OTHER_NAMES.get(cell.strip().lower(), cell.strip().lower()) for cell in cells]
+    known = _Row.__struct_fields__
     for name in names:
-        if name not in _COLUMNS:
-            raise DataError(
-                f"unknown column {name!r}",
-                where=f"{path}, line 1",
-                fix=f"known are {', '.join(_COLUMNS)}",
-            )
+        if name not in known:
+            what = f"unknown column {quote(name)}"
+            raise DataError(what, where=where, fix=f"known are {', '.join(known)}")
         if names.count(name) > 1:
-            raise DataError(f"the column {name!r} occurs twice", where=f"{path}, line 1")
+            raise DataError(f"the column {name!r} occurs twice", where=where)
     for name in ("u", "v"):
         if name not in names:
-            raise DataError(
-                f"the column {name!r} is missing",
-                where=f"{path}, line 1",
-                fix="the first line names the columns, such as name,u,v",
-            )
+            fix = "the first line names the columns, such as name,u,v"
+            raise DataError(f"the column {name!r} is missing", where=where, fix=fix)
     if {"score", "visibility"} <= set(names):
-        raise DataError("give score or visibility, not both", where=f"{path}, line 1")
+        raise DataError("give score or visibility, not both", where=where)
     return names
 
 
-def _object(
-    path: Path, header: list[str], image: str | None, found: list[tuple[str, dict[str, str]]]
-) -> ImageKeypoints:
-    def column(name: str) -> list[float] | None:
-        return [_number(c, name, w) for w, c in found] if name in header else None
+def _row(header: list[str], line: list[str], where: str) -> _Row | None:
+    """One line; None for one that is empty or has no pixel."""
+    cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
+    if not any(cells.values()):
+        return None
+    if len(line) != len(header):
+        raise DataError(f"{len(line)} values for {len(header)} columns", where=where)
+    if not cells["u"] and not cells["v"]:
+        return None
+    with in_file(where):
+        row: _Row = convert(cells, _Row, strict=False)
+    return row
+
+
+def _object(path: Path, image: str | None, rows: list[_Row]) -> ImageKeypoints:
+    def column(name: str) -> Any:
+        values = [getattr(row, name) for row in rows]
+        return None if values[0] is UNSET else values
 
     scores = column("score")
-    if "visibility" in header:
-        scores = [_visibility(cells, where) for where, cells in found]
-    ids = None
-    if "semantic_id" in header and "name" not in header:
-        ids = tuple(_whole(cells, "semantic_id", where) for where, cells in found)
-    names = None
-    if "name" in header:
-        names = tuple(_name(cells, where) for where, cells in found)
-    sigma = column("sigma")
+    if column("visibility") is not None:
+        scores = [_VISIBILITY_SCORES[int(flag)] for flag in column("visibility")]
+    names, ids, sigma = column("name"), column("semantic_id"), column("sigma")
     return ImageKeypoints(
-        points_2d=np.array([[_number(c, "u", w), _number(c, "v", w)] for w, c in found]),
+        points_2d=np.array([[row.u, row.v] for row in rows]),
         scores=None if scores is None else np.array(scores),
-        names=names,
-        semantic_ids=ids,
+        names=None if names is None else tuple(names),
+        semantic_ids=None if ids is None or names is not None else tuple(map(int, ids)),
         sigma=None if sigma is None else np.array(sigma),
         image=image,
         source=str(path) if image is None else f"{path}, {image}",
     )
-
-
-def _number(cells: dict[str, str], name: str, where: str) -> float:
-    try:
-        value = float(cells[name])
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DataError(f"{name} is {cells[name]!r}, not a number", where=where)
-    return value
-
-
-def _whole(cells: dict[str, str], name: str, where: str) -> int:
-    value = _number(cells, name, where)
-    if value != int(value):
-        raise DataError(f"{name} is {cells[name]!r}, not a whole number", where=where)
-    return int(value)
-
-
-def _visibility(cells: dict[str, str], where: str) -> float:
-    flag = _whole(cells, "visibility", where)
-    if flag not in _VISIBILITY_SCORES:
-        raise DataError(f"visibility is {flag}, not 0, 1 or 2", where=where)
-    return _VISIBILITY_SCORES[flag]
-
-
-def _name(cells: dict[str, str], where: str) -> str:
-    if not cells["name"]:
-        raise DataError("the name is empty", where=where)
-    return cells["name"]

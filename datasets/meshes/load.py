@@ -10,7 +10,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.meshes.obj import read_obj
 from cadalign.datasets.meshes.scenes import read_ply, read_scene
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 
 _READERS = {
@@ -72,12 +72,14 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         if path.stat().st_size == 0:
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
         return reader(path)
+    except InputError as error:  # what Mesh refuses
+        where = str(path) if error.where is None else error.where
+        raise DataError(error.what, where=where, fix=error.fix) from None
     except FileNotFoundError:
         raise DataError("no such mesh file", where=str(path)) from None
-    except OSError as error:
-        raise DataError(
-            f"the mesh file cannot be read ({error.strerror or error})", where=str(path)
-        ) from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"the mesh file cannot be read ({reason})", where=str(path)) from None
 
 
 def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ...]:

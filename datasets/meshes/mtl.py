@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,6 +16,11 @@ from cadalign.geometry.mesh import GREY, Material
 
 logger = logging.getLogger("cadalign")
 
+Texture = npt.NDArray[np.uint8]
+
+# Deflate compresses bytes to 1/1032 at most; images of one bit per pixel grow further when decoded.
+_COMPRESSION = 1032
+_FREE_BYTES = 2**26
 WHITE = (1.0, 1.0, 1.0, 1.0)
 # How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
 _MAP_OPTIONS = {
@@ -47,19 +53,24 @@ def load_materials(
         for path in _library_paths(obj_path, library):
             entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
     found: dict[str, Material] = {}
+    # Of each file once, however many materials name it.
+    load_texture = functools.cache(_load_texture)
     for name in names:
         # The parser joins the words of a name with single blanks.
         key = " ".join(name.split())
         if key in entries:
-            found[name] = _material(name, *entries[key])
+            found[name] = _material(name, *entries[key], load_texture)
         else:
             logger.warning("%s: material %r is not defined; it becomes grey", obj_path, name)
             found[name] = Material(name=name)
     return found
 
 
-def texture_array(image: Any) -> npt.NDArray[np.uint8]:
-    """A PIL image as (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
+def texture_array(image: Any, file_size: int) -> Texture:
+    """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
+    width, height = image.size
+    if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
+        raise ValueError(f"{width} x {height} pixels in {file_size} bytes")
     transparent = "A" in image.getbands() or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
@@ -113,8 +124,13 @@ def _rename_map(line: str) -> str:
     return f"texture_file {words[1]}" if words and words[0].lower() == "map_kd" else line
 
 
-def _material(name: str, path: Path, entry: dict[str, Any]) -> Material:
-    texture = _load_texture(path, entry.get("texture_file", []))
+def _material(
+    name: str,
+    path: Path,
+    entry: dict[str, Any],
+    load_texture: Callable[[Path, tuple[str, ...]], Texture | None],
+) -> Material:
+    texture = load_texture(path, tuple(entry.get("texture_file", [])))
     color = _color(entry)
     if texture is None and "texture_file" in entry:
         color = (*GREY[:3], color[3])
@@ -146,7 +162,7 @@ def _number(words: list[str] | None) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _load_texture(path: Path, words: list[str]) -> npt.NDArray[np.uint8] | None:
+def _load_texture(path: Path, words: tuple[str, ...]) -> Texture | None:
     import PIL.Image
 
     if not words:
@@ -158,20 +174,20 @@ def _load_texture(path: Path, words: list[str]) -> npt.NDArray[np.uint8] | None:
         return None
     try:
         with PIL.Image.open(found) as image:
-            return texture_array(image)
+            return texture_array(image, found.stat().st_size)
     except Exception as error:  # PIL's plugins raise what they like on damaged files
         logger.warning("%s: the texture %s cannot be read (%s); drawn grey", path, name, error)
         return None
 
 
-def _without_options(words: list[str]) -> list[str]:
+def _without_options(words: Sequence[str]) -> Sequence[str]:
     position = 0
     while position < len(words) - 1 and words[position].lower() in _MAP_OPTIONS:
         option = words[position].lower()
         position += 1
-        for _ in range(_MAP_OPTIONS[option]):
+        for value in words[position : position + _MAP_OPTIONS[option]]:
             # -o, -s and -t may leave their second and third value out.
-            if option in ("-o", "-s", "-t") and _number([words[position]]) is None:
+            if option in ("-o", "-s", "-t") and _number([value]) is None:
                 break
             position += 1
     return words[position:]

@@ -22,6 +22,7 @@ from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
 
 _DIGITS = b"0123456789+-"
+_MAX_VALUES = 16  # of a vertex; the format has at most 7
 _DAMAGED = "the file is cut short or damaged; get it again"
 # Assimp, which wrote ShapeNetCore.v2, says in a comment how many faces, lines and points follow.
 _ASSIMP_MARK = b"Open Asset Import Library"
@@ -50,13 +51,6 @@ def read_obj(path: Path) -> Mesh:
     Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is not an OBJ file, or has no faces.
-    OSError
-        If it cannot be read.
     """
     with path.open("rb") as file:
         statements = _sort_statements(file, path)
@@ -65,7 +59,7 @@ def read_obj(path: Path) -> Mesh:
         vertices, colors = _parse_vertices(statements.vertices)
         texture_coordinates = _parse_rows(statements.texture_coordinates)
         corners, sizes = _parse_faces(statements.faces)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise _first_malformed(path) from None
     line_of_corner = np.repeat(np.arange(len(sizes)), sizes)
     corners[:, 0] = _absolute_indices(
@@ -153,18 +147,18 @@ def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
 
 def _logical_lines(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
-    pending = b""
+    parts: list[bytes] = []
+    number = 0
     for number, raw in enumerate(file, start=1):
         line = raw.strip()
         if line.endswith(b"\\"):
-            pending += line[:-1] + b" "
+            parts.append(line[:-1])
             continue
-        if pending:
-            line, pending = pending + line, b""
         # A tab may separate the keyword too.
-        yield number, line.replace(b"\t", b" ")
-    if pending:
-        yield number, pending.replace(b"\t", b" ")
+        yield number, b" ".join([*parts, line]).replace(b"\t", b" ")
+        parts = []
+    if parts:
+        yield number, b" ".join(parts).replace(b"\t", b" ")
 
 
 def _require_complete(statements: _Statements, path: Path) -> None:
@@ -196,6 +190,8 @@ def _parse_rows(bodies: list[bytes]) -> FloatArray:
     if lengths.sum() != len(values) or (lengths < 1).any():
         raise ValueError("not all of it is numbers")
     width = int(lengths.max(initial=0))
+    if width > _MAX_VALUES:
+        raise ValueError("too many numbers in a line")
     if (lengths == width).all():
         return np.asarray(values.reshape(len(bodies), width))
     rows = np.zeros((len(bodies), width))
@@ -339,7 +335,7 @@ def _first_malformed(path: Path) -> DataError:
                     _parse_rows([body])
                 elif key == b"f":
                     _parse_faces([body])
-            except ValueError:
+            except (ValueError, OverflowError):
                 shown = line[:60].decode("ascii", errors="replace")
                 return DataError(
                     f"cannot read {shown!r}", where=f"{path}, line {number}", fix=_DAMAGED

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +14,9 @@ import trimesh
 from trimesh.visual.color import linear_to_srgb
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.meshes.mtl import WHITE, texture_array
+from cadalign.datasets.meshes.mtl import WHITE, Texture, texture_array
 from cadalign.datasets.meshes.obj import fan_triangles
-from cadalign.errors import DataError
+from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.mesh import GREY, Material, Mesh
 
 _DAMAGED = "the file is cut short or damaged; get it again"
@@ -21,75 +24,95 @@ _MAX_HEADER_LINES = 1000
 
 
 def read_ply(path: Path) -> Mesh:
-    """Read a PLY file, ASCII or binary; `cadalign.datasets.load_mesh` is the public way to it.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is not a PLY file, or has no faces.
-    OSError
-        If it cannot be read.
-    """
-    declared = _declared_counts(path)
-    if not declared.get("face"):
-        raise DataError("the PLY file has no faces", where=str(path))
-    mesh = _load(path)
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.vertices) or mesh.visual is None:
-        raise DataError("no triangles could be read", where=str(path), fix=_DAMAGED)
-    textured = mesh.visual.kind == "texture"
-    if len(mesh.vertices) < declared.get("vertex", 0) and not textured:
-        raise _short(path, "vertices", len(mesh.vertices), declared["vertex"])
-    if len(mesh.faces) == declared["face"]:
-        return _join([_piece(mesh, np.eye(4), path)], path)
-    if textured:
-        raise DataError("polygons with texture coordinates are not read", where=str(path))
-    return _with_polygons(mesh, declared["face"], path)
+    """Read a PLY file, ASCII or binary; `cadalign.datasets.load_mesh` is the public way to it."""
+    with _parsing(path):
+        declared = _declared_counts(path)
+        if not declared.get("face"):
+            raise DataError("the PLY file has no faces", where=str(path))
+        mesh = trimesh.load(str(path), process=False)
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.vertices) or mesh.visual is None:
+            raise DataError("no triangles could be read", where=str(path), fix=_DAMAGED)
+        textured = mesh.visual.kind == "texture"
+        if len(mesh.vertices) < declared.get("vertex", 0) and not textured:
+            raise _short(path, "vertices", len(mesh.vertices), declared["vertex"])
+        if len(mesh.faces) == declared["face"]:
+            return _join([_piece(mesh, np.eye(4), path, _textures([mesh], path))], path)
+        if textured:
+            raise DataError("polygons with texture coordinates are not read", where=str(path))
+        return _with_polygons(mesh, declared["face"], path)
 
 
 def read_scene(path: Path) -> Mesh:
-    """Read a GLB, glTF, STL or OFF file as one mesh, each node placed by its transform.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or damaged, is of another format, or has no faces.
-    OSError
-        If it cannot be read.
-    """
-    loaded = _load(path)
-    scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
-    pieces = []
-    for node in sorted(scene.graph.nodes_geometry):
-        transform, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            pieces.append(_piece(geometry, np.asarray(transform, dtype=float), path))
-    if not pieces:
-        raise DataError("the file has no faces", where=str(path), fix="is it whole?")
-    mesh = _join(pieces, path)
-    if path.suffix.lower() == ".off":
-        declared = _declared_off_faces(path)
-        if len(mesh.faces) < declared:
-            raise _short(path, "faces", len(mesh.faces), declared)
-    return mesh
+    """Read a GLB, glTF, STL or OFF file as one mesh, each node placed by its transform."""
+    with _parsing(path):
+        if path.suffix.lower() in (".glb", ".gltf"):
+            _check_accessors(path)
+        loaded = trimesh.load(str(path), process=False)
+        scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
+        textures = _textures(scene.geometry.values(), path)
+        pieces = []
+        for node in sorted(scene.graph.nodes_geometry):
+            transform, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+                placed = np.asarray(transform, dtype=float)
+                pieces.append(_piece(geometry, placed, path, textures))
+        if not pieces:
+            raise DataError("the file has no faces", where=str(path), fix="is it whole?")
+        mesh = _join(pieces, path)
+        if path.suffix.lower() == ".off":
+            declared = _declared_off_faces(path)
+            if len(mesh.faces) < declared:
+                raise _short(path, "faces", len(mesh.faces), declared)
+        return mesh
 
 
-def _load(path: Path) -> Any:
+@contextmanager
+def _parsing(path: Path) -> Iterator[None]:
+    """Convert all errors on damaged content to `DataError`: trimesh's readers raise any kind."""
     try:
-        return trimesh.load(str(path), process=False)
-    except OSError:
+        with np.errstate(all="ignore"):  # coordinates that are not finite are refused by Mesh
+            yield
+    except (OSError, CadalignError):
         raise
-    except Exception as error:  # trimesh's readers raise what they like on damaged files
+    except Exception as error:
         # Text that is not UTF-8 makes trimesh look for a package that guesses encodings.
         not_text = isinstance(error, ImportError | UnicodeDecodeError)
-        reason = (
-            "neither whole binary data nor text" if not_text else f"{type(error).__name__}: {error}"
-        )
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        if not_text:
+            reason = "neither whole binary data nor text"
         raise DataError(
             f"cannot be read as a {path.suffix.lstrip('.').upper()} file ({reason})",
             where=str(path),
             fix=_DAMAGED,
         ) from None
+
+
+def _check_accessors(path: Path) -> None:
+    """Refuse glTF accessors without data that are longer than the file: they would be zeros."""
+    data = path.read_bytes()
+    if data[:4] == b"glTF":
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]  # the chunk of JSON
+    for number, accessor in enumerate(json.loads(data).get("accessors", [])):
+        if "bufferView" not in accessor and accessor["count"] > path.stat().st_size:
+            raise DataError(
+                f"accessor {number} has {accessor['count']} values, but no data",
+                where=str(path),
+                fix=_DAMAGED,
+            )
+
+
+def _textures(geometries: Iterable[Any], path: Path) -> dict[int, Texture]:
+    """The textures of all materials by the identity of their image, each converted once."""
+    images = [_image(getattr(geometry.visual, "material", None)) for geometry in geometries]
+    size = path.stat().st_size
+    return {id(image): texture_array(image, size) for image in images if image is not None}
+
+
+def _image(material: Any) -> Any:
+    """The image of one of trimesh's materials; None if it has none."""
+    image = getattr(material, "baseColorTexture", None)
+    return getattr(material, "image", None) if image is None else image
 
 
 def _declared_counts(path: Path) -> dict[str, int]:
@@ -163,7 +186,9 @@ def _polygon_rows(data: Any) -> list[npt.NDArray[Any]]:
     return []
 
 
-def _piece(geometry: Any, transform: FloatArray, path: Path) -> Mesh:
+def _piece(
+    geometry: Any, transform: FloatArray, path: Path, textures: Mapping[int, Texture]
+) -> Mesh:
     """One of trimesh's meshes, placed."""
     vertices = trimesh.transform_points(np.asarray(geometry.vertices, dtype=float), transform)
     faces = np.asarray(geometry.faces, dtype=np.int64)
@@ -172,7 +197,7 @@ def _piece(geometry: Any, transform: FloatArray, path: Path) -> Mesh:
     face_material = np.zeros(len(faces), dtype=np.int64)
     colors, corner_uv = None, None
     if visual.kind == "texture":
-        materials = (_material(visual.material),)
+        materials = (_material(visual.material, textures),)
         if visual.uv is not None and len(visual.uv) == len(vertices):
             corner_uv = np.asarray(visual.uv, dtype=float)[faces][:, :, :2]
         attribute = getattr(visual, "vertex_attributes", {}).get("color")
@@ -220,21 +245,21 @@ def _encoded(colors: FloatArray) -> FloatArray:
     return encoded
 
 
-def _material(material: Any) -> Material:
-    """One of trimesh's materials; its colour and texture only."""
-    image = getattr(material, "baseColorTexture", None)
+def _material(material: Any, textures: Mapping[int, Texture]) -> Material:
+    """Convert one of trimesh's materials; its colour and texture only."""
+    image = _image(material)
     factor = getattr(material, "baseColorFactor", None)
+    diffuse = getattr(material, "diffuse", None)
     if factor is not None:
         color = _rgba(_encoded(np.array(_rgba(factor))))
-    elif image is not None:
-        color = WHITE
+    elif diffuse is not None and getattr(material, "baseColorTexture", None) is None:
+        color = _rgba(diffuse)
     else:
-        image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
-        color = _rgba(factor) if factor is not None else WHITE if image is not None else GREY
+        color = GREY if image is None else WHITE
     return Material(
         name=str(getattr(material, "name", None) or ""),
         color=color,
-        texture=None if image is None else texture_array(image),
+        texture=None if image is None else textures[id(image)],
     )
 
 

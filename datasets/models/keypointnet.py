@@ -253,7 +253,7 @@ class KeypointNet:
 
     @property
     def problems(self) -> dict[ModelKey, DataError]:
-        """Why models could not be read, by (category, model id)."""
+        """Errors of the models that could not be read, by (category, model id)."""
         return {
             (name, model_id): error
             for name in self._categories

@@ -1,4 +1,4 @@
-"""What KeypointNet says of a model: its keypoints and its symmetries."""
+"""Annotations of a model: its keypoints and its symmetries."""
 
 from __future__ import annotations
 
@@ -92,12 +92,12 @@ class RotationalSymmetry:
 
     @property
     def is_circle(self) -> bool:
-        """Whether any angle of rotation leaves the object as it is."""
+        """True if any angle of rotation leaves the object as it is."""
         return self.circle is not None
 
     @property
     def fold(self) -> int | None:
-        """How many keypoints trade places; None on a circle, which has no such number."""
+        """Number of keypoints that trade places; None on a circle, which has no such number."""
         return None if self.is_circle else len(self.keypoints)
 
 

@@ -1,4 +1,4 @@
-"""Where the mesh of a model lies: KeypointNet's PLY files, or ShapeNet's OBJ files."""
+"""Mesh files of KeypointNet's models: its own PLY files, or ShapeNet's OBJ files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,6 @@ class MeshLocator:
         KeypointNet's root.
     shapenet_root : str or path-like, optional
         ShapeNetCore; its meshes come first.
-
-    Raises
-    ------
-    DataError
-        If ``shapenet_root`` is no folder.
     """
 
     def __init__(self, root: Path, shapenet_root: str | os.PathLike[str] | None) -> None:

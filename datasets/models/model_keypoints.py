@@ -25,8 +25,8 @@ it.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,30 +34,62 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.annotations import parse_entry
 from cadalign.datasets.models.keypointnet import AnnotatedModel
-from cadalign.errors import CadalignError, DataError
+from cadalign.datasets.models.keypoints import Keypoints
+from cadalign.errors import CadalignError, DataError, InputError, quote
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_json
-from cadalign.io.json_file import (
-    as_index,
-    as_numbers,
-    as_object,
-    as_path,
-    as_text,
+from cadalign.io.documents import (
+    Document,
+    Index,
+    PathText,
+    Point3,
+    Text,
+    convert,
     in_file,
+    path_from,
     read_json,
-    refuse_unknown,
     written_path,
 )
+from cadalign.io.files import write_json
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
 SUFFIX = ".keypoints.json"
 """What the file of ``chair.obj`` ends in: ``chair.keypoints.json``."""
 
-_FIELDS = {"format", "version", "model", "keypoints"}
-_KEYPOINT_FIELDS = {"name", "xyz", "semantic_id", "face_index", "barycentric"}
 _SUM_TOLERANCE = 0.01
+
+
+class _Entry(Document):
+    """One keypoint of the file, as the module's documentation describes it."""
+
+    name: Text
+    xyz: Point3 | None = None
+    semantic_id: Index | None = None
+    face_index: Index | None = None
+    barycentric: Point3 | None = None
+
+    def __post_init__(self) -> None:
+        if (self.face_index is None) != (self.barycentric is None):
+            missing = "face_index" if self.face_index is None else "barycentric"
+            raise InputError("missing", where=missing, fix="give both or neither")
+        if self.xyz is None and self.face_index is None:
+            raise InputError("missing", where="xyz", fix="or give face_index and barycentric")
+        if self.barycentric is not None and not abs(sum(self.barycentric) - 1) <= _SUM_TOLERANCE:
+            raise InputError(
+                f"{list(self.barycentric)} sum to {sum(self.barycentric):g}, not to 1",
+                where="barycentric",
+            )
+
+
+class _File(Document):
+    """The file's only object."""
+
+    format: str
+    version: int
+    keypoints: list[_Entry]
+    model: PathText | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +162,7 @@ class ModelKeypoints:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the keypoints are called."""
+        """Names of the keypoints."""
         return tuple(keypoint.name for keypoint in self.keypoints)
 
     @property
@@ -140,7 +172,7 @@ class ModelKeypoints:
 
     @property
     def xyz(self) -> FloatArray:
-        """Where the keypoints lie, (k, 3) float [model units]."""
+        """Positions of the keypoints, (k, 3) float [model units]."""
         return np.array([keypoint.xyz for keypoint in self.keypoints], dtype=float).reshape(-1, 3)
 
     @classmethod
@@ -156,8 +188,12 @@ class ModelKeypoints:
         names : mapping of int to str, optional
             By semantic id; "keypoint 3" where there is none.
         """
-        given = names or {}
-        annotated = model.keypoints
+        return cls._of_keypoints(model.keypoints, model.mesh_path, names or {})
+
+    @classmethod
+    def _of_keypoints(
+        cls, annotated: Keypoints, model: Path | None, names: Mapping[int, str]
+    ) -> ModelKeypoints:
         rows = zip(
             annotated.semantic_ids.tolist(),
             annotated.xyz.tolist(),
@@ -168,7 +204,7 @@ class ModelKeypoints:
         return cls(
             tuple(
                 ModelKeypoint(
-                    given.get(number, f"keypoint {number}"),
+                    names.get(number, f"keypoint {number}"),
                     tuple(xyz),
                     number,
                     face,
@@ -176,67 +212,92 @@ class ModelKeypoints:
                 )
                 for number, xyz, face, weights in rows
             ),
-            model.mesh_path,
+            model,
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, mesh: Mesh | None = None) -> ModelKeypoints:
-        """Read a file of model keypoints.
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        mesh: Mesh | None = None,
+        model: Path | None = None,
+    ) -> ModelKeypoints:
+        """Read a file of model keypoints, or one model's of KeypointNet's annotations.
 
         Parameters
         ----------
         path : str or path-like
+            A file as described in `cadalign.datasets.models.model_keypoints`, or KeypointNet's
+            annotations of a category.
         mesh : Mesh, optional
-            Where keypoints without ``xyz`` lie; the file's ``model`` is read otherwise, if it is
-            needed.
+            The surface that keypoints without ``xyz`` lie on; the file's ``model`` is read
+            otherwise, if it is needed.
+        model : Path, optional
+            The mesh file; of KeypointNet's annotations those of the model are taken whose id
+            occurs in this path.
 
         Raises
         ------
         DataError
             If the file is missing, is not JSON, of another format or version, or a field is
-            missing, unknown or invalid; the message names file and field.
+            missing, unknown or invalid, or it has no annotations of the model; the message names
+            file and field.
         """
         path = Path(path)
         data = read_json(path)
+        if isinstance(data, list):
+            return cls._from_annotations(data, path, model)
         with in_file(path):
             return cls._from_data(data, path.parent, mesh)
 
     @classmethod
-    def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
-        data = as_object(data, where=None)
-        if data.get("format") != FORMAT:
+    def _from_annotations(cls, data: list[Any], path: Path, model: Path | None) -> ModelKeypoints:
+        if model is None:
             raise DataError(
-                f"{data.get('format')!r} is not {FORMAT!r}",
-                where="format",
+                "a list, not an object of model keypoints",
+                where=str(path),
                 fix="give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
             )
-        if data.get("version") != VERSION:
-            raise DataError(
-                f"{data.get('version')!r} is not {VERSION}",
-                where="version",
-                fix="it was written by another version of cadalign",
-            )
-        refuse_unknown(data, _FIELDS, where="top level")
-        entries = data.get("keypoints")
-        if not isinstance(entries, list):
-            raise DataError("expected a list", where="keypoints")
-        model = data.get("model")
-        model_path = None if model is None else as_path(model, folder=folder, where="model")
-        read = [_read_keypoint(entry, f"keypoints[{row}]") for row, entry in enumerate(entries)]
-        floating = [row for row, (_, is_placed) in enumerate(read) if not is_placed]
-        keypoints = [keypoint for keypoint, _ in read]
+        parts = model.absolute().parts
+        ids = {*parts, Path(parts[-1]).stem, *(part.split(".")[0] for part in parts)}
+        for entry in data:
+            model_id = entry.get("model_id") if isinstance(entry, dict) else None
+            if isinstance(model_id, str) and model_id in ids:
+                annotation = parse_entry(entry, where=f"{path}, {model_id}")
+                return cls._of_keypoints(annotation.keypoints, model, {})
+        raise DataError(
+            "has no annotations of a model whose id occurs in the model's path",
+            where=str(path),
+            fix=f"is {model} of this category?",
+        )
+
+    @classmethod
+    def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
+        for name, wanted, fix in (
+            (
+                "format",
+                FORMAT,
+                "give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
+            ),
+            ("version", VERSION, "it was written by another version of cadalign"),
+        ):
+            if isinstance(data, dict) and data.get(name) != wanted:
+                raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)
+        read: _File = convert(data, _File)
+        model = None if read.model is None else path_from(read.model, folder)
+        floating = [row for row, entry in enumerate(read.keypoints) if entry.xyz is None]
         if floating and mesh is None:
-            if model_path is None:
+            if model is None:
                 raise DataError(
                     "neither xyz nor a model that the face belongs to",
                     where=f"keypoints[{floating[0]}]",
                     fix="give xyz, or name the mesh file under model",
                 )
-            mesh = load_mesh(model_path)
-        if mesh is not None:
-            for row in floating:
-                keypoints[row] = _placed(keypoints[row], mesh, f"keypoints[{row}].face_index")
-        return cls(tuple(keypoints), model_path)
+            mesh = load_mesh(model)
+        return cls(
+            tuple(_keypoint(entry, row, mesh) for row, entry in enumerate(read.keypoints)), model
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file of model keypoints; the model's path is written relative to it.
@@ -249,7 +310,7 @@ class ModelKeypoints:
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
-        """What the file holds, the model's path relative to ``folder``."""
+        """Content of the file, the model's path relative to ``folder``."""
         data: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         if self.model is not None:
             data["model"] = written_path(self.model.resolve(), folder=folder)
@@ -257,57 +318,26 @@ class ModelKeypoints:
         return data
 
 
-def _read_keypoint(entry: Any, where: str) -> tuple[ModelKeypoint, bool]:
-    """A keypoint, and whether its place is known already."""
-    entry = as_object(entry, where=where)
-    refuse_unknown(entry, _KEYPOINT_FIELDS, where=where)
-    if "name" not in entry:
-        raise DataError("missing", where=f"{where}.name")
-    xyz = entry.get("xyz")
-    face, weights = entry.get("face_index"), entry.get("barycentric")
-    if (face is None) != (weights is None):
-        missing = "face_index" if face is None else "barycentric"
-        raise DataError("missing", where=f"{where}.{missing}", fix="give both or neither")
-    if xyz is None and face is None:
-        raise DataError("missing", where=f"{where}.xyz", fix="or give face_index and barycentric")
-    semantic_id = entry.get("semantic_id")
-    keypoint = ModelKeypoint(
-        name=as_text(entry["name"], where=f"{where}.name"),
-        xyz=_three((0.0, 0.0, 0.0) if xyz is None else xyz, f"{where}.xyz"),
-        semantic_id=None
-        if semantic_id is None
-        else as_index(semantic_id, where=f"{where}.semantic_id"),
-        face_index=None if face is None else as_index(face, where=f"{where}.face_index"),
-        barycentric=None if weights is None else _weights(weights, f"{where}.barycentric"),
+def _keypoint(entry: _Entry, row: int, mesh: Mesh | None) -> ModelKeypoint:
+    """The keypoint of an entry; one without ``xyz`` lies on the mesh."""
+    xyz = entry.xyz
+    if xyz is None and mesh and entry.face_index is not None and entry.barycentric is not None:
+        try:
+            (place,) = mesh.surface_points([entry.face_index], [entry.barycentric])
+        except CadalignError as error:
+            raise DataError(error.what, where=f"keypoints[{row}].face_index") from None
+        xyz = tuple(place.tolist())
+    return ModelKeypoint(
+        name=entry.name,
+        xyz=xyz or (0.0, 0.0, 0.0),
+        semantic_id=entry.semantic_id,
+        face_index=entry.face_index,
+        barycentric=entry.barycentric,
     )
-    return keypoint, xyz is not None
-
-
-def _three(value: Sequence[float], where: str) -> tuple[float, float, float]:
-    x, y, z = as_numbers(value, 3, where=where)
-    return x, y, z
-
-
-def _weights(value: Any, where: str) -> tuple[float, float, float]:
-    weights = _three(value, where)
-    if abs(sum(weights) - 1) > _SUM_TOLERANCE:
-        raise DataError(f"{list(weights)} sum to {sum(weights):g}, not to 1", where=where)
-    return weights
-
-
-def _placed(keypoint: ModelKeypoint, mesh: Mesh, where: str) -> ModelKeypoint:
-    """The keypoint with the place that its face and barycentric coordinates name."""
-    if keypoint.face_index is None or keypoint.barycentric is None:
-        return keypoint
-    try:
-        (xyz,) = mesh.surface_points([keypoint.face_index], [keypoint.barycentric])
-    except CadalignError as error:
-        raise DataError(error.what, where=where) from None
-    return replace(keypoint, xyz=tuple(xyz.tolist()))
 
 
 def _written(keypoint: ModelKeypoint) -> dict[str, Any]:
-    """What the file says of one keypoint."""
+    """The entry of one keypoint in the file."""
     data: dict[str, Any] = {"name": keypoint.name, "xyz": list(keypoint.xyz)}
     if keypoint.semantic_id is not None:
         data["semantic_id"] = keypoint.semantic_id

@@ -25,6 +25,7 @@ from cadalign.geometry.camera import Camera
 DEFAULT_FOCAL = 800.0
 """The virtual camera's focal length [px] where the files don't say one."""
 
+_LARGEST_IMAGE = 2**30
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
 
@@ -136,7 +137,7 @@ class BlindPnP(CorrespondenceSet):
         rays, points_3d = rows[:, :2], rows[:, 2:]
         if "inlier_matches" not in self._data:
             return rays, points_3d
-        pairs = self._array("inlier_matches", position, shape=(None, 2)).astype(np.int64)
+        pairs = _rows(self._array("inlier_matches", position, shape=(None, 2)))
         bad = pairs[(pairs < 0) | (pairs >= len(rows))]
         if len(bad):
             raise InputError(
@@ -156,7 +157,7 @@ class BlindPnP(CorrespondenceSet):
                     fix="W_gt.pkl, which says which belong together, is missing",
                 )
             return rays, points_3d
-        partners = self._flat("W_gt", position).astype(np.int64)
+        partners = _rows(self._flat("W_gt", position))
         scene_rows, image_rows = _pairs(partners, len(points_3d), len(rays))
         usual = rays[image_rows], points_3d[scene_rows]
         image_rows, scene_rows = _pairs(partners, len(rays), len(points_3d))
@@ -164,7 +165,7 @@ class BlindPnP(CorrespondenceSet):
         return min(usual, inverted, key=lambda pair: _distance(pair[0], pair[1], pose))
 
     def _count(self, kind: str, position: int) -> int | None:
-        """How many points come before the padding; None where the files don't say."""
+        """Number of points before the padding; None where the files don't say."""
         name = f"num_points_{kind}"
         return int(self._flat(name, position)[0]) if name in self._data else None
 
@@ -248,6 +249,11 @@ def _load_samples(file: Path) -> Any:
     return value
 
 
+def _rows(numbers: FloatArray) -> IntArray:
+    """Row numbers as integers; -1 where one is beyond all rows."""
+    return np.where(np.abs(numbers) < 2**53, numbers, -1.0).astype(np.int64)
+
+
 def _pairs(partners: IntArray, from_count: int, to_count: int) -> tuple[IntArray, IntArray]:
     """The rows i with a partner, and their partners, where ``partners[i]`` is that of row i."""
     rows = np.arange(min(from_count, len(partners)))
@@ -269,6 +275,9 @@ def _distance(rays: FloatArray, points_3d: FloatArray, pose: Alignment) -> float
 def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
     """A camera that looks along its principal point and just has all rays in its image."""
     fx, fy = float(focal_lengths[0]), float(focal_lengths[-1])
-    reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))
+    with np.errstate(over="ignore"):
+        reach = np.ceil(np.abs(rays).max(axis=0) * (fx, fy))
+    if not (reach < _LARGEST_IMAGE).all():
+        raise InputError(f"image points reach {reach.max():g} px from the centre", where="points")
     width, height = (2 * int(length) + 1 for length in reach)
     return Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)

@@ -21,7 +21,7 @@ _CUT = "the file is cut short or damaged; get it again"
 
 @dataclass(frozen=True, eq=False)
 class BundlerModel:
-    """What the file holds.
+    """Content of the file.
 
     Parameters
     ----------
@@ -51,14 +51,7 @@ class BundlerModel:
 
 
 def read_bundler(path: Path) -> BundlerModel:
-    """Read the file.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is of another version, is cut short, holds something else than
-        numbers, or has an observation in a camera that doesn't exist.
-    """
+    """Read the file."""
     values = _read_values(path)
     if len(values) < 2:
         raise DataError("the numbers of cameras and points are missing", where=str(path), fix=_CUT)

@@ -17,7 +17,7 @@ from cadalign.datasets.sfm.colmap_binary import (
     read_images_binary,
     read_points_binary,
 )
-from cadalign.datasets.sfm.colmap_model import INVALID_POINT, ColmapPoints
+from cadalign.datasets.sfm.colmap_model import INVALID_POINT
 from cadalign.datasets.sfm.colmap_text import read_cameras_text, read_images_text, read_points_text
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
@@ -73,29 +73,33 @@ class Colmap(CorrespondenceSet):
             raise DataError(
                 f"cannot be read ({error.strerror or error})", where=str(error.filename or folder)
             ) from None
-        self._point_ids, self._points = _sorted_points(points, self._point_file)
-        self._images = sorted(images, key=lambda image: image.name)
-        super().__init__(files["images"], [image.name for image in self._images])
+        ids, xyz = points
+        order = np.argsort(ids, kind="stable")
+        self._point_ids, self._points = ids[order], xyz[order]
+        twice = self._point_ids[1:][self._point_ids[1:] == self._point_ids[:-1]]
+        if len(twice):
+            raise DataError(f"point {twice[0]} occurs twice", where=str(self._point_file))
+        self._images = sorted(images, key=lambda image: image[0])
+        super().__init__(files["images"], [name for name, _ in self._images])
 
     def _read(self, position: int) -> Correspondences:
-        image = self._images[position]
-        view = image.read()
+        name, read_view = self._images[position]
+        view = read_view()
         rows = view.point_ids != INVALID_POINT
         point_ids = view.point_ids[rows]
         return Correspondences(
-            id=image.name,
-            points_3d=self._points[self._point_rows(point_ids, image.name)],
+            id=name,
+            points_3d=self._points[self._point_rows(point_ids, name)],
             points_2d=view.points_2d[rows] - PIXEL_CENTRE,
-            camera=self._camera(view.camera_id, image.name),
+            camera=self._camera(view.camera_id, name),
             cam_from_world=rigid_pose(rotation_from_quat_wxyz(view.quat_wxyz), view.translation),
             point_ids=point_ids,
         )
 
     def _point_rows(self, point_ids: IntArray, name: str) -> IntArray:
         rows = np.searchsorted(self._point_ids, point_ids)
-        known = np.zeros(len(point_ids), dtype=bool)
-        within = rows < len(self._point_ids)
-        known[within] = self._point_ids[rows[within]] == point_ids[within]
+        known = rows < len(self._point_ids)
+        known[known] = self._point_ids[rows[known]] == point_ids[known]
         missing = np.unique(point_ids[~known])
         if len(missing):
             raise DataError(
@@ -122,16 +126,7 @@ class Colmap(CorrespondenceSet):
 
 
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
-    """The rotation matrix of a quaternion.
-
-    Parameters
-    ----------
-    quat_wxyz : (4,) float
-        Scalar first, of any length but 0.
-
-    Returns
-    -------
-    (3, 3) float
+    """Rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
 
     Raises
     ------
@@ -143,17 +138,12 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
+    from scipy.spatial.transform import Rotation
+
     length = np.linalg.norm(quat_wxyz)
-    if not (np.isfinite(length) and length > 0):
+    if not 0 < length < np.inf:
         raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
-    w, x, y, z = quat_wxyz / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat(quat_wxyz[[1, 2, 3, 0]] / length).as_matrix())
 
 
 def _find_model(root: Path) -> tuple[Path, str]:
@@ -173,13 +163,3 @@ def _find_model(root: Path) -> tuple[Path, str]:
         where=str(root),
         fix="cameras, images and points3D are needed, all three as .bin or as .txt",
     )
-
-
-def _sorted_points(points: ColmapPoints, file: Path) -> tuple[IntArray, FloatArray]:
-    """The points by increasing number."""
-    order = np.argsort(points.ids, kind="stable")
-    ids = points.ids[order]
-    twice = ids[1:][ids[1:] == ids[:-1]]
-    if len(twice):
-        raise DataError(f"point {twice[0]} occurs twice", where=str(file))
-    return ids, points.xyz[order]

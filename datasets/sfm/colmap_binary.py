@@ -1,4 +1,7 @@
-"""COLMAP's binary files, see https://colmap.github.io/format.html; little endian."""
+"""COLMAP's binary files, see https://colmap.github.io/format.html; little endian.
+
+Readers raise `DataError` with the file and the offset.
+"""
 
 from __future__ import annotations
 
@@ -40,13 +43,7 @@ _PARAMETER = np.dtype("<f8")
 
 
 def read_cameras_binary(path: Path) -> CameraTable:
-    """Read ``cameras.bin``.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short, too long, or a camera's model is unknown to COLMAP.
-    """
+    """Read ``cameras.bin``."""
     cursor = _Cursor(path)
     cameras: CameraTable = {}
     for _ in range(cursor.count("cameras")):
@@ -75,13 +72,7 @@ def read_cameras_binary(path: Path) -> CameraTable:
 
 
 def read_points_binary(path: Path) -> ColmapPoints:
-    """Read numbers and coordinates out of ``points3D.bin``.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or too long.
-    """
+    """Read numbers and coordinates out of ``points3D.bin``."""
     cursor = _Cursor(path)
     ids, xyz = [], []
     for _ in range(cursor.count("points")):
@@ -91,29 +82,20 @@ def read_points_binary(path: Path) -> ColmapPoints:
         xyz.append((x, y, z))
     cursor.finish()
     # Numbers are unsigned in the file, but those of observations use -1 for "none".
-    return ColmapPoints(
-        ids=np.array(ids, dtype=np.uint64).astype(np.int64),
-        xyz=np.array(xyz, dtype=float).reshape(-1, 3),
-    )
+    return np.array(ids, dtype=np.uint64).astype(np.int64), np.reshape(xyz, (-1, 3))
 
 
 def read_images_binary(path: Path) -> list[ColmapImage]:
-    """Read ``images.bin``.
-
-    Raises
-    ------
-    DataError
-        If the file is cut short or too long.
-    """
+    """Read ``images.bin``."""
     cursor = _Cursor(path)
-    images = []
+    images: list[ColmapImage] = []
     for _ in range(cursor.count("images")):
         fields = cursor.unpack(_IMAGE, "an image")
         name = cursor.name()
         observations = cursor.array(
             _OBSERVATION, cursor.count("observations"), f"the observations of image {name}"
         )
-        images.append(ColmapImage(name, partial(_read_view, fields, observations)))
+        images.append((name, partial(_read_view, fields, observations)))
     cursor.finish()
     return images
 

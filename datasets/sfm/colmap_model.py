@@ -1,4 +1,4 @@
-"""What COLMAP's text and binary files both hold."""
+"""Content of COLMAP's files, text or binary."""
 
 from __future__ import annotations
 
@@ -37,21 +37,11 @@ class ColmapView:
     point_ids: IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class ColmapImage:
-    """An image's name, and what reads the rest of its entry when it is asked for."""
+ColmapImage = tuple[str, Callable[[], ColmapView]]
+"""An image's name, and the function that reads the rest of its entry."""
 
-    name: str
-    read: Callable[[], ColmapView]
-
-
-@dataclass(frozen=True, eq=False)
-class ColmapPoints:
-    """The points of a model: numbers (m,) int and coordinates (m, 3) float, in file order."""
-
-    ids: IntArray
-    xyz: FloatArray
-
+ColmapPoints = tuple[IntArray, FloatArray]
+"""Numbers (m,) and coordinates (m, 3) of all points, in file order."""
 
 CameraTable = dict[int, dict[str, Any]]
 """Cameras in the form that `cadalign.Camera.from_dict` reads, by number."""

@@ -1,4 +1,7 @@
-"""COLMAP's text files, see https://colmap.github.io/format.html."""
+"""COLMAP's text files, see https://colmap.github.io/format.html.
+
+Readers raise `DataError` with the file and the line.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.datasets.sfm.colmap_model import CameraTable, ColmapImage, ColmapPoints, ColmapView
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 
 # Before an image's name: its number, wxyz, translation, and its camera's number.
 _POSE_FIELDS = 9
 
 
 def read_cameras_text(path: Path) -> CameraTable:
-    """Read ``cameras.txt``.
-
-    Raises
-    ------
-    DataError
-        If a line is malformed or a number occurs twice.
-    """
+    """Read ``cameras.txt``."""
     cameras: CameraTable = {}
     for number, line in _entries(path):
         words = line.split()
@@ -43,35 +40,21 @@ def read_cameras_text(path: Path) -> CameraTable:
 
 
 def read_points_text(path: Path) -> ColmapPoints:
-    """Read numbers and coordinates out of ``points3D.txt``.
-
-    Raises
-    ------
-    DataError
-        If a line is malformed.
-    """
+    """Read numbers and coordinates out of ``points3D.txt``."""
     ids, xyz = [], []
     for number, line in _entries(path):
         words = line.split(maxsplit=4)
         try:
-            ids.append(int(words[0]))
+            ids.append(np.int64(int(words[0])))
             xyz.append((float(words[1]), float(words[2]), float(words[3])))
-        except (IndexError, ValueError):
+        except (IndexError, ValueError, OverflowError):
             raise _malformed(path, number, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
-    return ColmapPoints(
-        ids=np.array(ids, dtype=np.int64), xyz=np.array(xyz, dtype=float).reshape(-1, 3)
-    )
+    return np.array(ids, dtype=np.int64), np.reshape(xyz, (-1, 3))
 
 
 def read_images_text(path: Path) -> list[ColmapImage]:
-    """Read ``images.txt``; poses and observations are read when they are asked for.
-
-    Raises
-    ------
-    DataError
-        If a line has no place for an image's name.
-    """
-    images = []
+    """Read ``images.txt``; poses and observations are read when they are asked for."""
+    images: list[ColmapImage] = []
     lines = enumerate(_lines(path), start=1)
     for number, line in lines:
         words = line.split(maxsplit=_POSE_FIELDS)
@@ -88,7 +71,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
         _, observations = next(lines, (0, None))
         name = words[-1].strip()
         where = f"{path}, image {name}"
-        images.append(ColmapImage(name, partial(_read_view, words[1:-1], observations, where)))
+        images.append((name, partial(_read_view, words[1:-1], observations, where)))
     return images
 
 
@@ -133,7 +116,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _malformed(path: Path, number: int, line: str, wanted: str) -> DataError:
-    shown = line if len(line) <= 60 else f"{line[:57]}..."
-    return DataError(
-        f"{shown!r} is malformed", where=f"{path}, line {number}", fix=f"expected {wanted}"
-    )
+    what = f"{quote(line)} is malformed"
+    return DataError(what, where=f"{path}, line {number}", fix=f"expected {wanted}")

@@ -165,7 +165,7 @@ class CorrespondenceSet(ABC):
 
     @property
     def problems(self) -> dict[str, DataError]:
-        """Why images could not be read, by id; reads them all."""
+        """Errors of the images that could not be read, by id; reads them all."""
         self._prepare()
         problems = {}
         for position, name in enumerate(self.ids):
@@ -231,7 +231,9 @@ class CorrespondenceSet(ABC):
 
     def _read_checked(self, position: int) -> Correspondences:
         try:
-            return self._read(position)
+            # Numbers that overflow are refused by what they are given to.
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self._read(position)
         except InputError as error:
             where = f"{self.source}, image {self.ids[position]}"
             if error.where is not None:
@@ -257,7 +259,7 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
     matrix = as_floats(rotation, name="rotation", shape=(3, 3))
     shift = as_floats(np.reshape(translation, -1), name="translation", shape=(3,))
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE:
+    if not error <= _ROTATION_TOLERANCE:
         raise InputError(
             f"not a rotation matrix: {np.array2string(matrix, precision=4)}", where="rotation"
         )

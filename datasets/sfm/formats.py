@@ -20,39 +20,23 @@ _BUNDLER_HEADER = b"# Bundle file"
 
 @dataclass(frozen=True)
 class _Format:
-    """A format, and the files that it is recognised by.
-
-    Parameters
-    ----------
-    name : str
-    load : callable
-    sought : str
-        What a folder of this format holds, in words.
-    layouts : tuple of tuple of str
-        Patterns of files below the folder; it is of this format if all of one layout are there.
-    header : bytes
-        What its files begin with.
-    """
+    """A format, and the files that it is recognised by."""
 
     name: str
     load: Callable[[Path], CorrespondenceSet]
-    sought: str
-    layouts: tuple[tuple[str, ...], ...]
-    header: bytes = b""
+    sought: str  # the files of this format, for messages
+    layouts: tuple[tuple[str, ...], ...]  # patterns of files below the folder
+    header: bytes = b""  # the first bytes of each file
 
-    def fits(self, folder: Path) -> bool:
-        """Whether a folder holds all files of one layout."""
-        return any(
-            all(
-                any(_begins_with(file, self.header) for file in _files(folder, name))
-                for name in layout
-            )
-            for layout in self.layouts
-        )
-
-    def fits_in_part(self, folder: Path) -> bool:
-        """Whether a folder holds files with such names, any of them."""
-        return any(_files(folder, name) for layout in self.layouts for name in layout)
+    def fit(self, folder: Path) -> int:
+        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
+        best = 0
+        for layout in self.layouts:
+            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
+            if all(any(_begins_with(file, self.header) for file in found) for found in files):
+                return 2
+            best = max(best, int(any(files)))
+        return best
 
 
 _FORMATS = (
@@ -130,15 +114,20 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
 
 def _recognize(root: Path) -> _Format:
     if root.is_file():
-        return _recognize_file(root)
+        if _begins_with(root, _BUNDLER_HEADER):
+            return next(known for known in _FORMATS if known.load is Bundler)
+        raise DataError(
+            f"not a Bundler file: it does not begin with {_BUNDLER_HEADER.decode()!r}",
+            where=str(root),
+            fix="for other formats, give the folder",
+        )
     if not root.is_dir():
         raise DataError(
             "no such folder", where=str(root), fix="give the folder of the correspondences"
         )
     # A layout with files missing is better named by its loader, which says which ones.
-    found = [known for known in _FORMATS if known.fits(root)] or [
-        known for known in _FORMATS if known.fits_in_part(root)
-    ]
+    fits = [known.fit(root) for known in _FORMATS]
+    found = [known for known, fit in zip(_FORMATS, fits, strict=True) if fit and fit == max(fits)]
     if not found:
         sought = "; ".join(f"{known.name}: {known.sought}" for known in _FORMATS)
         raise DataError(
@@ -152,21 +141,6 @@ def _recognize(root: Path) -> _Format:
             f"the folder holds files of {names}", where=str(root), fix="say which format to read"
         )
     return found[0]
-
-
-def _recognize_file(file: Path) -> _Format:
-    """The format that is one file: Bundler's."""
-    if not _begins_with(file, _BUNDLER_HEADER):
-        raise DataError(
-            f"not a Bundler file: it does not begin with {_BUNDLER_HEADER.decode()!r}",
-            where=str(file),
-            fix="for other formats, give the folder",
-        )
-    return next(known for known in _FORMATS if known.name == "bundler")
-
-
-def _files(folder: Path, pattern: str) -> list[Path]:
-    return [file for file in folder.glob(pattern) if file.is_file()]
 
 
 def _begins_with(file: Path, header: bytes) -> bool:

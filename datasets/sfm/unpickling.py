@@ -4,24 +4,33 @@ A pickle is a program: it may import and call anything. Here it gets nothing but
 arrays, NumPy scalars, sets and ordered dictionaries; asking for anything else is refused before it
 is imported. NumPy's own ``dtype`` and ``ndarray`` are not handed out either: their ``__setstate__``
 trusts flags and lengths in the pickle, and can be made to read bytes as addresses of objects.
+
+Memory and time are bounded by the file's size: the program is read once without being run, which
+finds places in its memory beyond its length and nesting deep enough to exhaust the stack, and
+what it built must not hold more values than the file has bytes.
 """
 
 from __future__ import annotations
 
 import collections
+import io
 import math
 import os
 import pickle
+import pickletools
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 
 # Numbers, text and objects; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
+_MAX_DEPTH = 100
+_FILLING = frozenset(("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"))
 _FIX = (
     "only NumPy arrays and plain containers are loaded, a pickle can run code; get a trusted file"
 )
@@ -49,19 +58,100 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
         If the file cannot be read, is no whole pickle, or asks for anything else; names what it
         asked for.
     """
+    where = str(path)
     try:
-        with Path(path).open("rb") as file:
-            return _PlainUnpickler(file, str(path)).load()
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror or error})", where=where) from None
+    try:
+        _check_program(data)
+        value = _PlainUnpickler(io.BytesIO(data), where).load()
+        _check_size(value, limit=10 * len(data))
+        return value
     except DataError:
         raise
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=str(path)) from None
     except Exception as error:  # damaged pickles make the unpickler raise what it likes
         raise DataError(
-            f"not a whole pickle of arrays ({type(error).__name__}: {error})",
-            where=str(path),
+            f"not a whole pickle of arrays ({type(error).__name__}: {str(error)[:200]})",
+            where=where,
             fix="the file is cut short or damaged; get it again",
         ) from None
+
+
+def _check_program(data: bytes) -> None:
+    """Follow the pickle's stack with the nesting depths of its values in the place of values.
+
+    Raises
+    ------
+    pickle.UnpicklingError
+        If values are nested too deeply (hashing them would exhaust the stack), or a place in the
+        pickle's memory is numbered beyond its length (the unpickler would allocate them all).
+    """
+    stack: list[int] = []
+    marks: list[int] = []
+    memory: dict[int, int] = {}
+    argument: Any
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+        name = opcode.name
+        if name == "MARK":
+            marks.append(len(stack))
+        elif name == "MEMOIZE":
+            memory[len(memory)] = stack[-1]
+        elif name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            if int(argument) > count:
+                raise pickle.UnpicklingError("a place in memory beyond the pickle's length")
+            memory[int(argument)] = stack[-1]
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(memory[int(argument)])
+        else:
+            after = len(opcode.stack_after)
+            if pickletools.markobject in opcode.stack_before:
+                start = marks.pop()
+                # What stands before the mark: the container that is filled.
+                start -= opcode.stack_before.index(pickletools.markobject)
+            else:
+                start = len(stack) - len(opcode.stack_before)
+            used = stack[start:]
+            del stack[start:]
+            if name in _FILLING and used:
+                depth = max(used[0], 1 + max(used[1:], default=0))
+            else:
+                depth = 1 + max(used, default=0)
+            if depth > _MAX_DEPTH:
+                raise pickle.UnpicklingError(f"values are nested more than {_MAX_DEPTH} deep")
+            stack.extend([depth] * after)
+
+
+def _check_size(value: Any, *, limit: int) -> None:
+    """Refuse a container in itself, and shared ones that written out exceed the limit."""
+    sizes: dict[int, int] = {}
+    unfinished: set[int] = set()
+    waiting: list[tuple[Any, bool]] = [(value, False)]
+    while waiting:
+        item, is_done = waiting.pop()
+        items = _items(item)
+        if is_done:
+            unfinished.remove(id(item))
+            sizes[id(item)] = 1 + sum(sizes.get(id(each), 1) for each in items)
+            if sizes[id(item)] > limit:
+                raise pickle.UnpicklingError("it holds more values than the file has bytes")
+        elif id(item) in unfinished:
+            raise pickle.UnpicklingError("a container holds itself")
+        elif id(item) not in sizes and items:
+            unfinished.add(id(item))
+            waiting.append((item, True))
+            waiting.extend((each, False) for each in items)
+
+
+def _items(value: Any) -> Collection[Any]:
+    """The values in a container, none for anything else."""
+    if isinstance(value, dict):
+        return value.values()
+    if isinstance(value, list | tuple | set | frozenset):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        return list(value.flat)
+    return ()
 
 
 class _PlainUnpickler(pickle.Unpickler):
@@ -75,7 +165,7 @@ class _PlainUnpickler(pickle.Unpickler):
         current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
         if (current, name) not in self._allowed:
             raise DataError(
-                f"the pickle asks for {module}.{name}, which is refused",
+                f"the pickle asks for {quote(f'{module}.{name}')[1:-1]}, which is refused",
                 where=self._where,
                 fix=_FIX,
             )
@@ -93,7 +183,7 @@ class _Dtype:
 
     def __init__(self, code: str, align: Any = False, copy: Any = False) -> None:
         if not isinstance(code, str) or not _PLAIN_DTYPE.fullmatch(code):
-            raise pickle.UnpicklingError(f"the dtype {code!r} is not one of plain values")
+            raise pickle.UnpicklingError(f"the dtype {quote(code)} is not one of plain values")
         self._dtype = np.dtype(code)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -118,7 +208,9 @@ class _Array(np.ndarray[Any, Any]):
             fits = isinstance(data, bytes | str) and len(data) == count * values.itemsize
         # Refilling an array would pull its memory away from whatever looks at it already.
         if not fits or self.size:
-            raise pickle.UnpicklingError(f"an array of shape {shape} has other data than that")
+            raise pickle.UnpicklingError(
+                f"an array of shape {quote(shape)} has other data than that"
+            )
         # NumPy's stubs ask for a numpy.bool, which it doesn't take.
         rebuilt: Any = (1, shape, values, bool(fortran_order), data)
         super().__setstate__(rebuilt)
@@ -154,7 +246,7 @@ def _make_allowed() -> dict[tuple[str, str], Any]:
     def encode(text: str, encoding: str) -> bytes:
         # How Python 3 writes bytes so that Python 2 can read them.
         if encoding != "latin1":
-            raise pickle.UnpicklingError(f"the encoding {encoding!r} is not expected")
+            raise pickle.UnpicklingError(f"the encoding {quote(encoding)} is not expected")
         return text.encode("latin1")
 
     def no_bytes() -> bytes:
@@ -180,5 +272,5 @@ def _as_bytes(data: bytes | str) -> bytes:
 
 def _as_shape(shape: Any) -> tuple[int, ...]:
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise pickle.UnpicklingError(f"{shape!r} is not a shape")
+        raise pickle.UnpicklingError(f"{quote(shape)} is not a shape")
     return shape

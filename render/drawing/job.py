@@ -11,10 +11,12 @@ from PIL import Image
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.meshes.load import load_mesh
-from cadalign.datasets.models.annotations import parse_entry, read_entries
+from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.documents import read_json
 from cadalign.io.files import write_whole
 from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.drawing.movie import contact_sheet, write_movie
@@ -90,8 +92,9 @@ class RenderJob:
             raise InputError(
                 "only a still without keypoints can be transparent", where="--background"
             )
+        mesh = load_mesh(model)
         return cls(
-            scene=Scene(load_mesh(model)),
+            scene=Scene(mesh),
             # Depth, normals, triangles and lines are cast in any case.
             renderer=make_renderer(renderer if style == "color" else "raycast"),
             views=chosen,
@@ -99,7 +102,7 @@ class RenderJob:
             out=out,
             style=style,
             background=color,
-            keypoints=None if keypoints is None else read_keypoints(keypoints, model),
+            keypoints=None if keypoints is None else read_keypoints(keypoints, model, mesh),
             scale=factors,
             samples=samples,
         )
@@ -204,30 +207,19 @@ def parse_background(text: str) -> tuple[int, int, int] | None:
     )
 
 
-def read_keypoints(path: Path, model: Path) -> FloatArray:
-    """Read keypoints (k, 3) from a list of [x, y, z] or from KeypointNet's annotations.
-
-    Of the latter those of the model are taken whose id occurs in its file's path.
+def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
+    """Read keypoints (k, 3) from a list of [x, y, z] or as `ModelKeypoints.load` does.
 
     Raises
     ------
     DataError
         If the file is neither, or has no keypoints of this model.
     """
-    entries = read_entries(path)
-    if entries and isinstance(entries[0], dict):
-        places = set(model.absolute().with_suffix("").parts)
-        for entry in entries:
-            if isinstance(entry, dict) and entry.get("model_id") in places:
-                where = f"{path}, {entry['model_id']}"
-                return parse_entry(entry, where=where).keypoints.xyz
-        raise DataError(
-            "has no annotations of a model whose id occurs in the model's path",
-            where=str(path),
-            fix=f"is {model} of this category?",
-        )
+    data = read_json(path)
+    if isinstance(data, dict) or (isinstance(data, list) and data and isinstance(data[0], dict)):
+        return ModelKeypoints.load(path, mesh=mesh, model=model).xyz
     try:
-        return as_points(entries, name="keypoints", dimension=3)
+        return as_points(data, name="keypoints", dimension=3)
     except InputError as error:
         raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None
 

@@ -13,26 +13,70 @@ module.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
+from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
+from cadalign.io.files import write_json, write_text, writing
 
 _OPEN3D_VIEW = "PinholeCameraParameters"
 _OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
 _VERSION = {"version_major": 1, "version_minor": 0}
 _NERF_DISTORTION = ("k1", "k2", "p1", "p2")
-_NERF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+_Angle = Annotated[float, Meta(gt=0, lt=np.pi)]
+
+
+class _Open3dIntrinsic(ForeignDocument):
+    intrinsic_matrix: list[Any]  # column by column
+    width: int = 0
+    height: int = 0
+
+
+class _Open3dView(ForeignDocument):
+    """Open3D's ``PinholeCameraParameters``."""
+
+    intrinsic: _Open3dIntrinsic
+    extrinsic: list[Any]  # column by column
+
+
+class _Open3dTrajectory(ForeignDocument):
+    parameters: Annotated[list[_Open3dView], Meta(min_length=1)]
+
+
+class _NerfFrame(ForeignDocument):
+    """A frame of ``transforms.json``, together with what the file's top says for all frames."""
+
+    transform_matrix: list[Any]
+    w: Finite | None = None
+    h: Finite | None = None
+    fl_x: Finite | None = None
+    fl_y: Finite | None = None
+    cx: Finite | None = None
+    cy: Finite | None = None
+    camera_angle_x: _Angle | None = None
+    camera_angle_y: _Angle | None = None
+    k1: Finite | None = None
+    k2: Finite | None = None
+    k3: Finite | None = None
+    k4: Finite | None = None
+    p1: Finite | None = None
+    p2: Finite | None = None
+    file_path: Any = ""
+
+
+class _NerfFile(ForeignDocument):
+    frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +117,9 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     path = Path(path)
     if path.is_dir():
         return _read_colmap(path)
-    data = _read_json(path)
-    if not isinstance(data, dict):
-        raise _unknown(path)
-    if "frames" in data:
-        return _read_nerf(data, path)
-    if data.get("class_name") == _OPEN3D_TRAJECTORY:
-        entries = _list(data, "parameters", path)
-        return [_open3d_view(entry, f"{path}, parameters[{n}]") for n, entry in enumerate(entries)]
-    if data.get("class_name") == _OPEN3D_VIEW or {"extrinsic", "intrinsic"} <= data.keys():
-        return [_open3d_view(data, str(path))]
-    raise _unknown(path)
+    data = read_json(path)
+    with in_file(path):
+        return _views_of(data)
 
 
 def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -102,7 +138,7 @@ def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> N
     data: dict[str, Any] = entries[0]
     if len(entries) > 1:
         data = {"class_name": _OPEN3D_TRAJECTORY, "parameters": entries, **_VERSION}
-    _write_text(Path(path), json.dumps(data, indent=1) + "\n")
+    write_json(Path(path), data)
 
 
 def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -125,7 +161,7 @@ def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> Non
         | {"transform_matrix": _world_from_opengl(view, number).tolist()}
         for number, (view, camera) in enumerate(zip(views, cameras, strict=True))
     ]
-    _write_text(Path(path), json.dumps({**shared, "frames": frames}, indent=1) + "\n")
+    write_json(Path(path), {**shared, "frames": frames})
 
 
 def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -159,37 +195,46 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
         params = " ".join(f"{value:.17g}" for value in entry["params"])
         cameras.append(f"{camera_id} {entry['model']} {camera.width} {camera.height} {params}\n")
     folder = Path(folder)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"cannot be made ({error.strerror})", where=str(folder)) from None
-    _write_text(folder / "cameras.txt", "".join(cameras))
-    _write_text(folder / "images.txt", "".join(images))
-    _write_text(folder / "points3D.txt", "")
+    write_text(folder / "cameras.txt", "".join(cameras))
+    write_text(folder / "images.txt", "".join(images))
+    write_text(folder / "points3D.txt", "")
+
+
+def _views_of(data: Any) -> list[CameraView]:
+    """The cameras of a parsed Open3D or NeRF file."""
+    fields = data if isinstance(data, dict) else {}
+    if "frames" in fields:
+        return _nerf_views(fields)
+    if fields.get("class_name") == _OPEN3D_TRAJECTORY:
+        views = convert(fields, _Open3dTrajectory).parameters
+        return [_open3d_view(view, f"parameters[{n}]") for n, view in enumerate(views)]
+    if fields.get("class_name") == _OPEN3D_VIEW or {"extrinsic", "intrinsic"} <= fields.keys():
+        return [_open3d_view(convert(fields, _Open3dView), "")]
+    raise DataError(
+        "not a camera file that is known",
+        fix="give an Open3D PinholeCameraParameters or a NeRF transforms.json file, or the folder "
+        "of a COLMAP model",
+    )
 
 
 # Open3D
 
 
-def _open3d_view(data: Any, where: str) -> CameraView:
-    intrinsic = data.get("intrinsic") if isinstance(data, dict) else None
-    if not isinstance(intrinsic, dict):
-        raise DataError("the field 'intrinsic' is missing", where=where)
-    matrix = _matrix(intrinsic.get("intrinsic_matrix"), 3, f"{where}, intrinsic_matrix").T
-    extrinsic = _matrix(data.get("extrinsic"), 4, f"{where}, extrinsic").T
-    try:
+def _open3d_view(view: _Open3dView, where: str) -> CameraView:
+    with within(where):
+        matrix = _matrix(view.intrinsic.intrinsic_matrix, 3, "intrinsic_matrix").T
+        extrinsic = _matrix(view.extrinsic, 4, "extrinsic").T
         camera = Camera(
-            width=intrinsic.get("width", 0),
-            height=intrinsic.get("height", 0),
+            width=view.intrinsic.width,
+            height=view.intrinsic.height,
             fx=matrix[0, 0],
             fy=matrix[1, 1],
             cx=matrix[0, 2],
             cy=matrix[1, 2],
         )
-        pose = Alignment(extrinsic[:3, :3], extrinsic[:3, 3], np.ones(3))
-    except InputError as error:
-        raise _in_file(error, where) from None
-    return CameraView(camera, pose)
+        return CameraView(camera, Alignment(extrinsic[:3, :3], extrinsic[:3, 3], np.ones(3)))
 
 
 def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
@@ -215,49 +260,46 @@ def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
 # NeRF
 
 
-def _read_nerf(data: dict[str, Any], path: Path) -> list[CameraView]:
+def _nerf_views(data: dict[str, Any]) -> list[CameraView]:
+    shared = {key: data[key] for key in _NerfFrame.__struct_fields__ if key in data}
     views = []
-    for number, frame in enumerate(_list(data, "frames", path)):
-        where = f"{path}, frames[{number}]"
-        if not isinstance(frame, dict):
-            raise DataError("is not an object", where=where)
-        matrix = _matrix(frame.get("transform_matrix"), 4, f"{where}, transform_matrix")
-        try:
-            if abs(np.linalg.det(matrix)) < 1e-12:
+    for number, entry in enumerate(convert(data, _NerfFile).frames):
+        with within(f"frames[{number}]"):
+            frame: _NerfFrame = convert({**shared, **entry}, _NerfFrame)
+            matrix = _matrix(frame.transform_matrix, 4, "transform_matrix")
+            with np.errstate(all="ignore"):
+                determinant = abs(np.linalg.det(matrix))
+            if not 1e-12 <= determinant < np.inf:
                 raise InputError("the matrix has no inverse", where="transform_matrix")
             pose = alignment_from_opengl(np.asarray(np.linalg.inv(matrix), dtype=float))
-            camera = _camera_from_nerf({**data, **frame})
-        except CadalignError as error:
-            raise _in_file(error, where) from None
-        views.append(CameraView(camera, pose, str(frame.get("file_path", ""))))
+            views.append(CameraView(_camera_from_nerf(frame), pose, str(frame.file_path)))
     return views
 
 
-def _camera_from_nerf(entry: dict[str, Any]) -> Camera:
-    values = {key: _number(entry, key) for key in (*_NERF_CAMERA, *_NERF_DISTORTION)}
-    for key in ("k3", "k4"):
-        if _number(entry, key):
-            raise InputError(f"{key} is a fisheye's coefficient", where=key, fix="undistort first")
-    width, height = values["w"], values["h"]
+def _camera_from_nerf(frame: _NerfFrame) -> Camera:
+    for name, value in (("k3", frame.k3), ("k4", frame.k4)):
+        if value:
+            raise InputError(
+                f"{name} is a fisheye's coefficient", where=name, fix="undistort first"
+            )
+    width, height = frame.w, frame.h
     if width is None or height is None:
-        raise InputError("w and h, the image's size, are missing", where="transforms")
-    fx, fy = values["fl_x"], values["fl_y"]
-    if fx is None and values["camera_angle_x"] is not None:
-        fx = width / 2 / np.tan(values["camera_angle_x"] / 2)
-    if fy is None and values["camera_angle_y"] is not None:
-        fy = height / 2 / np.tan(values["camera_angle_y"] / 2)
+        raise InputError("w and h, the image's size, are missing")
+    fx, fy = frame.fl_x, frame.fl_y
+    if fx is None and frame.camera_angle_x is not None:
+        fx = width / 2 / float(np.tan(frame.camera_angle_x / 2))
+    if fy is None and frame.camera_angle_y is not None:
+        fy = height / 2 / float(np.tan(frame.camera_angle_y / 2))
     if fx is None:
-        raise InputError("neither fl_x nor camera_angle_x is there", where="transforms")
-    cx = width / 2 if values["cx"] is None else values["cx"]
-    cy = height / 2 if values["cy"] is None else values["cy"]
+        raise InputError("neither fl_x nor camera_angle_x is there")
     return Camera(
         width=int(width),
         height=int(height),
         fx=fx,
         fy=fx if fy is None else fy,
-        cx=cx - PIXEL_CENTRE,
-        cy=cy - PIXEL_CENTRE,
-        distortion=tuple(values[key] or 0.0 for key in _NERF_DISTORTION),
+        cx=(width / 2 if frame.cx is None else frame.cx) - PIXEL_CENTRE,
+        cy=(height / 2 if frame.cy is None else frame.cy) - PIXEL_CENTRE,
+        distortion=(frame.k1 or 0.0, frame.k2 or 0.0, frame.p1 or 0.0, frame.p2 or 0.0),
     )
 
 
@@ -311,7 +353,7 @@ def _quat_wxyz(rotation: FloatArray) -> FloatArray:
 
 def _require_views(views: Sequence[CameraView]) -> None:
     if not views:
-        raise InputError("there are none", where="views")
+        raise InputError("give at least one view", where="views")
 
 
 def _rigid(view: CameraView, number: int) -> Alignment:
@@ -324,60 +366,11 @@ def _rigid(view: CameraView, number: int) -> Alignment:
     return view.cam_from_world
 
 
-def _matrix(value: Any, size: int, where: str) -> FloatArray:
+def _matrix(value: list[Any], size: int, where: str) -> FloatArray:
     """A flat or nested list of numbers as (size, size) float, row by row."""
-    try:
-        matrix = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape not in ((size * size,), (size, size)) or not np.isfinite(matrix).all():
+    nested = bool(value) and isinstance(value[0], list)
+    rows = convert(value, list[list[Finite]] if nested else list[Finite], where=where)
+    flat = [number for row in rows for number in row] if nested else rows
+    if len(flat) != size * size or (nested and any(len(row) != size for row in rows)):
         raise DataError(f"is not {size} x {size} finite numbers", where=where)
-    return matrix.reshape(size, size)
-
-
-def _number(entry: dict[str, Any], key: str) -> float | None:
-    value = entry.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{value!r} is not a number", where=key)
-    return float(value)
-
-
-def _list(data: dict[str, Any], key: str, path: Path) -> list[Any]:
-    value = data.get(key)
-    if not isinstance(value, list) or not value:
-        raise DataError("is not a list with anything in it", where=f"{path}, {key}")
-    return value
-
-
-def _in_file(error: CadalignError, where: str) -> DataError:
-    place = where if error.where is None else f"{where}, {error.where}"
-    return DataError(error.what, where=place, fix=error.fix)
-
-
-def _unknown(path: Path) -> DataError:
-    return DataError(
-        "not a camera file that is known",
-        where=str(path),
-        fix="give an Open3D PinholeCameraParameters or a NeRF transforms.json file, or the folder "
-        "of a COLMAP model",
-    )
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror})", where=str(path)) from None
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not JSON: {error}", where=str(path)) from None
-
-
-def _write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"cannot be written ({error.strerror})", where=str(path)) from None
+    return np.array(flat).reshape(size, size)

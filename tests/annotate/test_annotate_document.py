@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from cadalign.annotate.document import Document, FocalChoice, Pair
 from cadalign.annotate.history import History
-from cadalign.annotate.keypoint_book import KeypointBook
+from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 
@@ -58,8 +58,8 @@ def test_a_keypoint_has_one_place() -> None:
     with pytest.raises(InputError) as error:
         document.place_keypoint(5)
     assert str(error.value) == (
-        "keypoint: this keypoint is pair 1 already; "
-        "a keypoint has one place in a photo: move or delete that pair"
+        "keypoint: this keypoint is already used by pair 1; "
+        "move or delete that pair: a keypoint occurs once in a photo"
     )
 
 
@@ -144,42 +144,48 @@ def test_moves_of_one_gesture_are_undone_together() -> None:
 
 
 def test_points_without_id_or_name_get_free_ones() -> None:
-    book = KeypointBook(
+    registry = KeypointRegistry(
         [ModelKeypoint("seat", (0, 0, 0)), ModelKeypoint("seat", (1, 0, 0), semantic_id=4)]
     )
-    added = book.add(ModelKeypoint("", (2, 0, 0)))
-    assert {number: point.name for number, point in book} == {
+    added = registry.add(ModelKeypoint("", (2, 0, 0)))
+    assert {number: point.name for number, point in registry} == {
         4: "seat",
         5: "seat (2)",
         added: f"point {added}",
     }
-    assert book.given == {4, 5}
+    assert registry.given == {4, 5}
     assert added == 6
 
 
 def test_points_are_found_by_their_place() -> None:
-    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
-    assert book.find((0.999, 0, 0), tolerance=0.01) == 1
-    assert book.find((0.9, 0, 0), tolerance=0.01) is None
-    assert KeypointBook().find((0, 0, 0), tolerance=1) is None
+    registry = KeypointRegistry(
+        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
+    )
+    assert registry.find((0.999, 0, 0), tolerance=0.01) == 1
+    assert registry.find((0.9, 0, 0), tolerance=0.01) is None
+    assert KeypointRegistry().find((0, 0, 0), tolerance=1) is None
 
 
 def test_names_are_checked() -> None:
-    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
-    book.rename(0, "  front   left ")
-    assert book[0].name == "front left"
-    with pytest.raises(InputError, match=r"^name: another keypoint is called 'b'$"):
-        book.rename(0, "b")
+    registry = KeypointRegistry(
+        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
+    )
+    registry.rename(0, "  front   left ")
+    assert registry[0].name == "front left"
+    with pytest.raises(InputError, match=r"^name: another keypoint is called 'b'; choose"):
+        registry.rename(0, "b")
     for bad in ("", " \n ", 81 * "x"):
-        with pytest.raises(InputError, match=r"is not a name; give 1 to 80 characters$"):
-            book.rename(0, bad)
+        with pytest.raises(InputError, match=r"is empty or too long; give 1 to 80 characters$"):
+            registry.rename(0, bad)
     with pytest.raises(InputError, match=r"^keypoint: there is no keypoint 9; reload the page$"):
-        book.rename(9, "c")
+        registry.rename(9, "c")
 
 
 def test_points_of_an_earlier_session_are_taken_in() -> None:
-    book = KeypointBook([ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)])
-    book.take_in(
+    registry = KeypointRegistry(
+        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
+    )
+    registry.merge(
         [
             ModelKeypoint("renamed", (1e-9, 0, 0), 0),
             ModelKeypoint("placed", (2, 0, 0), 7),
@@ -187,6 +193,6 @@ def test_points_of_an_earlier_session_are_taken_in() -> None:
         ],
         tolerance=1e-6,
     )
-    names = {number: point.name for number, point in book}
+    names = {number: point.name for number, point in registry}
     assert names == {0: "renamed", 1: "b", 7: "placed", 8: "elsewhere"}
-    assert book.given == {0, 1, 7, 8}
+    assert registry.given == {0, 1, 7, 8}

@@ -1,4 +1,4 @@
-"""The live alignment: what it says of the pairs, which contradict it, and what to mark next."""
+"""The live alignment: its values, outliers among the pairs, and the next-best keypoint."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
-from cadalign.annotate.advice import Advice, best_next, unknown_name, updated_variances
-from cadalign.annotate.alignment import Lens, LiveAlignment, align
+from cadalign.annotate.alignment import Intrinsics, LiveAlignment, align
 from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.next_best import NextBest, find_next_best, unknown_name, updated_variances
 from cadalign.annotate.prediction import projection_jacobian
-from cadalign.annotate.words import advice_text, facts_of, notes_of
+from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation.problems import Problem
 
@@ -31,7 +31,7 @@ def live_of(
         problem.points_3d,
         problem.points_2d if points_2d is None else points_2d,
         None,
-        Lens(problem.camera, calibrated=True),
+        Intrinsics(problem.camera, calibrated=True),
         choice,
     )
 
@@ -66,7 +66,7 @@ def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
     assert live.message == message
 
 
-def test_deviations_go_by_the_residuals() -> None:
+def test_standard_deviations_scale_with_the_residuals() -> None:
     problem = problem_of(3, points=12, noise_px=8.0)
     live = live_of(problem)
     assert live.result is not None
@@ -82,12 +82,10 @@ def test_pairs_in_one_plane_give_a_provisional_alignment_that_says_so() -> None:
     problem = problem_of(1, points=6, noise_px=1.0)
     flat = problem.points_3d * [1, 1, 0]
     points_2d = problem.camera.project(problem.alignment.apply(flat))
-    live = align(flat, points_2d, None, Lens(problem.camera, calibrated=True), KNOWN)
+    live = align(flat, points_2d, None, Intrinsics(problem.camera, calibrated=True), KNOWN)
     assert live.provisional
     assert live.result is not None
-    assert live.message.startswith(
-        "Only a likely stretch is shown: the scale s_z is not determined"
-    )
+    assert live.message.startswith("The stretch shown is assumed: the scale s_z is not determined")
     assert live.message.endswith("Add a pair elsewhere.")
 
 
@@ -96,7 +94,7 @@ def test_coinciding_pairs_give_no_alignment() -> None:
         np.zeros((5, 3)),
         np.full((5, 2), 100.0),
         None,
-        Lens(problem_of(0, points=4, noise_px=1.0).camera, calibrated=True),
+        Intrinsics(problem_of(0, points=4, noise_px=1.0).camera, calibrated=True),
         KNOWN,
     )
     assert live.result is None
@@ -105,36 +103,36 @@ def test_coinciding_pairs_give_no_alignment() -> None:
 
 def test_unknown_focal_length_is_estimated_from_the_fifth_pair_on() -> None:
     problem = problem_of(5, points=12, noise_px=0.3)
-    lens = Lens(problem.camera.with_focal(500.0), calibrated=False)
-    live = align(problem.points_3d, problem.points_2d, None, lens, UNKNOWN)
-    assert live.camera is not None
+    intrinsics = Intrinsics(problem.camera.with_focal(500.0), calibrated=False)
+    live = align(problem.points_3d, problem.points_2d, None, intrinsics, UNKNOWN)
+    assert live.result is not None
     assert live.result is not None
     expected = fit(
         problem.points_3d, problem.points_2d, Camera.without_focal(640, 480), focal="estimate"
     )
     assert live.result.alignment == expected.alignment
-    assert live.camera == expected.camera
-    assert live.camera.fx == pytest.approx(150, rel=5 * expected.std.focal)
+    assert live.result.camera == expected.camera
+    assert live.result.camera.fx == pytest.approx(150, rel=5 * expected.std.focal)
     assert not live.provisional
-    four = align(problem.points_3d[:4], problem.points_2d[:4], None, lens, UNKNOWN)
+    four = align(problem.points_3d[:4], problem.points_2d[:4], None, intrinsics, UNKNOWN)
     assert four.provisional
-    assert four.camera == lens.camera
+    assert four.result.camera == intrinsics.camera
     assert four.message == (
-        "With 4 pairs the focal length is assumed; the fifth pair begins to tell it."
+        "With 4 pairs the focal length is assumed; it is estimated from 5 pairs on."
     )
 
 
 def test_typed_focal_length_is_used() -> None:
-    lens = Lens(LENS_CAMERA, calibrated=True)
-    assert lens.with_focal(FocalChoice(known=True, pixels=600.0)).fy == pytest.approx(620.0)
-    assert lens.with_focal(KNOWN) is LENS_CAMERA
-    written = lens.to_write(UNKNOWN)
+    intrinsics = Intrinsics(LENS_CAMERA, calibrated=True)
+    assert intrinsics.with_focal(FocalChoice(known=True, pixels=600.0)).fy == pytest.approx(620.0)
+    assert intrinsics.with_focal(KNOWN) is LENS_CAMERA
+    written = intrinsics.to_write(UNKNOWN)
     assert not written.focal_known
     assert (written.cx, written.cy, written.distortion) == (310.0, 250.0, LENS_CAMERA.distortion)
-    assert lens.to_write(KNOWN) is LENS_CAMERA
+    assert intrinsics.to_write(KNOWN) is LENS_CAMERA
 
 
-# --- contradictions --------------------------------------------------------------------------
+# --- outliers ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wrong", [(4,), (0, 7), (1, 5, 9)])
@@ -144,10 +142,10 @@ def test_wrong_pairs_are_named_with_how_far_they_are_off(wrong: tuple[int, ...])
     for k, row in enumerate(wrong):
         points_2d[row] += [(37, 5), (-30, 25), (10, -45)][k]
     live = live_of(problem, points_2d=points_2d)
-    assert set(live.contradictions) == set(wrong)
+    assert set(live.outliers) == set(wrong)
     true = np.linalg.norm(points_2d - problem.points_2d, axis=1)
     for row in wrong:
-        assert live.contradictions[row] == pytest.approx(true[row], abs=12)
+        assert live.outliers[row] == pytest.approx(true[row], abs=12)
 
 
 @pytest.mark.parametrize("choice", [KNOWN, UNKNOWN])
@@ -157,7 +155,7 @@ def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
     for seed in range(seeds):
         for points, noise in ((6, 1.0), (10, 3.0), (20, 6.0)):
             live = live_of(problem_of(seed, points=points, noise_px=noise), choice=choice)
-            suspected += len(live.contradictions)
+            suspected += len(live.outliers)
     assert suspected <= 0.005 * seeds * 36
 
 
@@ -167,9 +165,9 @@ def test_one_wrong_pair_is_found_among_few() -> None:
         problem = problem_of(seed, points=8, noise_px=1.0)
         points_2d = problem.points_2d.copy()
         points_2d[3] += [0, 60]
-        contradictions = live_of(problem, points_2d=points_2d).contradictions
-        found += 3 in contradictions
-        alone += set(contradictions) == {3}
+        outliers = live_of(problem, points_2d=points_2d).outliers
+        found += 3 in outliers
+        alone += set(outliers) == {3}
     assert found >= 32
     assert alone >= 30
 
@@ -177,7 +175,7 @@ def test_one_wrong_pair_is_found_among_few() -> None:
 def test_too_few_pairs_accuse_nobody() -> None:
     problem = problem_of(0, points=5, noise_px=1.0)
     points_2d = problem.points_2d + [[90, 0], *[[0, 0]] * 4]
-    assert live_of(problem, points_2d=points_2d).contradictions == {}
+    assert live_of(problem, points_2d=points_2d).outliers == {}
 
 
 # --- the next keypoint -----------------------------------------------------------------------
@@ -199,7 +197,7 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
 @pytest.mark.parametrize("focal", ["known", "estimate"])
 @given(st.integers(0, 10_000))
 @settings(max_examples=15)
-def test_advice_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
+def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
     problem = problem_of(seed, points=9, noise_px=0.5)
     result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
     assert result.covariance is not None
@@ -211,25 +209,29 @@ def test_advice_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
         candidates, result.camera, result.alignment, result.covariance, sigma=1.0
     )
     np.testing.assert_allclose(predicted, brute, rtol=2e-3)
-    advice = best_next(candidates, result.camera, result.alignment, result.covariance, sigma=1.0)
-    assert advice is not None
-    column = brute[:, advice.unknown]
-    assert column[advice.row] <= column.min() * (1 + 5e-3)
-    assert advice.after < advice.before
+    next_best = find_next_best(
+        candidates, result.camera, result.alignment, result.covariance, sigma=1.0
+    )
+    assert next_best is not None
+    column = brute[:, next_best.unknown]
+    assert column[next_best.row] <= column.min() * (1 + 5e-3)
+    assert next_best.after < next_best.before
 
 
-def test_advice_looks_at_the_least_known_unknown() -> None:
+def test_next_best_concerns_the_most_uncertain_unknown() -> None:
     problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 1e-4, 0.04])
-    advice = best_next(problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0)
-    assert advice is not None
-    assert advice.unknown == 7
-    assert advice.before == pytest.approx(0.2)
+    next_best = find_next_best(
+        problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0
+    )
+    assert next_best is not None
+    assert next_best.unknown == 7
+    assert next_best.before == pytest.approx(0.2)
     distance = np.linalg.norm(result.alignment.translation)
     covariance[5, 5] = (0.3 * distance) ** 2  # in shares of the distance
     assert (
-        best_next(
+        find_next_best(
             problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0
         ).unknown
         == 5
@@ -240,13 +242,16 @@ def test_equally_good_candidates_give_the_first() -> None:
     problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     same = np.repeat(problem.points_3d[:1], 5, axis=0)
-    advice = best_next(same, problem.camera, result.alignment, result.covariance, sigma=1.0)
-    assert advice is not None
-    assert advice.row == 0
+    next_best = find_next_best(same, problem.camera, result.alignment, result.covariance, sigma=1.0)
+    assert next_best is not None
+    assert next_best.row == 0
     assert (
-        best_next(same[:0], problem.camera, result.alignment, result.covariance, sigma=1.0) is None
+        find_next_best(same[:0], problem.camera, result.alignment, result.covariance, sigma=1.0)
+        is None
     )
-    assert best_next(same, problem.camera, result.alignment, np.zeros((8, 8)), sigma=1.0) is None
+    assert (
+        find_next_best(same, problem.camera, result.alignment, np.zeros((8, 8)), sigma=1.0) is None
+    )
 
 
 # --- derivatives -----------------------------------------------------------------------------
@@ -287,10 +292,10 @@ def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
         projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose)
 
 
-# --- words -----------------------------------------------------------------------------------
+# --- text -----------------------------------------------------------------------------------
 
 
-def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
+def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> None:
     problem = problem_of(7, points=15, noise_px=1.0)
     facts = {fact.label: fact for fact in facts_of(live_of(problem))}
     assert list(facts) == [
@@ -301,8 +306,8 @@ def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
         "Focal length",
         "Pairs agree to",
     ]
-    value, _, deviation = facts["Stretch along y"].value.partition(" ± ")
-    assert abs(float(value) - problem.alignment.scale[1]) < 5 * float(deviation)
+    value, _, std = facts["Stretch along y"].value.partition(" ± ")
+    assert abs(float(value) - problem.alignment.scale[1]) < 5 * float(std)
     longer = problem.alignment.scale[1] > 1
     assert facts["Stretch along y"].note.endswith(
         f"{'longer' if longer else 'shorter'} than the model"
@@ -313,7 +318,7 @@ def test_facts_say_stretch_pose_and_agreement_with_deviations() -> None:
     assert facts_of(LiveAlignment()) == ()
 
 
-def test_estimated_focal_length_has_a_deviation() -> None:
+def test_estimated_focal_length_has_a_standard_deviation() -> None:
     facts = {
         fact.label: fact
         for fact in facts_of(live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN))
@@ -331,12 +336,12 @@ def test_notes_name_alternatives_and_weak_stretches() -> None:
     assert notes_of(LiveAlignment(message="wait")) == ()
 
 
-def test_advice_names_point_and_gain() -> None:
-    assert advice_text(Advice(0, 7, 0.12, 0.034), "left arm") == (
-        "left arm: it would tell the stretch along z to ± 3.4 % instead of 12 %"
+def test_text_names_point_and_gain() -> None:
+    assert next_best_text(NextBest(0, 7, 0.12, 0.034), "left arm") == (
+        "left arm: it would determine the stretch along z to ± 3.4 % instead of 12 %"
     )
-    assert advice_text(Advice(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
-        "tip: it would tell the rotation to ± 0.5° instead of 4°"
+    assert next_best_text(NextBest(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
+        "tip: it would determine the rotation to ± 0.5° instead of 4°"
     )
     assert unknown_name(8) == "the focal length"
     assert unknown_name(6, "y") == "the stretch along x"

@@ -92,14 +92,14 @@ def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
 
 def test_rays_are_checked() -> None:
     model = CadModel(Mesh(SQUARE, [[0, 1, 2]]))
-    with pytest.raises(InputError, match=r"^direction: is zero$"):
+    with pytest.raises(InputError, match=r"^direction: the vector is zero$"):
         model.pick([0, 0, 1], [0, 0, 0])
     with pytest.raises(InputError, match=r"^origin: NaN or infinite"):
         model.pick([0, 0, np.nan], [0, 0, 1])
 
 
 def test_a_model_without_extent_is_refused() -> None:
-    with pytest.raises(InputError, match=r"^dot: all its vertices are in one place$"):
+    with pytest.raises(InputError, match=r"^dot: all vertices of the mesh coincide$"):
         CadModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
 
 

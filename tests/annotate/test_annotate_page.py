@@ -13,8 +13,8 @@ from playwright.sync_api import Browser, Page
 from support.annotating import Case, place_all, place_twenty, served
 
 from cadalign.annotate.guard import Access
+from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.state import state_of
 from cadalign.cli import main
 
 READY = (
@@ -130,7 +130,7 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
         page.mouse.click(*driver.pixel(uv))
         driver.wait_for_state(lambda state, n=number: len(state["pairs"]) == n)
         page.mouse.click(
-            *driver.surface(driver.session.model.to_display(driver.session.book[keypoint].xyz))
+            *driver.surface(driver.session.model.to_display(driver.session.registry[keypoint].xyz))
         )
         state = driver.wait_for_state(lambda state, k=keypoint: state["pairs"][-1]["keypoint"] == k)
         assert state["alignment"]["status"] == ("done" if number >= 4 else "none")
@@ -175,7 +175,7 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
     reloaded = driver.wait_for_state(lambda _: True)
     assert reloaded["pairs"] == undone["pairs"]
     assert reloaded["alignment"] == undone["alignment"]
-    restarted = state_of(case.open(keypoints=None), 0)
+    restarted = page_state(case.open(keypoints=None), 0)
     assert json.loads(json.dumps(restarted["pairs"])) == undone["pairs"]
 
     # It is saved, and the file gives the alignment that the page shows.
@@ -206,16 +206,16 @@ def test_clicks_on_the_model_give_the_surface_point(opened: tuple[Driver, Case, 
                 {"x": x, "y": y},
             ):
                 continue
-            count = len(driver.session.slides[0].document.pairs)
+            count = len(driver.session.photos[0].document.pairs)
             driver.page.evaluate("annotator.state.message = ''")
             driver.page.mouse.click(x, y)
             driver.wait_for_state(
                 lambda state, n=count: len(state["pairs"]) == n + 1 or state["message"] != ""
             )
-            pairs = driver.session.slides[0].document.pairs
+            pairs = driver.session.photos[0].document.pairs
             if len(pairs) == count:
                 continue  # half a pixel beside the outline
-            placed = driver.session.book[pairs[-1].keypoint]
+            placed = driver.session.registry[pairs[-1].keypoint]
             gaps.append(np.linalg.norm(np.array(placed.xyz) - target) / model.diagonal)
             if len(gaps) >= 8 * (view + 1):
                 break
@@ -337,7 +337,7 @@ def test_a_finger_places_a_point(browser: Browser, case: Case) -> None:
     context.close()
 
 
-def test_contradictions_trouble_and_misses_are_said(opened: tuple[Driver, Case, Access]) -> None:
+def test_outliers_save_errors_and_misses_are_shown(opened: tuple[Driver, Case, Access]) -> None:
     driver, case, _ = opened
     page = driver.page
     place_all(driver.session, case, count=10)

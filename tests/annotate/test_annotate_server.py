@@ -228,8 +228,8 @@ def test_port_in_use_is_an_error_in_words() -> None:
         with pytest.raises(InputError) as error:
             listen(port)
     assert str(error.value) == (
-        f"--port: port {port} cannot be listened on (Address already in use); "
-        "leave --port away to get a free one"
+        f"--port: port {port} cannot be opened (Address already in use); "
+        "omit --port to use a free one"
     )
-    with pytest.raises(InputError, match=r"^--port: port 99999 cannot be listened on"):
+    with pytest.raises(InputError, match=r"^--port: port 99999 cannot be opened"):
         listen(99999)

@@ -15,10 +15,10 @@ from support.annotating import Case, place, place_all, place_twenty
 from support.refusals import refusal_text
 
 from cadalign import Camera, FitResult, fit
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import Photo, find_photos
-from cadalign.annotate.prepare import open_session
 from cadalign.annotate.session import Session
-from cadalign.annotate.state import state_of
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
 from cadalign.errors import DataError, InputError
@@ -43,7 +43,7 @@ def comparable(state: dict[str, Any]) -> dict[str, Any]:
 def test_nothing_is_written_before_anything_is_placed(case: Case) -> None:
     before = sorted(case.folder.rglob("*"))
     session = case.open()
-    state_of(session, 0)
+    page_state(session, 0)
     assert sorted(case.folder.rglob("*")) == before
 
 
@@ -88,7 +88,7 @@ def test_every_change_is_on_disk_at_once_and_found_again(case: Case) -> None:
         session.act(0, action)
         for keypoints in (case.keypoints, None):
             again = case.open(keypoints=keypoints)
-            assert comparable(state_of(again, 0)) == comparable(state_of(session, 0)), action
+            assert comparable(page_state(again, 0)) == comparable(page_state(session, 0)), action
 
 
 def test_unfinished_halves_have_a_file_of_their_own_while_there_are_any(case: Case) -> None:
@@ -108,7 +108,7 @@ def test_all_pairs_can_be_deleted_and_the_camera_stays(case: Case) -> None:
     session.act(0, {"do": "place_uv", "uv": [10, 20]})
     session.act(0, {"do": "focal", "known": True, "pixels": 700})
     session.act(0, {"do": "delete", "pair": 1})
-    state = state_of(case.open(camera=None), 0)
+    state = page_state(case.open(camera=None), 0)
     assert state["pairs"] == []
     assert state["focal"]["pixels"] == 700
 
@@ -131,7 +131,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
     unready.act(0, {"do": "delete", "pair": 1})
     assert file.read_bytes() == before
     unready.warm_up()
-    state = state_of(unready, 0)
+    state = page_state(unready, 0)
     assert (
         FitResult.from_json(file.read_text()).alignment.to_dict()
         == (state["alignment"]["alignment"])
@@ -164,7 +164,7 @@ def test_placed_points_are_written_with_face_and_barycentrics(case: Case) -> Non
     assert ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json").keypoints == ()
 
 
-def test_trouble_with_saving_is_shown_and_nothing_is_lost(
+def test_errors_of_saving_are_shown_and_nothing_is_lost(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = case.open()
@@ -175,13 +175,13 @@ def test_trouble_with_saving_is_shown_and_nothing_is_lost(
     with monkeypatch.context() as patched:
         patched.setattr("os.replace", full)
         session.act(0, {"do": "place_uv", "uv": [10, 20]})
-    state = state_of(session, 0)
+    state = page_state(session, 0)
     assert "No space left on device" in state["saved"]["trouble"]
     assert len(state["pairs"]) == 1
     assert not list(case.folder.glob(".unfinished-*"))
     session.act(0, {"do": "place_uv", "uv": [30, 40]})
-    assert state_of(session, 0)["saved"]["trouble"] == ""
-    assert len(state_of(case.open(), 0)["pairs"]) == 2
+    assert page_state(session, 0)["saved"]["trouble"] == ""
+    assert len(page_state(case.open(), 0)["pairs"]) == 2
 
 
 def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
@@ -199,7 +199,7 @@ def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     ).save(case.observation)
     session = case.open()
     expected = fit(instance.points_3d, instance.points_2d, instance.camera, sigma=sigma)
-    assert state_of(session, 0)["alignment"]["alignment"] == expected.alignment.to_dict()
+    assert page_state(session, 0)["alignment"]["alignment"] == expected.alignment.to_dict()
     session.act(0, {"do": "place_uv", "uv": [10, 20]})
     session.act(0, {"do": "pick", **FROM_ABOVE})
     written = Observation.load(case.observation)
@@ -220,26 +220,26 @@ def test_suggested_point_becomes_the_pairs_model_half(case: Case) -> None:
     suggestion = state["suggestion"]
     assert suggestion["keypoint"] not in {pair["keypoint"] for pair in state["pairs"]}
     outcome = session.act(0, {"do": "suggested"})
-    assert session.slides[0].document.pair(outcome.selected).keypoint == suggestion["keypoint"]
+    assert session.photos[0].document.pair(outcome.selected).keypoint == suggestion["keypoint"]
 
 
 def test_corners_of_the_surface_are_suggested_where_no_keypoint_is_left(case: Case) -> None:
     session = case.open(keypoints=None)
     given = {point.semantic_id: point for point in ModelKeypoints.load(case.keypoints).keypoints}
     for keypoint, uv in case.clicks:
-        place(session, session.book.add(given[keypoint]), uv)
-    suggestion = state_of(session, 0)["suggestion"]
+        place(session, session.registry.add(given[keypoint]), uv)
+    suggestion = page_state(session, 0)["suggestion"]
     assert suggestion is not None
     assert suggestion["keypoint"] is None
-    before = len(session.book)
+    before = len(session.registry)
     session.act(0, {"do": "suggested"})
-    assert len(session.book) == before + 1
+    assert len(session.registry) == before + 1
 
 
 def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> None:
     session = case.open()
-    model, book = session.model, session.book
-    xyz = np.array(book[0].xyz)
+    model, registry = session.model, session.registry
+    xyz = np.array(registry[0].xyz)
     outwards = xyz - model.center
     front = model.to_display(xyz + 3 * outwards)
     back = model.to_display(xyz - 6 * outwards)
@@ -247,18 +247,18 @@ def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> Non
         pytest.skip("the keypoint is not seen from outside")
     ray = {"origin": front.tolist(), "direction": (-outwards).tolist(), "near": 0}
     session.act(0, {"do": "pick", **ray})
-    assert session.slides[0].document.pairs[0].keypoint == 0
+    assert session.photos[0].document.pairs[0].keypoint == 0
     session.act(0, {"do": "undo"})
     ray = {"origin": back.tolist(), "direction": outwards.tolist(), "near": 0}
     session.act(0, {"do": "pick", **ray})
-    assert 0 not in session.slides[0].document.keypoints
+    assert 0 not in session.photos[0].document.keypoints
 
 
 def test_click_beside_the_model_says_so_and_changes_nothing(case: Case) -> None:
     session = case.open()
     outcome = session.act(0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
     assert outcome.message == "That click missed the model."
-    assert not session.slides[0].history.can_undo
+    assert not session.photos[0].history.can_undo
 
 
 def test_contradicting_pair_is_marked(case: Case) -> None:
@@ -266,7 +266,7 @@ def test_contradicting_pair_is_marked(case: Case) -> None:
     for row, (keypoint, (u, v)) in enumerate(case.clicks):
         place(session, keypoint, [u + (45 if row == 4 else 0), v])
     marked = {
-        pair["position"]: pair["off"] for pair in state_of(session, 0)["pairs"] if pair["off"]
+        pair["position"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]
     }
     assert list(marked) == [5]
     assert marked[5] == pytest.approx(45, abs=15)
@@ -278,22 +278,28 @@ def test_contradicting_pair_is_marked(case: Case) -> None:
         ({}, "do: None is not an action; known are place_uv, "),
         ({"do": "__init__"}, "do: '__init__' is not an action; "),
         ({"do": ["undo"]}, "do: ['undo'] is not an action; "),
-        ({"do": "place_uv"}, "uv: shape (), expected (2)"),
-        ({"do": "place_uv", "uv": [1, "x"]}, "uv: not an array of numbers"),
-        ({"do": "place_uv", "uv": [1, 2, 3]}, "uv: shape (3,), expected (2)"),
-        ({"do": "place_uv", "uv": [1, float("nan")]}, "uv: NaN or infinite values"),
+        ({"do": "place_uv"}, "uv: missing"),
+        ({"do": "place_uv", "uv": [1, "x"]}, "uv[1]: 'x' is not a finite number"),
+        ({"do": "place_uv", "uv": [1, 2, 3]}, "uv: [1, 2, 3] is not a list of 2"),
+        ({"do": "place_uv", "uv": [1, float("nan")]}, "uv[1]: nan is not a finite number"),
         ({"do": "place_uv", "uv": [-1, 2]}, "uv: (-1.0, 2.0) is outside the photo"),
         ({"do": "place_uv", "uv": [1, 2], "pair": "1"}, "pair: '1' is not a whole number"),
         ({"do": "place_keypoint", "keypoint": 999}, "keypoint: there is no keypoint 999"),
-        ({"do": "pick", "origin": [0, 0, 1], "direction": [0, 0, 0]}, "direction: is zero"),
-        ({"do": "pick", "origin": [0, 0], "direction": [0, 0, 1]}, "origin: shape (2,)"),
-        ({"do": "suggested"}, "suggestion: there is none; place more pairs"),
+        (
+            {"do": "pick", "origin": [0, 0, 1], "direction": [0, 0, 0]},
+            "direction: the vector is zero",
+        ),
+        (
+            {"do": "pick", "origin": [0, 0], "direction": [0, 0, 1]},
+            "origin: [0, 0] is not a list of 3",
+        ),
+        ({"do": "suggested"}, "suggestion: there is no suggested keypoint yet; place more pairs"),
         ({"do": "move", "pair": 7, "uv": [1, 2]}, "pair: there is no pair 7; reload the page"),
         ({"do": "delete", "pair": None}, "pair: None is not a whole number"),
         ({"do": "rename", "pair": 7, "name": "x"}, "pair: there is no pair 7"),
-        ({"do": "focal", "known": 1}, "known: 1 is neither true nor false"),
+        ({"do": "focal", "known": 1}, "known: 1 is not true or false"),
         ({"do": "focal", "known": True, "pixels": 0}, "pixels: 0 px is no focal length of this"),
-        ({"do": "focal", "known": True, "pixels": "x"}, "pixels: not an array of numbers"),
+        ({"do": "focal", "known": True, "pixels": "x"}, "pixels: 'x' is not a finite number"),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(
@@ -301,21 +307,23 @@ def test_bad_actions_are_refused_and_change_nothing(
 ) -> None:
     session = open_session(image=original.photo, model=original.model, keypoints=original.keypoints)
     assert refusal_text(lambda: session.act(0, action)).startswith(message)
-    assert session.slides[0].document.pairs == ()
+    assert session.photos[0].document.pairs == ()
     assert not original.observation.exists()
 
 
 def test_unknown_photo_is_refused(original: Case) -> None:
     session = open_session(image=original.photo, model=original.model)
     assert refusal_text(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
-    assert refusal_text(lambda: state_of(session, -1)) == "image: there is no photo 0"
+    assert refusal_text(lambda: page_state(session, -1)) == "image: there is no photo 0"
 
 
 def test_name_needs_a_model_point(case: Case) -> None:
     session = case.open()
     session.act(0, {"do": "place_uv", "uv": [1, 2]})
     act = {"do": "rename", "pair": 1, "name": "x"}
-    assert refusal_text(lambda: session.act(0, act)) == "pair: this pair has no model point yet"
+    assert refusal_text(lambda: session.act(0, act)) == (
+        "pair: this pair has no model point yet; click on the model first"
+    )
 
 
 # --- focal length ----------------------------------------------------------------------------
@@ -328,12 +336,12 @@ def test_without_a_camera_the_focal_length_is_estimated_and_the_file_says_so(
     state = place_all(session, case)
     assert not state["focal"]["known"]
     true = case.instance.camera.fx
-    result = session.live(session.slides[0])[0].result
+    result = session.live(session.photos[0])[0].result
     assert result is not None
     assert abs(state["alignment"]["focal"] / true - 1) < 5 * result.std.focal
     camera = Observation.load(case.observation).camera
     assert not camera.focal_known
-    assert not state_of(case.open(camera=None), 0)["focal"]["known"]
+    assert not page_state(case.open(camera=None), 0)["focal"]["known"]
     command = ["fit", str(case.observation), "--focal", "estimate", "--json"]
     assert main([*command, "--out", str(case.folder / "x")]) == 0
     assert json.loads(capsys.readouterr().out)["alignment"] == state["alignment"]["alignment"]
@@ -343,19 +351,19 @@ def test_focal_length_can_be_said_to_be_known_and_not(case: Case) -> None:
     session = case.open()
     known = place_all(session, case)
     session.act(0, {"do": "focal", "known": False})
-    estimated = state_of(session, 0)
+    estimated = page_state(session, 0)
     assert estimated["alignment"]["focal"] != known["alignment"]["focal"]
-    assert case.open().slides[0].document.focal.known is False  # the file says so
+    assert case.open().photos[0].document.focal.known is False  # the file says so
     session.act(0, {"do": "focal", "known": True})
-    assert state_of(session, 0)["alignment"]["focal"] == case.instance.camera.fx
+    assert page_state(session, 0)["alignment"]["focal"] == case.instance.camera.fx
     session.act(0, {"do": "undo"})
-    assert state_of(session, 0)["alignment"]["focal"] == estimated["alignment"]["focal"]
+    assert page_state(session, 0)["alignment"]["focal"] == estimated["alignment"]["focal"]
 
 
 def test_camera_of_an_observation_is_used(case: Case) -> None:
     instance = case.instance
     Observation(instance.points_3d, instance.points_2d, instance.camera).save(case.observation)
-    state = state_of(case.open(camera=None), 0)
+    state = page_state(case.open(camera=None), 0)
     assert state["focal"]["known"]
     assert state["focal"]["pixels"] == instance.camera.fx
     assert len(state["pairs"]) == len(instance.points_3d)
@@ -379,17 +387,17 @@ def exif_photo(path: Path, *, orientation: int = 1, focal_35mm: int | None = Non
 def test_exif_focal_length_is_a_hint(case: Case) -> None:
     photo = case.folder / "exif.jpg"
     exif_photo(photo, focal_35mm=50)
-    state = state_of(case.open(camera=None, image=photo), 0)
+    state = page_state(case.open(camera=None, image=photo), 0)
     # 50 mm on a film of 43.27 mm diagonal; the photo's diagonal is 500 px.
     assert state["focal"]["pixels"] == pytest.approx(50 / 43.2666 * 500, rel=0.01)
-    assert state["focal"]["note"].startswith("The photo's EXIF data say about 578 px")
+    assert state["focal"]["note"].startswith("The photo's EXIF data give about 578 px")
     assert not state["focal"]["known"]
 
 
 def test_exif_focal_length_of_zero_is_ignored(case: Case) -> None:
     photo = case.folder / "exif.jpg"
     exif_photo(photo, focal_35mm=0)
-    state = state_of(case.open(camera=None, image=photo), 0)
+    state = page_state(case.open(camera=None, image=photo), 0)
     assert state["focal"]["note"] == ""
 
 
@@ -445,7 +453,8 @@ def test_what_is_not_a_photo_is_refused(case: Case) -> None:
 def test_photo_and_camera_must_have_the_same_size(case: Case) -> None:
     case.camera.write_text(json.dumps(Camera.from_fov(100, 80, fov_x=50).to_dict()))
     assert refusal_text(case.open) == (
-        f"{case.photo}: the photo is 640 x 480, the camera 100 x 80; give the camera of this photo"
+        f"{case.photo}: the photo has 640 x 480 pixels, the camera 100 x 80; "
+        "give the camera of this photo"
     )
 
 
@@ -465,7 +474,7 @@ def test_photos_of_a_folder_come_in_turn_each_with_its_file(
     out = case.folder / "out"
     out.mkdir()
     session = case.open(image=case.folder, out=out)
-    names = [slide.photo.path.name for slide in session.slides]
+    names = [photo.photo.path.name for photo in session.photos]
     assert names == ["a.jpg", "b.jpg", "b.png", "photo.png"]
     assert "left out: " in caplog.text
     assert "broken.png" in caplog.text
@@ -479,7 +488,7 @@ def test_photos_of_a_folder_come_in_turn_each_with_its_file(
         "sample_chair_000.keypoints.json",
     ]
     assert Observation.load(out / "b.png.json").points_2d.tolist() == [[20, 5]]
-    state = state_of(session, 2)
+    state = page_state(session, 2)
     assert (state["image"]["number"], state["image"]["count"], state["image"]["name"]) == (
         2,
         4,
@@ -488,17 +497,19 @@ def test_photos_of_a_folder_come_in_turn_each_with_its_file(
 
 
 def test_folder_without_photos_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"there are no photos in this folder; photos end in .bmp"):
+    with pytest.raises(
+        InputError, match=r"no photos in this folder; file names of photos end in .bmp"
+    ):
         find_photos(tmp_path)
     (tmp_path / "x.png").write_text("no photo")
-    with pytest.raises(DataError, match=r"none of its photos can be read$"):
+    with pytest.raises(DataError, match=r"none of the photos in this folder can be read$"):
         open_session(image=tmp_path, model=tmp_path / "m.ply")
 
 
 def test_observation_goes_with_one_photo(case: Case) -> None:
     assert refusal_text(lambda: case.open(image=case.folder, observation=case.observation)) == (
-        "--observation: names the file of a single photo; "
-        "with a folder of photos, or --out, leave it away"
+        "--observation: names the file of a single photo, but a folder is given too; "
+        "use --out for a folder of photos, and not both options"
     )
 
 
@@ -515,7 +526,7 @@ def test_files_of_others_are_never_overwritten(case: Case) -> None:
     unfinished = case.folder / "photo.unfinished.json"
     unfinished.write_text('{"pairs": []}')
     assert refusal_text(case.open) == (
-        f"{unfinished}: not a file of cadalign unfinished pairs; delete it to go on without"
+        f"{unfinished}: not a file of cadalign unfinished pairs; delete it to start without them"
     )
 
 
@@ -541,16 +552,16 @@ def namesake(case: Case) -> Path:
 def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
     place_all(case.open(), case)
     other = namesake(case)
-    book = case.folder / "sample_chair_000.keypoints.json"
-    kept = case.observation.read_bytes(), book.read_bytes()
+    keypoints = case.folder / "sample_chair_000.keypoints.json"
+    kept = case.observation.read_bytes(), keypoints.read_bytes()
     ours = f"belongs to the model {case.model.resolve()}, not {other.resolve()}; "
-    advice = "give another --observation or --out"
-    assert refusal_text(lambda: case.open(model=other)) == f"{book}: {ours}{advice}"
-    assert (case.observation.read_bytes(), book.read_bytes()) == kept
-    book.unlink()  # the observation is refused without its help
-    assert refusal_text(lambda: case.open(model=other)) == f"{case.observation}: {ours}{advice}"
+    fix = "give another --observation or --out"
+    assert refusal_text(lambda: case.open(model=other)) == f"{keypoints}: {ours}{fix}"
+    assert (case.observation.read_bytes(), keypoints.read_bytes()) == kept
+    keypoints.unlink()  # the observation is refused without its help
+    assert refusal_text(lambda: case.open(model=other)) == f"{case.observation}: {ours}{fix}"
     assert case.observation.read_bytes() == kept[0]
-    state_of(case.open(), 0)
+    page_state(case.open(), 0)
 
 
 def test_halves_of_pairs_of_a_namesake_are_refused(case: Case) -> None:
@@ -567,7 +578,7 @@ def test_model_reached_by_another_way_is_the_same(case: Case) -> None:
     link = case.folder / "link"
     link.symlink_to(case.model.parent)
     session = case.open(model=link / case.model.name)
-    assert len(session.slides[0].document.complete_pairs) == 6
+    assert len(session.photos[0].document.complete_pairs) == 6
 
 
 def test_given_keypoints_without_ids_all_come(case: Case) -> None:
@@ -575,8 +586,8 @@ def test_given_keypoints_without_ids_all_come(case: Case) -> None:
     bare = tuple(replace(point, semantic_id=None) for point in given)
     ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
     session = case.open()
-    assert [point.name for _, point in session.book] == [point.name for point in given]
-    assert len(session.book.given) == len(given)
+    assert [point.name for _, point in session.registry] == [point.name for point in given]
+    assert len(session.registry.given) == len(given)
 
 
 def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
@@ -586,22 +597,22 @@ def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
     points[0] += 0.01  # no keypoint is here
     Observation(points, case.instance.points_2d, case.instance.camera).save(case.observation)
     session = case.open()
-    keypoints = [pair.keypoint for pair in session.slides[0].document.pairs]
+    keypoints = [pair.keypoint for pair in session.photos[0].document.pairs]
     assert keypoints[1:] == ids[1:]
-    assert keypoints[0] not in session.book.given
+    assert keypoints[0] not in session.registry.given
 
 
 def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:
     session = open_session(image=case.photo, model=case.model, camera=case.camera)
     assert isinstance(session, Session)
-    state = state_of(session, 0)
+    state = page_state(session, 0)
     assert state["alignment"]["status"] == "preparing"
     session.warm_up()
-    assert state_of(session, 0)["alignment"]["status"] == "none"
+    assert page_state(session, 0)["alignment"]["status"] == "none"
 
 
 def test_state_of_twenty_pairs_is_plain_data(case: Case) -> None:
     session = case.open()
     place_twenty(session, case)
-    assert len(session.slides[0].document.complete_pairs) == 20
-    json.dumps(state_of(session, 0), allow_nan=False)
+    assert len(session.photos[0].document.complete_pairs) == 20
+    json.dumps(page_state(session, 0), allow_nan=False)

@@ -50,8 +50,8 @@ def test_port_in_use(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
         port = listener.getsockname()[1]
         message = refusal(capsys, "--image", case.photo, "--model", case.model, "--port", port)
     assert message == (
-        f"--port: port {port} cannot be listened on (Address already in use); "
-        "leave --port away to get a free one"
+        f"--port: port {port} cannot be opened (Address already in use); "
+        "omit --port to use a free one"
     )
 
 
@@ -72,7 +72,8 @@ def test_out_folder_is_made(case: Case, capsys: pytest.CaptureFixture[str]) -> N
     file = case.folder / "file"
     file.write_text("")
     message = refusal(capsys, "--image", case.photo, "--model", case.model, "--out", file / "out")
-    assert message == f"{file / 'out'}: cannot be made (Not a directory); choose another --out"
+    reason = "the folder cannot be created (Not a directory); choose another --out"
+    assert message == f"{file / 'out'}: {reason}"
 
 
 def test_folder_of_the_observation_is_made(

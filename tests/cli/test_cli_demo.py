@@ -291,10 +291,10 @@ def test_page_escapes_what_files_say(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (["--per-category", "0"], "--per-category: 0 is not positive"),
+        (["--per-category", "0"], "--per-category: 0 is less than 1"),
         (["--noise-px", "-1"], "--noise-px: -1.0 is not a noise level"),
         (["--noise-px", "nan"], "--noise-px: nan is not a noise level"),
-        (["--seed", "-1"], "--seed: -1 is negative"),
+        (["--seed", "-1"], "--seed: -1 is less than 0"),
         (
             ["--root", "/nowhere/at/all"],
             "/nowhere/at/all: no such folder; give KeypointNet's root",

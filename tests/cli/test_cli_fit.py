@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +17,7 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import FitResult, fit
+from cadalign import FitResult, RansacOptions, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
@@ -92,6 +94,54 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+def test_options_of_fit_are_those_of_the_function(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json", sigma=np.linspace(0.2, 5, 10))
+    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--scale-prior-sigma", "0.3"]
+    assert main(["fit", str(path), *flags]) == 0
+    expected = fit(
+        PROBLEM.points_3d,
+        PROBLEM.points_2d,
+        PROBLEM.camera,
+        sigma=2.0,
+        loss="cauchy",
+        stretch="y",
+        scale_prior_sigma=0.3,
+    )
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_options_of_ransac_need_no_prefix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    flags = ["--robust", "--max-reproj-error", "6", "--seed", "3", "--no-refine"]
+    assert main(["fit", str(path), *flags]) == 0
+    ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_full_disk_is_reported_and_leaves_earlier_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert main(["fit", str(path)]) == 0
+    written = tmp_path / "chair_fit" / "fit.json"
+    before = written.read_bytes()
+    capsys.readouterr()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    assert refusal_line(capsys, "fit", str(path), "--method", "aepnp").startswith(
+        f"{written}: cannot be written (No space left on device); "
+    )
+    assert written.read_bytes() == before
+
+
 def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
     blue = np.full((480, 640, 3), (200, 90, 40), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), blue)
@@ -124,7 +174,7 @@ def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
     assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: NaN or infinite values in row 0; remove or repair these"
+        f"{path}: keypoints[4].uv[0]: nan is not a finite number"
     )
 
 
@@ -132,7 +182,7 @@ def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixtu
     path = write_observation(tmp_path / "chair.json")
     edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
     assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: shape (3,), expected (2)"
+        f"{path}: keypoints[4].uv: [1, 2, 3] is not a list of 2"
     )
 
 
@@ -191,7 +241,17 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_observation(tmp_path / "chair.json")
     assert refusal_line(capsys, "fit", str(path), "--method", "best") == (
-        "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+        "--method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
+    )
+
+
+def test_given_and_estimated_sigma_exclude_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert refusal_line(capsys, "fit", str(path), "--sigma", "2", "--similar") == (
+        "--sigma: --similar estimates the standard deviation, which --sigma gives; "
+        "give one of the two options"
     )
 
 
@@ -246,7 +306,9 @@ def test_output_folder_that_cannot_be_made(
     path = write_observation(tmp_path / "chair.json")
     (tmp_path / "out").write_text("a file in the way")
     line = refusal_line(capsys, "fit", str(path), "--out", str(tmp_path / "out"))
-    assert line == f"{tmp_path / 'out'}: cannot be made (File exists); choose another --out"
+    assert line == (
+        f"{tmp_path / 'out'}: the folder cannot be created (File exists); choose another --out"
+    )
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     result = fitted(folder, "found.observation")
     captured = capsys.readouterr()
     focal = 34 / np.hypot(36, 24) * 800
-    assert f"Focal length by the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
+    assert f"Focal length from the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(
@@ -179,7 +179,7 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ([], "{folder}/found.json: [0]: the photo's size is not known; give --image or --camera"),
+        ([], "{folder}/found.json: [0]: the photo's size is unknown; give --image or --camera"),
         (["--image", "{folder}/none.jpg"], "{folder}/none.jpg: no such file"),
         (
             ["--image", "{folder}/found.json"],
@@ -233,5 +233,5 @@ def test_photo_and_camera_of_different_sizes_are_refused(
     text = refusal_line(capsys, *observing(folder, *options))
     assert text == (
         f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
-        "give what belongs together"
+        "give keypoints, photo and camera of one image"
     )

@@ -18,6 +18,7 @@ from PIL import Image
 from cadalign import Camera
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.render import Render
+from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at
@@ -140,6 +141,17 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         ],
     }
     (tmp_path / "chair.json").write_text(json.dumps([{"model_id": "other"}, entry]))
+    named = {"name": "corner", "face_index": 0, "barycentric": [0.5, 0.25, 0.25]}
+    mesh = load_mesh(model)
+    xyz = mesh.surface_points([0], [[0.5, 0.25, 0.25]])[0].tolist()
+    own = {"format": "cadalign model keypoints", "version": 1, "keypoints": [named]}
+    (tmp_path / "parts.keypoints.json").write_text(json.dumps(own))
+    (tmp_path / "same.json").write_text(json.dumps([xyz]))
+    pictures = []
+    for name in ("parts.keypoints.json", "same.json"):
+        _run(model, "--out", tmp_path / "k.png", "--keypoints", tmp_path / name)
+        pictures.append(_pixels(tmp_path / "k.png").astype(int))
+    np.testing.assert_array_equal(*pictures)
     drawn = []
     for name in ("points.json", "chair.json"):
         out = tmp_path / "k.png"

@@ -102,7 +102,11 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        ([1], "{path}: expected an object, got list"),
+        (
+            [1],
+            "{path}: a list, not an object of model keypoints; "
+            "give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
+        ),
         (
             DATA | {"format": "other"},
             "{path}: format: 'other' is not 'cadalign model keypoints'; "
@@ -117,8 +121,8 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             "{path}: top level: unknown field 'points'; "
             "known are format, keypoints, model, version",
         ),
-        (DATA | {"keypoints": {}}, "{path}: keypoints: expected a list"),
-        (DATA | {"model": 3}, "{path}: model: 3 is not a path"),
+        (DATA | {"keypoints": {}}, "{path}: keypoints: {{}} is not a list"),
+        (DATA | {"model": 3}, "{path}: model: 3 is not a text"),
         (changed(1, name=...), "{path}: keypoints[1].name: missing"),
         (changed(1, name=""), "{path}: keypoints[1].name: '' is not a text"),
         (changed(1, name=4), "{path}: keypoints[1].name: 4 is not a text"),
@@ -138,10 +142,10 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             changed(0, xyz=...),
             "{path}: keypoints[0].xyz: missing; or give face_index and barycentric",
         ),
-        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: shape (2,), expected (3)"),
+        (changed(0, xyz=[1, 2]), "{path}: keypoints[0].xyz: [1, 2] is not a list of 3"),
         (
             changed(0, xyz=[1, 2, None]),
-            "{path}: keypoints[0].xyz: NaN or infinite values in row 2; remove or repair these",
+            "{path}: keypoints[0].xyz[2]: None is not a finite number",
         ),
         (
             changed(1, barycentric=...),
@@ -165,7 +169,7 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
             "{path}: keypoints[0]: unknown field 'colour'; "
             "known are barycentric, face_index, name, semantic_id, xyz",
         ),
-        (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: expected an object, got int"),
+        (DATA | {"keypoints": [3]}, "{path}: keypoints[0]: 3 is not an object"),
         (
             {name: value for name, value in DATA.items() if name != "model"},
             "{path}: keypoints[2]: neither xyz nor a model that the face belongs to; "

@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 
 from cadalign.errors import DataError
-from cadalign.evaluation.api import run_sweep, simulate, sweep_of
+from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.simulation.experiment import SweepExperiment
+from cadalign.evaluation.simulation.options import SweepOptions
 
 distributed = pytest.importorskip(
     "distributed", reason="Dask is not installed: pip install 'cadalign[dask]'"
@@ -23,7 +24,7 @@ distributed = pytest.importorskip(
 
 pytestmark = pytest.mark.slow
 
-KIND = sweep_of("points", values=[8, 20], runs=600, methods=["optimal", "aepnp-paper", "limit"])
+KIND = SweepOptions("points", values=(8, 20), runs=600, methods=("optimal", "aepnp-paper", "limit"))
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
     tmp_path: Path, cluster: Any
 ) -> None:
     calm, hit = RunFolder(tmp_path / "calm"), RunFolder(tmp_path / "hit")
-    run_sweep(KIND, calm, workers=0)
+    run(KIND, calm, workers=0)
     killed: list[int] = []
 
     def kill_one(progress: Progress) -> None:
@@ -47,7 +48,7 @@ def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
             killed.append(worker.pid)
             os.kill(worker.pid, signal.SIGKILL)
 
-    run_sweep(KIND, hit, dask=cluster.scheduler_address, on_progress=kill_one)
+    run(KIND, hit, dask=cluster.scheduler_address, on_progress=kill_one)
     assert killed
     assert hit.results.read_bytes() == calm.results.read_bytes()
 
@@ -68,5 +69,5 @@ def test_simulate_takes_the_address(cluster: Any) -> None:
 def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
     workers = DaskWorkers(address, timeout=1.0)
     with pytest.raises(DataError, match="no Dask scheduler answers") as caught:
-        next(workers.evaluate(SweepExperiment(KIND), []))
+        next(workers.evaluate(SweepExperiment(KIND.kind), []))
     assert caught.value.where == address

@@ -16,28 +16,25 @@ import pytest
 from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_correspondences
 from cadalign.errors import DataError, InputError
+from cadalign.evaluation import plots
 from cadalign.evaluation.accuracy.methods import fit_with
-from cadalign.evaluation.correspondences import figures as correspondences_report
+from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.experiment import (
     CorrespondenceExperiment,
-    CorrespondenceOptions,
-    CorrespondenceTask,
-    CorrespondenceTasks,
-    run_correspondences,
+    errors_of,
     spoil,
 )
-from cadalign.evaluation.correspondences.figures import (
-    Quartiles,
-    draw_quartiles,
-    summarize_correspondences,
-    write_correspondences_report,
-)
-from cadalign.evaluation.correspondences.outcome import CorrespondenceOutcome
+from cadalign.evaluation.correspondences.options import CorrespondenceOptions
+from cadalign.evaluation.correspondences.spec import SPEC
+from cadalign.evaluation.correspondences.summary import summarize
+from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.summary import Quartiles
+from cadalign.fitting.options import RansacOptions
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -46,7 +43,8 @@ needs_data = pytest.mark.skipif(DATA is None, reason="CADALIGN_DATA is unset")
 
 POINTS = 60
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5)
-QUICK = CorrespondenceOptions(outliers=(0.0, 0.3), draws=2, methods=("epnp", "ransac-optimal"))
+ANY = Path()  # replaced by `run`
+QUICK = CorrespondenceOptions(ANY, outliers=(0.0, 0.3), draws=2, methods=("epnp", "ransac-optimal"))
 
 
 def seen_image(name: str, seed: int, camera: Camera = CAMERA) -> Correspondences:
@@ -120,7 +118,7 @@ def run(
     root: Path, out: Path, options: CorrespondenceOptions = QUICK, *, workers: int = 0
 ) -> list[dict[str, object]]:
     """Do a run; its rows."""
-    run_correspondences(root, options, RunFolder(out), workers=workers)
+    do_run(replace(options, path=root), RunFolder(out), workers=workers)
     return read_table(RunFolder(out).results).to_pylist()
 
 
@@ -139,7 +137,7 @@ def finished(colmap: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolde
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the writing of figures, which takes seconds and has a test of its own."""
-    monkeypatch.setattr(correspondences_report, "save_figure", lambda figure, path: [])
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: [])
 
 
 class TestFormats:
@@ -312,19 +310,19 @@ class TestRows:
             method="",
             camera=CAMERA,
         )
-        labels = {"image": "a", "draw": 0, "outliers": 0.25}
-        row = CorrespondenceOutcome.of_fit(est, truth, method="ransac-optimal", **labels)
-        assert row.rotation_error_deg == pytest.approx(0.4)
-        assert row.translation_error == pytest.approx(0.05)
-        assert (row.scale_y_error, row.scale_z_error) == pytest.approx((0.005, 0.005))
-        assert row.success
-        assert (row.inliers, row.inlier_precision, row.inlier_recall) == (3, 2 / 3, 2 / 3)
+        inlier_columns = ("inliers", "inlier_precision", "inlier_recall")
+        row = errors_of(est, truth, method="ransac-optimal")
+        assert row["rotation_error_deg"] == pytest.approx(0.4)
+        assert row["translation_error"] == pytest.approx(0.05)
+        assert (row["scale_y_error"], row["scale_z_error"]) == pytest.approx((0.005, 0.005))
+        assert row["success"]
+        assert [row[name] for name in inlier_columns] == [3, 2 / 3, 2 / 3]
         every = replace(est, inliers=np.ones(4, dtype=bool))
-        row = CorrespondenceOutcome.of_fit(every, truth, method="ransac-optimal", **labels)
-        assert (row.inliers, row.inlier_precision, row.inlier_recall) == (4, 3 / 4, 1)
+        row = errors_of(every, truth, method="ransac-optimal")
+        assert [row[name] for name in inlier_columns] == [4, 3 / 4, 1]
         for scale in ([1, 1.02, 2.0], [1, 1.0, 1.97]):
             off = replace(est, alignment=Alignment(turn, [0, 0, 10], scale))
-            assert not CorrespondenceOutcome.of_fit(off, truth, method="epnp", **labels).success
+            assert not errors_of(off, truth, method="epnp")["success"]
 
     def test_options_of_the_search_reach_it(self):
         problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))
@@ -339,11 +337,15 @@ class TestRows:
     def test_too_few_points_become_a_failed_row_with_the_reason(self):
         few = seen_image("a", 1).subset(np.arange(5))
         task = CorrespondenceTask("a", 0.0, 0, few)
-        options = CorrespondenceOptions(methods=("aepnp-paper", "epnp"))
+        options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
         paper, epnp = CorrespondenceExperiment(options).evaluate([task]).rows
         assert (paper["status"], epnp["status"]) == ("failed", "ok")
         assert "5" in paper["reason"]
-        assert (paper["points"], paper["success"], paper["rotation_error_deg"]) == (5, False, None)
+        assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (
+            5,
+            False,
+            None,
+        )
 
 
 class TestBrokenImages:
@@ -360,7 +362,7 @@ class TestBrokenImages:
         assert len(failed) == 4
         assert all("point 10000" in row["reason"] and row["points"] is None for row in failed)
         assert "4 of 12 rows failed, 4 of them because their image" in capsys.readouterr().err
-        for summary in summarize_correspondences(RunFolder(out)):
+        for summary in summarize(Run.open(out)):
             assert (summary.inputs, summary.failed, summary.unreadable) == (4, 0, 2)
             assert math.isfinite(summary.rotation_error_deg.upper)
 
@@ -391,7 +393,7 @@ class TestRuns:
 
     @pytest.mark.slow
     def test_results_are_the_same_bytes_with_and_without_workers(self, colmap, tmp_path):
-        options = CorrespondenceOptions(outliers=(0.0, 0.4), draws=5)
+        options = CorrespondenceOptions(ANY, outliers=(0.0, 0.4), draws=5)
         run(colmap, tmp_path / "none", options, workers=0)
         run(colmap, tmp_path / "two", options, workers=2)
         one, other = RunFolder(tmp_path / "none"), RunFolder(tmp_path / "two")
@@ -409,7 +411,7 @@ class TestReport:
 
     def test_summaries_agree_with_the_rows(self, finished):
         rows = read_table(finished.results).to_pylist()
-        for summary in summarize_correspondences(finished):
+        for summary in summarize(Run.open(finished.path)):
             some = [
                 row
                 for row in rows
@@ -423,7 +425,7 @@ class TestReport:
             assert math.isnan(summary.inlier_recall) == (summary.method == "epnp")
 
     def test_table_and_figures_are_written(self, finished):
-        write_correspondences_report(finished)
+        SPEC.write(Run.open(finished.path))
         with finished.summary.open() as file:
             rows = list(csv.DictReader(file))
         assert [(row["outliers"], row["method"]) for row in rows] == [
@@ -452,13 +454,14 @@ class TestReport:
         folder = RunFolder(tmp_path / "run")
         # Nothing agrees to a thousandth of a pixel.
         options = CorrespondenceOptions(
-            outliers=(0.2,), draws=1, methods=("ransac-ap4p",), max_reproj_error=1e-3
+            ANY, outliers=(0.2,), draws=1, methods=("ransac-ap4p",), max_reproj_error=1e-3
         )
         assert {row["status"] for row in run(colmap, folder.path, options)} == {"failed"}
-        (summary,) = summarize_correspondences(folder)
+        (summary,) = summarize(Run.open(folder.path))
         assert (summary.failed, summary.success) == (2, 0)
         assert math.isnan(summary.rotation_error_deg.lower)
-        files = draw_quartiles(tmp_path / "figure", [summary], "rotation_error_deg")
+        files = plots.draw_plots(tmp_path, SPEC.plots([Run.open(folder.path)])[1:2])
+        assert [file.stem for file in files] == ["outliers_rotation_error_deg"] * 2
         assert all(file.is_file() for file in files)
 
 
@@ -490,15 +493,15 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            (["--outliers", "1"], "1 is not a share of wrong points"),
-            (["--outliers", "0", "-0.1"], "-0.1 is not a share of wrong points"),
-            (["--outliers", "nan"], "nan is not a share of wrong points"),
+            (["--outliers", "1"], "1 is not a share of outliers"),
+            (["--outliers", "0", "-0.1"], "-0.1 is not a share of outliers"),
+            (["--outliers", "nan"], "nan is not a share of outliers"),
             (["--methods", "ransac-optimum"], "did you mean 'ransac-optimal'?"),
-            (["--methods", "limit"], "the limit needs the noise"),
-            (["--draws", "0"], "draws: 0 is less than 1"),
-            (["--max-reproj-error", "0"], "max_reproj_error"),
-            (["--max-iterations", "0"], "max_iterations"),
-            (["--max-images", "0"], "max_images: 0 is less than 1"),
+            (["--methods", "limit"], "the Cramer-Rao bound needs the noise"),
+            (["--draws", "0"], "--draws: 0 is less than 1"),
+            (["--max-reproj-error", "0"], "--max-reproj-error"),
+            (["--max-iterations", "0"], "--max-iterations"),
+            (["--max-images", "0"], "--max-images: 0 is less than 1"),
             (["--workers", "-2"], "-2 is not a number of processes"),
         ],
     )
@@ -530,6 +533,7 @@ class TestCommand:
 class TestRealModels:
     def test_the_robust_optimum_succeeds_where_others_do_not(self, name, tmp_path):
         options = CorrespondenceOptions(
+            ANY,
             outliers=(0.0, 0.5),
             draws=3,
             methods=(
@@ -542,7 +546,7 @@ class TestRealModels:
         )
         folder = RunFolder(tmp_path / "run")
         run(Path(str(DATA)) / "sfm" / name, folder.path, options)
-        found = {(s.outliers, s.method): s for s in summarize_correspondences(folder)}
+        found = {(s.outliers, s.method): s for s in summarize(Run.open(folder.path))}
         for share in (0.0, 0.5):
             assert found[share, "ransac-optimal"].success == 1
             assert found[share, "ransac-optimal"].inlier_recall > 0.95
@@ -555,10 +559,10 @@ class TestRealModels:
 
     def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, name, tmp_path):
         options = CorrespondenceOptions(
-            outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")
+            ANY, outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")
         )
         folder = RunFolder(tmp_path / "run")
         run(Path(str(DATA)) / "sfm" / name, folder.path, options)
-        six, four = summarize_correspondences(folder)
+        six, four = summarize(Run.open(folder.path))
         assert four.success == 1
         assert six.success < 0.5

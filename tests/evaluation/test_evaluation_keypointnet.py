@@ -13,11 +13,12 @@ import cadalign
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.accuracy.outcome import FAILED, OK, Outcome
-from cadalign.evaluation.accuracy.summary import summarize, summary_csv
-from cadalign.evaluation.instances.record import exhibit_stem
-from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.instances.record import record_stem
+from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.summary import CategorySummary, summarize_cells
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.outcome import FAILED, OK
+from cadalign.evaluation.summary import summary_csv
 
 METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
 
@@ -152,7 +153,7 @@ def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
     arguments = ["evaluate", "keypointnet", str(sample_root), "--out", str(out), *options]
     assert main([*arguments, "--categories", "chair", "car"]) == 0
     models = KeypointNet(sample_root).subset(categories=["chair", "car"])
-    wanted = {exhibit_stem(*key) for key in models.ids()}
+    wanted = {record_stem(*key) for key in models.ids()}
     endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "sketches": ".json"}
     for folder, ending in endings.items():
         files = {path.name for path in (out / folder).iterdir()}
@@ -188,21 +189,27 @@ def test_show_refuses_what_is_no_evaluation(
     assert "not the folder of an evaluation" in capsys.readouterr().err
 
 
-def outcome(method: str, error: float | None, *, category: str = "chair") -> Outcome:
-    labels = {"category": category, "model_id": "m", "view": 0, "method": method}
+def row(method: str, error: float | None, *, category: str = "chair") -> dict[str, Any]:
+    names = {"category": category, "model_id": "m", "view": 0, "method": method}
     if error is None:
-        return Outcome.of_failure("why", **labels)
-    blank = Outcome.of_failure("", **labels)
+        return {**names, "status": FAILED, "reason": "why"}
     numbers = dict.fromkeys(("rotation_error_deg", "sym_rotation_error_deg"), error)
     small = {"sym_translation_error": 0.06, "scale_y_error": 0.01, "scale_z_error": 0.01}
     other = {"translation_error": 0.06, "keypoints": 7}
-    return Outcome(**{**vars(blank), "status": OK, **numbers, **small, **other})
+    return {**names, "status": OK, "reason": "", **numbers, **small, **other}
+
+
+def summaries_of(rows: list[dict[str, Any]]) -> list[CategorySummary]:
+    names = [name for name, _ in COLUMNS]
+    return summarize_cells(
+        "chair", {name: np.array([row.get(name) for row in rows]) for name in names}
+    )
 
 
 def test_failed_rows_count_against_success_and_not_in_medians() -> None:
-    rows = [outcome("optimal", error) for error in (1.0, 4.0, 9.0, 30.0, None)]
-    rows += [outcome("limit", 2.0)]
-    optimal, limit = summarize(rows)
+    rows = [row("optimal", error) for error in (1.0, 4.0, 9.0, 30.0, None)]
+    rows += [row("limit", 2.0)]
+    optimal, limit = summaries_of(rows)
     assert (optimal.instances, optimal.failed) == (5, 1)
     assert optimal.rotation_error_deg == 6.5
     assert optimal.success_5deg_5pct == 0.0  # the translation is 6 % off
@@ -213,8 +220,8 @@ def test_failed_rows_count_against_success_and_not_in_medians() -> None:
 
 
 def test_a_category_where_all_failed_has_empty_cells() -> None:
-    summaries = summarize([outcome("optimal", None)])
-    assert summaries[0].cells() == ["-"] * 6
+    summaries = summaries_of([row("optimal", None)])
+    assert summaries[0].texts() == ["-"] * 6
     assert summary_csv(summaries).splitlines()[1].startswith("chair,optimal,1,1,,,")
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from cadalign.evaluation.paper import reproduction as paper
-from cadalign.evaluation.paper.reproduction import PAPER_TABLE, PaperPlan, reproduce_paper
-from cadalign.evaluation.simulation.experiment import SWEEPS, SweepKind
+from cadalign.evaluation.paper.reproduction import PaperPlan, reproduce_paper
+from cadalign.evaluation.paper.table import PAPER_TABLE
+from cadalign.evaluation.simulation.options import SWEEPS, SweepKind
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "reproduce_paper.py"
 
@@ -55,7 +55,7 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
 
 
 def test_the_papers_table_is_as_stated() -> None:
-    bottle = paper.PAPER_TABLE["bottle"]
+    bottle = PAPER_TABLE["bottle"]
     assert (bottle.rotation_error_deg, bottle.scale_z_error) == (7.004, 0.107)
 
 

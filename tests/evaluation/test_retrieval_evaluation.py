@@ -14,22 +14,21 @@ import pytest
 from cadalign import Box, Library
 from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
-from cadalign.evaluation.retrieval import figures as retrieval_report
-from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, run_retrieval, same_shapes
-from cadalign.evaluation.retrieval.figures import summarize_retrieval, write_retrieval_report
-from cadalign.evaluation.retrieval.tasks import (
-    RetrievalEvaluation,
-    RetrievalTask,
-    observe_model,
-    retrieval_tasks,
-)
+from cadalign.evaluation import plots
+from cadalign.evaluation.api import run
+from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, same_shapes
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
+from cadalign.evaluation.retrieval.spec import SPEC
+from cadalign.evaluation.retrieval.summary import summarize
+from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, retrieval_tasks
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import box_iou
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.shape import distances
 
-QUICK = RetrievalEvaluation(noises_px=(1.0,), keypoints=(6, 8))
+QUICK = RetrievalRunOptions(Path(), noises_px=(1.0,), keypoints=(6, 8))
 
 
 def make_model(number: int, *, keypoints: int = 12, category: str = "box") -> LibraryModel:
@@ -53,14 +52,14 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(library: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
-    run_retrieval(library, QUICK, folder, workers=0)
+    run(replace(QUICK, root=library), folder, workers=0)
     return folder
 
 
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the writing of figures, which takes seconds and has a test of its own."""
-    monkeypatch.setattr(retrieval_report, "save_figure", lambda figure, path: [])
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: [])
 
 
 def rows_of(folder: RunFolder, **wanted: Any) -> list[dict[str, Any]]:
@@ -97,7 +96,7 @@ class TestQueries:
     def test_tasks_are_the_models_with_enough_keypoints(self) -> None:
         models = [make_model(1), make_model(2, keypoints=7), make_model(3, category="can")]
         library = Library.from_models(models)
-        options = RetrievalEvaluation(noises_px=(5, 1), keypoints=(9, 6))
+        options = RetrievalRunOptions(Path(), noises_px=(5, 1), keypoints=(9, 6))
         found = [(t.model_id, t.noise_px, t.keypoints) for t in retrieval_tasks(library, options)]
         cases = [(1, 6), (1, 9), (5, 6), (5, 9)]
         expected = [("001", *case) for case in cases] + [("002", 1, 6), ("002", 5, 6)]
@@ -208,21 +207,21 @@ class TestRuns:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            run_retrieval(library, QUICK, folder, workers=0, on_progress=stop)
+            run(replace(QUICK, root=library), folder, workers=0, on_progress=stop)
         assert not folder.is_finished
-        run_retrieval(library, QUICK, folder, workers=2)
+        run(replace(QUICK, root=library), folder, workers=2)
         assert folder.results.read_bytes() == finished.results.read_bytes()
 
     def test_another_library_or_configuration_is_refused(
         self, finished: RunFolder, library: Path, tmp_path: Path
     ) -> None:
         with pytest.raises(DataError, match="another configuration: seed is 0 there and 1 now"):
-            run_retrieval(library, replace(QUICK, seed=1), finished)
+            run(replace(QUICK, root=library, seed=1), finished)
         other = tmp_path / "other"
         Library.from_models([make_model(number) for number in range(10)]).save(other)
         before = (finished.path / "library.cadalign").read_bytes()
         with pytest.raises(DataError, match="another configuration: library is"):
-            run_retrieval(other, QUICK, finished)
+            run(replace(QUICK, root=other), finished)
         assert (finished.path / "library.cadalign").read_bytes() == before
 
     def test_a_library_left_by_a_run_that_never_began_is_not_evaluated(
@@ -238,9 +237,9 @@ class TestRuns:
         with monkeypatch.context() as patch:
             patch.setattr(RunFolder, "claim", die)
             with pytest.raises(KeyboardInterrupt):
-                run_retrieval(other, QUICK, folder, workers=0)
+                run(replace(QUICK, root=other), folder, workers=0)
         options = replace(QUICK, max_models=2, methods=("epnp",), keypoints=(8,))
-        run_retrieval(library, options, folder, workers=0)
+        run(replace(options, root=library), folder, workers=0)
         evaluated = Library.open(folder.path / "library.cadalign")
         assert evaluated.fingerprint == Library.open(library).fingerprint
         config = folder.read_config()
@@ -253,7 +252,7 @@ class TestRuns:
             QUICK, categories=("chair",), whole_library=True, keypoints=(8,), methods=("optimal",)
         )
         folder = RunFolder(tmp_path / "run")
-        run_retrieval(sample_root, options, folder, workers=0)
+        run(replace(options, root=sample_root), folder, workers=0)
         assert len(Library.open(folder.path / "library.cadalign").categories) == 4
         inside, outside = rows_of(folder)
         assert inside["rank"] == 1
@@ -290,13 +289,13 @@ class TestRuns:
             ({"keypoints": (13,)}, "keypoints: no model has 13 keypoints"),
         ):
             with pytest.raises(InputError, match=message):
-                run_retrieval(library, replace(QUICK, **change), RunFolder(tmp_path / "run"))
+                run(replace(QUICK, root=library, **change), RunFolder(tmp_path / "run"))
         assert not (tmp_path / "run").exists()
 
 
 class TestSummaries:
     def test_rates_and_medians_are_those_of_the_rows(self, finished: RunFolder) -> None:
-        summaries = summarize_retrieval(finished)
+        summaries = summarize(Run.open(finished.path))
         assert len(summaries) == 2 * 2 * 2
         for summary in summaries:
             rows = rows_of(
@@ -323,7 +322,7 @@ class TestSummaries:
             )
 
     def test_table_and_figures_are_written(self, finished: RunFolder) -> None:
-        summaries = write_retrieval_report(finished)
+        summaries = SPEC.write(Run.open(finished.path))
         with finished.summary.open() as file:
             lines = list(csv.DictReader(file))
         assert len(lines) == len(summaries)
@@ -372,7 +371,8 @@ class TestCommand:
 
 @pytest.mark.slow
 def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path: Path) -> None:
-    options = RetrievalEvaluation(
+    options = RetrievalRunOptions(
+        real_data / "keypointnet",
         categories=("chair",),
         noises_px=(1.0,),
         keypoints=(8,),
@@ -380,8 +380,8 @@ def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path:
         max_models=60,
     )
     folder = RunFolder(tmp_path / "run")
-    run_retrieval(real_data / "keypointnet", options, folder)
-    found = {(s.protocol, s.method): s for s in summarize_retrieval(folder)}
+    run(options, folder)
+    found = {(s.protocol, s.method): s for s in summarize(Run.open(folder.path))}
     assert found["leave-in", "optimal"].rank_1 > 0.93
     assert found["leave-in", "epnp"].rank_1 < 0.4
     stretched, rigid = found["leave-out", "optimal"], found["leave-out", "epnp"]

@@ -22,10 +22,15 @@ import pytest
 
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import KILLED_REASON, InProcess, LocalProcesses
+from cadalign.evaluation.runs.parallel import (
+    KILLED_REASON,
+    InProcess,
+    LocalProcesses,
+    evaluate_chunk,
+)
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
-from cadalign.evaluation.runs.tables import ROW_GROUP, read_table, write_tables
-from cadalign.evaluation.runs.work import AbortError, Columns, Result, evaluate_chunk
+from cadalign.evaluation.runs.tables import ROW_GROUP, Columns, read_table, write_tables
+from cadalign.evaluation.runs.work import AbortError, Plan, Rows
 from cadalign.io import files
 
 MAIN = "import sys; from cadalign.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -54,7 +59,7 @@ class Squares:
         if self.dead_on_arrival:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def evaluate(self, tasks: Sequence[int]) -> Result:
+    def evaluate(self, tasks: Sequence[int]) -> Rows:
         rows = []
         for task in tasks:
             if self.full_disk:
@@ -69,11 +74,11 @@ class Squares:
                     flag.touch()
                     os.kill(os.getpid(), signal.SIGKILL)
             rows.append({"task": task, "square": float(task) ** 2, "reason": ""})
-        return Result(rows, [{"task": task, "process": os.getpid()} for task in tasks])
+        return Rows(rows, [{"task": task, "process": os.getpid()} for task in tasks])
 
-    def failure(self, task: int, reason: str) -> Result:
+    def failure(self, task: int, reason: str) -> Rows:
         rows = [{"task": task, "square": None, "reason": reason}]
-        return Result(rows, [{"task": task, "process": 0}])
+        return Rows(rows, [{"task": task, "process": 0}])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -89,14 +94,8 @@ def run_squares(
     path: Path, experiment: Squares, *, count: int = 100, workers: int = 0, config: int = 1
 ) -> list[dict[str, object]]:
     folder = RunFolder(path)
-    execute(
-        experiment,
-        range(count),
-        folder,
-        config={"value": config},
-        chunk_size=7,
-        workers=workers_of(workers),
-    )
+    plan = Plan(experiment, range(count), {"value": config}, 7)
+    execute(plan, folder, workers=workers_of(workers))
     return read_table(folder.results).to_pylist()
 
 
@@ -158,12 +157,12 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
             raise InterruptedError_
 
     folder = RunFolder(tmp_path / "cut")
-    arguments = {"config": {"value": 1}, "chunk_size": 7, "workers": InProcess()}
+    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), InProcess()
     with pytest.raises(InterruptedError_):
-        execute(Squares(), range(100), folder, on_progress=interrupt, **arguments)
+        execute(plan, folder, workers=workers, on_progress=interrupt)
     assert not folder.is_finished
     seen: list[int] = []
-    execute(Squares(), range(100), folder, on_progress=lambda p: seen.append(p.done), **arguments)
+    execute(plan, folder, workers=workers, on_progress=lambda p: seen.append(p.done))
     assert seen[0] == 35
     run_squares(tmp_path / "whole", Squares())
     assert folder.results.read_bytes() == (tmp_path / "whole" / "results.parquet").read_bytes()

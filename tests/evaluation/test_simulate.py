@@ -13,8 +13,8 @@ import pytest
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.api import sweep_of
-from cadalign.evaluation.simulation.experiment import SWEEPS, SweepExperiment, SweepTask, SweepTasks
+from cadalign.evaluation.simulation.experiment import SweepExperiment, SweepTask, SweepTasks
+from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.problems import simulate_problem
 
 
@@ -51,7 +51,8 @@ def test_without_outliers_a_problem_is_as_it_was() -> None:
 
 
 def test_a_problem_does_not_depend_on_its_neighbours() -> None:
-    kind = sweep_of("noise", values=[1, 3], runs=4, points=12, methods=["optimal", "limit"])
+    options = {"values": (1, 3), "runs": 4, "points": 12, "methods": ("optimal", "limit")}
+    kind = SweepOptions("noise", **options).kind
     experiment = SweepExperiment(kind, seed=3)
     tasks = SweepTasks(kind.values, kind.runs)[:]
     together = experiment.evaluate(tasks).rows
@@ -61,7 +62,7 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
 
 
 def test_another_seed_gives_other_problems() -> None:
-    kind = sweep_of("points", values=[8])
+    kind = SweepOptions("points", values=(8,)).kind
     first = SweepExperiment(kind, 0).problem(SweepTask(8.0, 0))
     other = SweepExperiment(kind, 1).problem(SweepTask(8.0, 0))
     assert not np.array_equal(first.points_2d, other.points_2d)
@@ -116,7 +117,7 @@ def test_running_times_are_positive_and_not_in_the_results(tmp_path: Path) -> No
 )
 def test_bad_options_are_named(sweep: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        sweep_of(sweep, **options)
+        SweepOptions(sweep, **options)
 
 
 @pytest.mark.parametrize("sweep", list(SWEEPS))

@@ -253,20 +253,20 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
             "stretch: 'yz' are not axes that can stretch where z is known; "
             "give one of xy, x, y, none",
         ),
-        ({"known_axis": "w"}, "known_axis: 'w' is not an axis; give x, y or z"),
+        ({"known_axis": "w"}, "known_axis: unknown known_axis 'w'; known are x, y, z"),
         (
             {"method": "best"},
             "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp",
         ),
         (
             {"method": "aepnp", "loss": "huber"},
-            "method: the method 'aepnp' knows neither loss, stretch nor scale prior; "
-            "use the method 'optimal', or leave these options alone",
+            "method: the method 'aepnp' supports neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options at their defaults",
         ),
         (
             {"method": "epnp", "stretch": "none"},
-            "method: the method 'epnp' knows neither loss, stretch nor scale prior; "
-            "use the method 'optimal', or leave these options alone",
+            "method: the method 'epnp' supports neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options at their defaults",
         ),
     ],
 )

@@ -87,17 +87,32 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
     ("text", "expected"),
     [
         ("{", "fit result: not valid JSON: "),
-        ("[]", "fit result: malformed ("),
-        ("{}", "fit result: missing 'covariance'"),
+        ("[]", "fit result: [] is not an object"),
+        ("{}", "fit result: alignment: missing"),
         (
             json.dumps(MADE.to_dict() | {"alignment": {"scale": [1, 1, 1]}}),
-            "alignment: missing rotation, translation",
+            "fit result: alignment: missing rotation, translation",
         ),
         (
             json.dumps(MADE.to_dict() | {"residuals": [[1, 2, 3]]}),
-            "residuals: shape (1, 3), expected (n, 2)",
+            "fit result: residuals[0]: [1, 2, 3] is not a list of 2",
         ),
-        (json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}), "fit result: malformed ("),
+        (
+            json.dumps(MADE.to_dict() | {"inliers": [True]}),
+            f"fit result: inliers: 1 entries, but points_3d has {len(MADE.points_3d)}",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"known_axis": "q"}),
+            "fit result: known_axis: 'q' is not one of 'x', 'y', 'z'",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"sigma": "1"}),
+            "fit result: sigma: '1' is not a finite number",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}),
+            "fit result: stats.iterations: missing",
+        ),
     ],
 )
 def test_malformed_json_is_refused(text: str, expected: str) -> None:

@@ -494,7 +494,7 @@ def test_structure_from_motion_through_lenses(real_data: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"focal": "guess"}, "focal: unknown choice 'guess'; give known or estimate"),
+        ({"focal": "guess"}, "focal: unknown focal 'guess'; known are known, estimate"),
         (
             {"focal": "estimate", "method": "aepnp"},
             "focal: the method 'aepnp' needs a known focal length; use the method 'optimal'",

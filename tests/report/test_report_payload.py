@@ -21,18 +21,17 @@ from cadalign import Alignment, Box, Camera, Library
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.accuracy.methods import fit_with
-from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet, run_sweep, sweep_of
-from cadalign.evaluation.correspondences.experiment import (
-    CorrespondenceOptions,
-    run_correspondences,
-)
-from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.correspondences.options import CorrespondenceOptions
+from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
-from cadalign.evaluation.retrieval.experiment import RetrievalEvaluation, run_retrieval
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
+from cadalign.evaluation.simulation.options import SweepOptions
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
 from cadalign.report import media, write_report
 from cadalign.report.instances import compact
@@ -43,7 +42,7 @@ HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
 
 
 def evaluate(root: Path, out: Path, **options: Any) -> Path:
-    run_keypointnet(root, KeypointNetOptions(**options), RunFolder(out), workers=0)
+    do_run(KeypointNetOptions(root, **options), RunFolder(out), workers=0)
     return out
 
 
@@ -146,7 +145,7 @@ def test_headline_marks_the_best_method_but_never_the_limit(payload: dict[str, A
 
 def test_summary_says_what_was_run_on_what(payload: dict[str, Any], sample_root: Path) -> None:
     assert payload["summary"].startswith(
-        "3 methods and the Cramer-Rao limit on 8 views of 4 models in 4 categories of sample, "
+        "3 methods and the Cramer-Rao bound on 8 views of 4 models in 4 categories of sample, "
         "1 px of noise, with cadalign 0.1.0 on 20"
     )
     assert payload["title"] == "Alignment on sample"
@@ -293,12 +292,12 @@ def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path
 def test_pictures_of_different_instances_have_different_names() -> None:
     ids = ["a", "a_1", "a_2", "a_1_1", "a_10", "a_0", "a_01", "a/1", "x" * 300 + "_1"]
     keys = [("chair", name, view) for name in ids for view in range(12)]
-    stems = {exhibit_stem(*key) for key in keys}
+    stems = {record_stem(*key) for key in keys}
     assert len(stems) == len(keys)
     assert all(len(stem) < 250 and "/" not in stem for stem in stems)
     usual = "1a2b3c4d5e6f708192a3b4c5d6e7f809"
-    assert exhibit_stem("chair", usual, 3) == f"chair_{usual}_3"
-    assert exhibit_stem("chair", "sample_chair_002") == "chair_sample_chair_002"
+    assert record_stem("chair", usual, 3) == f"chair_{usual}_3"
+    assert record_stem("chair", "sample_chair_002") == "chair_sample_chair_002"
 
 
 # --- size ------------------------------------------------------------------------------------
@@ -419,14 +418,14 @@ def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> P
     from cadalign.evaluation.runs.tables import write_rows
 
     folder = RunFolder(run)
-    for path in (folder.results, folder.exhibits, folder.timings):
+    for path in (folder.results, folder.records, folder.timings):
         path.unlink()
     folder.parts.mkdir()
     tasks = KeypointTasks(KeypointNet(root), views=1)
     for index in (0, 2):
         result = experiment.evaluate(tasks[64 * index : 64 * index + 64])
         write_rows(folder.part(index), experiment.columns, result.rows)
-        write_rows(folder.part_exhibits(index), experiment.exhibit_columns, result.exhibits)
+        write_rows(folder.part_records(index), experiment.record_columns, result.records)
         write_rows(folder.part_timings(index), experiment.timing_columns, result.timings)
     return run
 
@@ -468,8 +467,8 @@ def test_compared_runs_share_pictures(drawn: Path, tmp_path: Path) -> None:
 
 
 def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
-    kind = sweep_of("noise", values=[1, 4], runs=12, methods=["optimal", "aepnp", "limit"])
-    run_sweep(kind, RunFolder(tmp_path / "run"), workers=0)
+    options = SweepOptions("noise", values=(1, 4), runs=12, methods=("optimal", "aepnp", "limit"))
+    do_run(options, RunFolder(tmp_path / "run"), workers=0)
     found = report(tmp_path, tmp_path / "run")
     assert found["tables"] is None
     assert found["title"] == "Simulation: noise"
@@ -494,20 +493,21 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
 
 
 def test_running_time_is_shown_where_it_is_what_was_measured(tmp_path: Path) -> None:
-    kind = sweep_of("runtime", values=[8], runs=2, methods=["aepnp"])
-    run_sweep(kind, RunFolder(tmp_path / "run"), workers=0)
+    options = SweepOptions("runtime", values=(8,), runs=2, methods=("aepnp",))
+    do_run(options, RunFolder(tmp_path / "run"), workers=0)
     found = report(tmp_path, tmp_path / "run")
     assert found["plots"][0]["id"] == "microseconds"
     assert found["headline"]["rows"][0]["cells"]["microseconds"] > 0
 
 
 def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path: Path) -> None:
-    run_correspondences(
+    options = CorrespondenceOptions(
         real_data / "sfm" / "maupertuis_colmap",
-        CorrespondenceOptions(outliers=(0.0, 0.5), draws=1, methods=("ransac-optimal", "epnp")),
-        RunFolder(tmp_path / "run"),
-        workers=0,
+        outliers=(0.0, 0.5),
+        draws=1,
+        methods=("ransac-optimal", "epnp"),
     )
+    do_run(options, RunFolder(tmp_path / "run"), workers=0)
     found = report(tmp_path, tmp_path / "run")
     assert found["headline"]["group"] == "outliers [%]"
     assert [row["category"] for row in found["headline"]["rows"]] == ["0", "0", "50", "50"]
@@ -530,8 +530,8 @@ def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
         for keypoint, point in zip(entry["keypoints"], xyz, strict=True):
             keypoint["xyz"] = point
     file.write_text(json.dumps(entries))
-    options = RetrievalEvaluation(keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
-    run_retrieval(root, options, RunFolder(tmp_path / "run"), workers=0)
+    options = RetrievalRunOptions(root, keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
+    do_run(options, RunFolder(tmp_path / "run"), workers=0)
     found = report(tmp_path, tmp_path / "run")
     assert found["title"] == "Retrieval on data"
     assert "One method of finding 4 models of data again" in found["summary"]
@@ -554,7 +554,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
         for k, xyz in enumerate(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 9, 3)))
     ]
     Library.from_models(models).save(file)
-    options = RetrievalEvaluation(keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
+    options = RetrievalRunOptions(file, keypoints=(8,), noises_px=(1.0,), methods=("epnp",))
 
     def stop(progress: Progress) -> None:
         if progress.done:
@@ -562,7 +562,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
 
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(KeyboardInterrupt):
-        run_retrieval(file, options, folder, workers=0, on_progress=stop)
+        do_run(options, folder, workers=0, on_progress=stop)
     found = report(tmp_path, folder.path)
     (run,) = found["runs"]
     assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
@@ -573,7 +573,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
     assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
     assert rows[0]["milliseconds"] > 0
     assert found["plots"][0]["traces"][0]["y"] == [rows[0]["rank_1"]]
-    run_retrieval(file, options, folder, workers=0)
+    do_run(options, folder, workers=0)
     folder.timings.unlink()  # what was not kept is not shown
     found = report(tmp_path, folder.path)
     assert found["runs"][0]["state"] == "finished"
@@ -635,8 +635,8 @@ def test_what_is_no_run_is_refused(
 
 def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -> None:
     for name in ("noise", "points"):
-        kind = sweep_of(name, values=[8], runs=1, methods=["aepnp"])
-        run_sweep(kind, RunFolder(tmp_path / name), workers=0)
+        options = SweepOptions(name, values=(8,), runs=1, methods=("aepnp",))
+        do_run(options, RunFolder(tmp_path / name), workers=0)
     page = tmp_path / "report.html"
     with pytest.raises(InputError, match="none is given"):
         write_report([], page)

@@ -12,14 +12,16 @@ import pytest
 
 from cadalign.cli import main
 from cadalign.errors import InputError
-from cadalign.evaluation.api import run_sweep, sweep_of
+from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.simulation.options import SweepOptions
 from cadalign.report import FORMATS, headline_text
-from cadalign.report.headline import Column, Headline, HeadlineRow
+from cadalign.report.headline import Headline, HeadlineRow
 from cadalign.report.tables import table_text
 
 HOSTILE = "a|b_c\\ & 50 % #1 {x} ~^$ <img src=x onerror=alert(1)> *`[]\nnext"
-COLUMNS = (Column("n", "instances", digits=0, better=None), Column("r", "R error", "deg", digits=3))
+COLUMNS = (Metric("n", "instances", digits=0, better=None), Metric("r", "R error", "deg", digits=3))
 
 
 def headline(category: str = "chair") -> Headline:
@@ -35,8 +37,8 @@ def headline(category: str = "chair") -> Headline:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "a_run"
-    kind = sweep_of("noise", values=[1, 4], runs=4, methods=["optimal", "aepnp", "limit"])
-    run_sweep(kind, RunFolder(out), workers=0)
+    options = SweepOptions("noise", values=(1, 4), runs=4, methods=("optimal", "aepnp", "limit"))
+    do_run(options, RunFolder(out), workers=0)
     return out
 
 
@@ -47,7 +49,7 @@ def test_markdown_has_best_values_bold() -> None:
         "| chair | optimal \\(ours\\) | 3 | **0.123** |\n"
         "| chair | EPnP \\(no stretch\\) | 3 | 10.000 |\n"
         "| chair | stated | - | 0.998 |\n"
-        "| all | Cramer-Rao limit | 3 | - |\n"
+        "| all | Cramer-Rao bound | 3 | - |\n"
         "\n"
         "Medians, in %.\n"
     )
@@ -64,7 +66,7 @@ def test_latex_is_a_booktabs_table_with_groups_apart() -> None:
         "chair & EPnP (no stretch) & 3 & 10.000 \\\\\n"
         "chair & stated & - & 0.998 \\\\\n"
         "\\addlinespace\n"
-        "all & Cramer-Rao limit & 3 & - \\\\\n"
+        "all & Cramer-Rao bound & 3 & - \\\\\n"
         "\\bottomrule\n"
         "\\end{tabular}\n"
     )
@@ -98,8 +100,8 @@ def test_names_cannot_break_a_table() -> None:
 
 def test_several_runs_are_told_apart_in_every_format(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "b_run"
-    kind = sweep_of("noise", values=[1], runs=4, methods=["aepnp"])
-    run_sweep(kind, RunFolder(other), workers=0)
+    options = SweepOptions("noise", values=(1,), runs=4, methods=("aepnp",))
+    do_run(options, RunFolder(other), workers=0)
     for format, names in (("md", "a\\_run"), ("csv", "a_run"), ("latex", "a\\_run")):
         text = headline_text([run, other], format=format)
         assert text.count(names) == 6
@@ -131,8 +133,8 @@ def test_the_page_goes_into_the_folder_of_the_run(
 def test_the_page_of_several_runs_goes_where_one_is(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kind = sweep_of("noise", values=[1], runs=4, methods=["aepnp"])
-    run_sweep(kind, RunFolder(tmp_path / "b"), workers=0)
+    options = SweepOptions("noise", values=(1,), runs=4, methods=("aepnp",))
+    do_run(options, RunFolder(tmp_path / "b"), workers=0)
     monkeypatch.chdir(tmp_path)
     assert main(["report", str(run), "b"]) == 0
     assert (tmp_path / "report.html").is_file()

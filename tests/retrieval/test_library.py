@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from cadalign import Library
@@ -16,6 +17,7 @@ from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.labelings import mirrored_labelings
+from cadalign.retrieval.library_file import _HEADER, VERSION, _checksum, write_library
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
 HEADER = 64
@@ -96,7 +98,7 @@ def test_of_a_model_with_a_damaged_mesh_the_keypoints_bounds_are_taken(
     held = library[model.key]
     assert held.mesh_path is None
     np.testing.assert_array_equal(held.bounds[0], model.keypoints.xyz.min(axis=0))
-    with pytest.raises(DataError, match=f"model {model.model_id}: there is no mesh"):
+    with pytest.raises(DataError, match=f"model {model.model_id}: the model has no mesh"):
         held.load_mesh()
 
 
@@ -210,7 +212,7 @@ def test_another_version_is_refused_and_both_are_named(file: Path) -> None:
 @pytest.mark.parametrize("left", [HEADER, HEADER + 1000, -1])
 def test_a_file_that_was_cut_short_is_refused(file: Path, left: int) -> None:
     file.write_bytes(file.read_bytes()[:left])
-    with pytest.raises(DataError, match=r"cut short: \d+ bytes, \d+ expected; copy it again"):
+    with pytest.raises(DataError, match=r"truncated: \d+ bytes, \d+ expected; copy it again"):
         Library.open(file)
 
 
@@ -256,3 +258,58 @@ def test_opening_50000_models_takes_less_than_a_second(tmp_path: Path) -> None:
     assert len(library) == 50_000
     assert min(seconds) < 1.0
     assert library.nbytes < 40e6
+
+
+def test_forged_tables_are_refused_when_opened(library: Library, tmp_path: Path) -> None:
+    models = {name: library._table.table[name].to_pylist() for name in SCHEMA.names}
+    # Row 3 of a column gets an entry that no builder writes.
+    forged = [
+        ("labelings", [10**9] * 8),
+        ("labelings", [-1] * 8),
+        ("labelings", [0, 1, 2]),
+        ("semantic_ids", [0, 1]),
+        ("semantic_ids", [None] * 8),
+        ("keypoints", [[float("nan")] * 3] * 8),
+        ("keypoints", None),
+        ("bounds", [float("inf")] * 6),
+        ("bounds", None),
+        ("category", None),
+        ("category", "zebra"),
+        ("model_id", "0002"),
+    ]
+    for name, entry in forged:
+        columns = models | {name: [*models[name][:3], entry, *models[name][4:]]}
+        table = pa.table(columns, schema=SCHEMA)
+        write_library(tmp_path / "forged", ModelTable(table))
+        with pytest.raises(DataError, match="the library file is invalid: "):
+            Library.open(tmp_path / "forged")
+
+
+def test_forged_offsets_are_refused_when_opened(file: Path) -> None:
+    payload = file.read_bytes()[HEADER:]
+    offsets = np.arange(0, 8 * 13, 8, dtype="<i4")  # of 12 models of 8 keypoints
+    assert offsets.tobytes() in payload
+    far = np.minimum(offsets * 2**24, 2**31 - 1).astype("<i4")
+    payload = payload.replace(offsets.tobytes(), far.tobytes())
+    checksum = _checksum(pa.py_buffer(payload))
+    file.write_bytes(
+        _HEADER.pack(b"cadalign library", VERSION, 0, len(payload), checksum) + payload
+    )
+    with pytest.raises(DataError, match="the library file is invalid: "):
+        Library.open(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[]", "{}", '{"reflections": [[0, 99]], "rotations": []}',
+     '{"reflections": [[0]], "rotations": []}',
+     '{"reflections": [], "rotations": [{"keypoints": [-1], "circle": null}]}'],
+)  # fmt: skip
+def test_forged_symmetries_are_refused_when_the_model_is_asked_for(
+    library: Library, tmp_path: Path, text: str
+) -> None:
+    columns = {name: library._table.table[name].to_pylist() for name in SCHEMA.names}
+    table = pa.table(columns | {"symmetries": [text] * len(library)}, schema=SCHEMA)
+    write_library(tmp_path / "forged", ModelTable(table))
+    with pytest.raises(DataError, match="symmetries: "):
+        next(iter(Library.open(tmp_path / "forged")))

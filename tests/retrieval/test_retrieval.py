@@ -20,7 +20,7 @@ from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.bounds import error_bound
-from cadalign.retrieval.candidates import gather_field, observe
+from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import rank
 from cadalign.retrieval.shape import is_same_shape, shape_distance
@@ -377,7 +377,7 @@ def test_no_pose_has_errors_below_the_bound(
         covariances = factors @ factors.transpose(0, 2, 1)
     options = RetrievalOptions(sigma=covariances)
     model = LibraryModel("box", "1", xyz, np.arange(count), np.zeros((2, 3)))
-    field = gather_field(
+    field = gather_candidates(
         Library.from_models([model])._table,
         observe(seen, np.arange(count), CAMERA, options),
         options,
@@ -408,7 +408,7 @@ def test_the_bound_spares_most_of_the_work() -> None:
     options = RetrievalOptions(top=1)
     many = Library.from_models([make_model(number) for number in range(2000)])
     observed = observe(pixels, IDS, CAMERA, options)
-    ranking = rank(gather_field(many._table, observed, options), observed, options)
+    ranking = rank(gather_candidates(many._table, observed, options), observed, options)
     assert ranking.searched < 500
 
 
@@ -496,23 +496,23 @@ def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
         ({"semantic_ids": np.r_[IDS[:9], 3]}, "semantic_ids: the semantic id 3 occurs twice"),
         ({"semantic_ids": IDS + 0.5}, "semantic_ids: float64 of shape"),
         ({"camera": "none"}, "camera: expected a cadalign.Camera, got str"),
-        ({"top": 0}, "top: 0 is not a number of matches"),
+        ({"top": 0}, "top: must be a whole number >= 1, not 0"),
         ({"method": "aepnp"}, "method: unknown method 'aepnp'; known are optimal, epnp"),
-        ({"method": "epnp", "loss": "huber"}, "'epnp' knows neither loss nor stretch"),
-        ({"method": "epnp", "stretch": "y"}, "'epnp' knows neither loss nor stretch"),
-        ({"sigma": 0.0}, "sigma: has values that are not positive"),
+        ({"method": "epnp", "loss": "huber"}, "'epnp' supports neither loss nor stretch"),
+        ({"method": "epnp", "stretch": "y"}, "'epnp' supports neither loss nor stretch"),
+        ({"sigma": 0.0}, "sigma: all values must be > 0"),
         ({"sigma": None}, "sigma: the noise must be known"),
         ({"sigma": np.ones(9)}, r"sigma: shape \(9,\)"),
-        ({"shape_sigma": -1.0}, "shape_sigma: -1.0 is out of range"),
-        ({"missing_prob": 1.0}, "missing_prob: 1.0 is out of range"),
-        ({"spurious": 0.0}, "spurious: 0.0 is out of range"),
-        ({"max_stretch": 0.5}, "max_stretch: 0.5 is out of range"),
-        ({"max_stretch": float("nan")}, "max_stretch: nan is out of range"),
+        ({"shape_sigma": -1.0}, "shape_sigma: must be >= 0, not -1.0"),
+        ({"missing_prob": 1.0}, "missing_prob: must be between 0 and 1, both excluded, not 1.0"),
+        ({"spurious": 0.0}, "spurious: must be > 0, not 0.0"),
+        ({"max_stretch": 0.5}, "max_stretch: must be between 1 and 1000, not 0.5"),
+        ({"max_stretch": float("nan")}, "max_stretch: must be between 1 and 1000, not nan"),
         ({"loss": "tukey"}, "loss: unknown loss 'tukey'; known are linear, huber, cauchy"),
         ({"loss_scale": -1}, "loss_scale: -1 is not positive"),
         ({"scale_prior_sigma": 0.0}, "scale_prior_sigma: 0.0 is not positive"),
         ({"stretch": "x"}, "stretch: 'x' are not axes that can stretch"),
-        ({"workers": 0}, "workers: 0 is not a number of threads; or -1"),
+        ({"workers": 0}, "workers: must be >= 1, or -1 for all cores, not 0"),
         ({"mask": np.ones((480, 640)), "image": np.ones((480, 640, 3))}, "a mask or an image, not"),
     ],
 )
@@ -556,7 +556,7 @@ def test_shapes_of_other_categories_or_keypoints_are_not_the_same() -> None:
     fewer = make_model(0, ids=range(9))
     assert shape_distance(fewer, model) < 1e-12
     assert not is_same_shape(fewer, model)
-    with pytest.raises(InputError, match="the one is of 'can', the other of 'box'"):
+    with pytest.raises(InputError, match="the categories 'can' and 'box' differ"):
         shape_distance(replace(model, category="can"), model)
 
 

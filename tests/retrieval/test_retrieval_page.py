@@ -23,8 +23,8 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.mask_files import read_opacity
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.pictures import read_opacity
 from cadalign.retrieval.query import read_query
 
 
@@ -151,7 +151,7 @@ class TestSilhouettes:
         def retrieve(**options: Any) -> None:
             twins.retrieve(pixels, np.arange(7), CAMERA, **options)
 
-        with pytest.raises(InputError, match="mask: it shows no pixel of the object"):
+        with pytest.raises(InputError, match="mask: contains no pixel of the object"):
             retrieve(mask=np.zeros((480, 640), dtype=bool))
         with pytest.raises(InputError, match=r"mask: shape \(640, 480\), but .* 480 high and 640"):
             retrieve(mask=np.zeros((640, 480), dtype=bool))
@@ -239,10 +239,27 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
 def test_matches_as_json_are_those_of_the_library(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--robust", "--json"]
+    options = ["--sigma", "2", "--category", "chair", "--symmetries", "--loss", "cauchy", "--json"]
     assert main(["retrieve", *case.arguments, *options]) == 0
     expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
     assert json.loads(capsys.readouterr().out) == [match.to_dict() for match in expected]
+
+
+def test_robust_search_is_an_option_of_fit_alone(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--robust") == (
+        "--robust: the robust search (RANSAC) is an option of `cadalign fit` only; "
+        "use --loss cauchy"
+    )
+
+
+def test_refused_options_are_named_as_they_are_typed(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refusal_line(capsys, "retrieve", *case.arguments, "--max-stretch", "0.5") == (
+        "--max-stretch: must be between 1 and 1000, not 0.5"
+    )
 
 
 def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
@@ -342,7 +359,7 @@ def test_a_page_shows_the_matches_side_by_side(
             page.on("console", lambda message, to=problems: to.append(message.text))
             page.on("pageerror", lambda error, to=problems: to.append(str(error)))
             page.goto((out / "index.html").as_uri())
-            cards = page.locator("li.retrieved")
+            cards = page.locator("li.match")
             assert cards.count() == 4
             assert case.model_id in cards.first.inner_text()
             assert "100.0 %" in cards.first.inner_text()
@@ -350,7 +367,7 @@ def test_a_page_shows_the_matches_side_by_side(
             assert page.locator("img").first.evaluate(loaded) == 640
             overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert page.evaluate(overflow) == 0
-            bar = page.locator(".retrieved-score i").first.bounding_box()
+            bar = page.locator(".score i").first.bounding_box()
             assert bar is not None
             assert bar["width"] > 100
             assert 3 < bar["height"] < 12
@@ -445,7 +462,7 @@ def test_what_the_library_refuses_is_one_line(
     path = tmp_path / "blind.json"
     replace(case.observation, image=None).save(path)
     blind = refusal_line(capsys, "retrieve", str(path), *case.arguments[1:], "--silhouette")
-    assert blind.startswith("--silhouette: the observation names no image; give its image, or")
+    assert blind.startswith("--silhouette: the observation names no image; add the image")
     assert "no such folder" in refusal_line(capsys, "library", "build", str(tmp_path / "none"))
     (tmp_path / "lib").write_text("something else that is a file of more than sixty-four bytes ...")
     assert "not a library file" in refusal_line(capsys, "library", "show", str(tmp_path / "lib"))

@@ -72,7 +72,8 @@ def test_truth_is_among_the_solutions() -> None:
 
 def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     """No exact alignment that a local search from many starts finds is left out."""
-    from cadalign.solvers.objective import LINEAR, Objective
+    from cadalign.solvers.constants import LINEAR
+    from cadalign.solvers.objective import Objective
     from cadalign.solvers.refine import refine
 
     rng = np.random.default_rng(0)

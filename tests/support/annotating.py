@@ -15,14 +15,14 @@ import numpy as np
 import uvicorn
 
 from cadalign.annotate.guard import Access
-from cadalign.annotate.prepare import open_session
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.page_state import page_state
 from cadalign.annotate.server import listen, make_app
 from cadalign.annotate.session import Session
-from cadalign.annotate.state import state_of
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.evaluation.instances.instance import Instance, make_instance
 from cadalign.io.images import write_image
-from cadalign.render import RaycastRenderer
+from cadalign.render import RaycastRenderer, visible_keypoints
 
 
 @dataclass(frozen=True)
@@ -101,25 +101,29 @@ def place_all(session: Session, case: Case, *, count: int | None = None) -> dict
     """Place the first of the visible keypoints; gives the state."""
     for keypoint, uv in case.clicks[:count]:
         place(session, keypoint, uv)
-    return state_of(session, 0)
+    return page_state(session, 0)
 
 
 def place_twenty(session: Session, case: Case) -> None:
     """Place all visible keypoints, and corners of the surface up to 20 pairs."""
     place_all(session, case)
     rng = np.random.default_rng(0)
-    seen = session.model.visible(
-        session.model.sample_points, case.instance.camera, case.instance.cam_from_model
+    seen = visible_keypoints(
+        session.model.scene,
+        session.model.sample_points,
+        case.instance.camera,
+        case.instance.cam_from_model,
     )
     for point in (p for p, is_seen in zip(session.model.samples, seen, strict=True) if is_seen):
-        if len(session.slides[0].document.pairs) >= 20:
+        if len(session.photos[0].document.pairs) >= 20:
             return
-        if session.book.find(point.xyz, tolerance=1e-3) is None:
+        if session.registry.find(point.xyz, tolerance=1e-3) is None:
             ((u, v),) = case.instance.camera.project(
                 case.instance.cam_from_model.apply([point.xyz])
             )
             noise = rng.normal(size=2)
-            place(session, session.book.add(point), [u + noise[0], v + noise[1]])
+            u, v = float(u + noise[0]), float(v + noise[1])
+            place(session, session.registry.add(point), [u, v])
 
 
 @contextmanager

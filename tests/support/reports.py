@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Mesh
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.preview import sketch_of
+from cadalign.evaluation.instances.preview import preview_of
+from cadalign.evaluation.metrics import INSTANCE_METRICS as METRICS
 from cadalign.render import look_at
-from cadalign.report.looks import METRICS, method_dict
+from cadalign.report.looks import method_dict
 from cadalign.report.page import render_page
 
 HOSTILE = "<img src=x onerror=alert(1)><b>&lt;"
@@ -148,14 +149,14 @@ class _Maker:
                 for run in range(recipe.runs)
             ],
             "methods": [method_dict(name) for name in METHODS],
-            "metrics": [metric.to_dict() for metric in METRICS],
+            "metrics": [metric.page() for metric in METRICS],
             "headline": self._headline(rows, instances),
             "tables": {"strings": self.strings, "instances": instances, "rows": rows},
             "plots": [],
             "pictures": {str(i): self._picture(i, boxes=False) for i in shown},
             "thumbs": {str(i): self._picture(i, boxes=True) for i in shown},
             "exhibits": exhibits,
-            "meshes": {"m0": sketch_of(self.mesh).to_dict()},
+            "meshes": {"m0": preview_of(self.mesh).to_dict()},
         }
 
     def _string(self, text: str) -> int:
@@ -268,7 +269,7 @@ class _Maker:
                 failures.append({**about, "reason": REASON, "count": failed})
         counts = {"unit": "", "digits": 0, "better": None}
         columns = [{"key": key, "label": key, **counts} for key in ("instances", "failed")]
-        columns += [metric.to_dict() for metric in HEADED]
+        columns += [metric.page() for metric in HEADED]
         stated = {"method": PAPER, "cells": {"rotation_error_deg": 0.998}}
         return {
             "group": "category",

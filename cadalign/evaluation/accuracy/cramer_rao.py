@@ -8,11 +8,13 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.instances.symmetry import rotation_about
 from cadalign.fitting.focal.grid import focal_slopes
-from cadalign.fitting.noise import Sigma, whitening_of
+from cadalign.fitting.noise import whitening_of
+from cadalign.fitting.options import Sigma
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import LINEAR, UNKNOWNS
 from cadalign.solvers.focal import focal_covariance
-from cadalign.solvers.objective import LINEAR, UNKNOWNS, Objective
+from cadalign.solvers.objective import Objective
 from cadalign.solvers.optimal import covariance_of
 
 _LEAST_INFORMATION = 1e-12

@@ -1,4 +1,4 @@
-"""The methods that can be evaluated, by name."""
+"""Methods that can be evaluated, by name."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import numpy.typing as npt
 from cadalign.errors import InputError
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.fit import fit, fit_batch
-from cadalign.fitting.options import METHODS
+from cadalign.fitting.options import METHODS, RansacOptions
 from cadalign.fitting.result import FitResult
-from cadalign.fitting.robust import RansacOptions
 from cadalign.geometry.camera import Camera
 
 LIMIT = "limit"
@@ -39,17 +38,17 @@ _INLIER_BOUND = 3.5
 
 
 def method_names() -> tuple[str, ...]:
-    """All names: the methods of `cadalign.fit`, variants of them, and the limit."""
+    """All names: the methods of `cadalign.fit`, variants of them, and the Cramer-Rao bound."""
     return (*METHODS, *_VARIANTS, *_RANSAC, LIMIT)
 
 
 def is_robust(name: str) -> bool:
-    """Whether a method searches for inliers."""
+    """True for methods that search for inliers."""
     return name in _RANSAC
 
 
 def has_statistics(name: str) -> bool:
-    """Whether a method predicts standard deviations and knows of alternatives."""
+    """True for methods that predict standard deviations and know of alternatives."""
     return name == "optimal" or name in _VARIANTS or name in _RANSAC
 
 
@@ -109,6 +108,7 @@ def fit_batch_with(
 
 
 def _options(name: str, sigma: float, ransac: RansacOptions | None = None) -> dict[str, Any]:
+    """The options of `cadalign.fit` that a name stands for."""
     if name in _RANSAC:
         common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)
         return {"ransac": replace(common, **_RANSAC[name])}

@@ -1,4 +1,4 @@
-"""How figures look: one colour and marker for each method, the same in every figure."""
+"""Style of figures: one label, colour and marker for each method, the same everywhere."""
 
 from __future__ import annotations
 
@@ -40,28 +40,20 @@ _LABELS = {
     "aepnp": "AEPnP, 4 x 4 (ours)",
     "aepnp-paper": "AEPnP, as published",
     "epnp": "EPnP (no stretch)",
+    "optimal-unstretched": "optimal, without stretch",
     "optimal-huber": "optimal, Huber loss",
     "optimal-cauchy": "optimal, Cauchy loss",
     "ransac-optimal": "LO-RANSAC + optimal (ours)",
     "ransac-ap4p": "RANSAC, 4 points",
     "ransac-aepnp": "RANSAC, 6 points (AEPnP)",
     "ransac-aepnp-refined": "RANSAC, 6 points + refinement",
-    LIMIT: "Cramer-Rao limit",
+    LIMIT: "Cramer-Rao bound",
 }
-METRIC_LABELS = {
-    "rotation_error_deg": "rotation error [deg]",
-    "translation_error": "translation error [model units]",
-    "scale_y_error": "relative error of $s_y$ [%]",
-    "scale_z_error": "relative error of $s_z$ [%]",
-    "box_iou": "box IoU",
-    "microseconds": "time of one call [µs]",
-}
-PERCENT_METRICS = ("scale_y_error", "scale_z_error")
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a method is drawn.
+    """Label and line of a method.
 
     Parameters
     ----------
@@ -76,7 +68,7 @@ class Look:
 
 
 def look_of(method: str) -> Look:
-    """How a method is drawn; the limit as a dashed line without markers."""
+    """The look of a method; that of the Cramer-Rao bound is a dashed line without markers."""
     label = _LABELS.get(method, method)
     if method == LIMIT:
         return Look(label, "black", "", "--")

@@ -10,8 +10,8 @@ import numpy as np
 
 from cadalign.errors import RenderError
 from cadalign.evaluation.instances.instance import Instance
-from cadalign.evaluation.instances.preview import write_sketch
-from cadalign.evaluation.instances.record import exhibit_stem
+from cadalign.evaluation.instances.preview import write_preview
+from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -36,11 +36,11 @@ def draw_instance(
     model_id: str,
     view: int = 0,
 ) -> None:
-    """Render an instance and write its pictures and its model's sketch to a run's folder.
+    """Render an instance; write its pictures and its mesh preview to a run's folder.
 
     ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
-    one with the boxes, ``pictures`` it as it is, ``sketches`` the model in few triangles. Each file
-    appears whole or not at all.
+    one with the boxes, ``pictures`` it as it is, ``sketches`` the preview of its model's mesh. Each
+    file appears whole or not at all.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def draw_instance(
     DataError
         If a file cannot be written.
     """
-    stem = exhibit_stem(category, model_id, view)
+    stem = record_stem(category, model_id, view)
     if instance.scene is None:
         raise RenderError("there is no mesh to draw", where=stem)
     frame = _renderer().render(instance.scene, instance.camera, instance.cam_from_model)
@@ -69,9 +69,9 @@ def draw_instance(
     )
     _write_webp(folder.pictures / f"{stem}.webp", plain, quality=_QUALITY)
     _write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
-    sketch = folder.sketches / f"{exhibit_stem(category, model_id)}.json"
-    if view == 0 or not sketch.exists():
-        write_sketch(sketch, instance.scene.mesh)
+    preview = folder.previews / f"{record_stem(category, model_id)}.json"
+    if view == 0 or not preview.exists():
+        write_preview(preview, instance.scene.mesh)
     write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
 
 

@@ -1,4 +1,4 @@
-"""Test instances made from an annotated model: a view, a stretch, noisy visible keypoints."""
+"""Test instances of an annotated model: a view, a stretch, noisy visible keypoints."""
 
 from __future__ import annotations
 
@@ -52,9 +52,12 @@ class Instance:
     gt : Alignment
         The truth: pose, and the scale that undoes the stretch.
     visibility : {"rays", "hull"}
-        How it was found out which keypoints are seen.
+        Rule by which keypoints count as seen.
     scene : Scene, optional
         The model as the image shows it; None without a mesh.
+    diagonal : float
+        Of the bounding box of the model as the image shows it [model units]. Without a mesh it is
+        taken as 1, to which KeypointNet's models are normalised.
     """
 
     camera: Camera
@@ -66,6 +69,7 @@ class Instance:
     gt: Alignment
     visibility: str
     scene: Scene | None = None
+    diagonal: float = 1.0
 
     @cached_property
     def gt_box(self) -> Box:
@@ -110,10 +114,10 @@ def make_instance(
     noise_px : float
         Standard deviation of the Gaussian noise on each image coordinate [px].
     min_visible : int
-        How many keypoints a view must show.
+        Least number of keypoints that a view must show.
     seed, view_index : int
     scene : Scene, optional
-        What `load_scene` gave for this model, where it has been loaded.
+        The model's, as `load_scene` gives it, where it has been loaded.
 
     Returns
     -------
@@ -203,6 +207,7 @@ def _stretched(
     visibility: str,
     scene: Scene | None = None,
 ) -> Instance:
+    """The instance of a view, with a stretch and noise drawn for it."""
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
     seen = xyz[visible]
     projected = camera.project(cam_from_model.apply(seen))
@@ -216,4 +221,5 @@ def _stretched(
         gt=Alignment.from_solver(cam_from_model.rotation, cam_from_model.translation, 1 / stretch),
         visibility=visibility,
         scene=scene,
+        diagonal=1.0 if scene is None else float(np.linalg.norm(np.ptp(bounds, axis=0))),
     )

@@ -1,4 +1,4 @@
-"""A model in few triangles and lines: light enough for a page, true enough to recognise it."""
+"""Mesh previews: models in few triangles and lines, light enough for a page."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CREASE_DEG = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sketch:
+class MeshPreview:
     """A simplified model.
 
     Parameters
@@ -40,7 +40,7 @@ class Sketch:
     edges: IntArray
 
     def to_dict(self) -> dict[str, Any]:
-        """The sketch for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
+        """The preview for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
         placed = self.vertices if len(self.vertices) else np.zeros((1, 3))
         low = placed.min(axis=0)
         step = np.maximum(np.ptp(placed, axis=0), 1e-12) / (2 * _FINEST - 1)
@@ -56,7 +56,9 @@ class Sketch:
         }
 
 
-def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES) -> Sketch:
+def preview_of(
+    mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
+) -> MeshPreview:
     """Simplify a mesh by merging the vertices in each cell of a grid.
 
     The grid is fine enough to leave about as many triangles as may be; a mesh that has few is kept.
@@ -65,13 +67,13 @@ def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_ED
     ----------
     mesh : Mesh
     max_faces, max_edges : int
-        How many triangles and lines at most.
+        Largest numbers of triangles and lines.
 
     Examples
     --------
     >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    >>> sketch = sketch_of(square)
-    >>> len(sketch.faces), len(sketch.edges)  # the diagonal is no crease
+    >>> preview = preview_of(square)
+    >>> len(preview.faces), len(preview.edges)  # the diagonal is no crease
     (2, 4)
     """
     small = cluster(mesh, cells=_FINEST)
@@ -82,18 +84,18 @@ def sketch_of(mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_ED
     length = np.linalg.norm(small.vertices[creases[:, 0]] - small.vertices[creases[:, 1]], axis=1)
     longest = creases[np.argsort(-length, kind="stable")]
     lines = np.concatenate([small.wires, longest])[:max_edges]
-    return Sketch(small.vertices, small.faces, lines)
+    return MeshPreview(small.vertices, small.faces, lines)
 
 
-def write_sketch(path: Path, mesh: Mesh) -> None:
-    """Write a model's sketch as JSON.
+def write_preview(path: Path, mesh: Mesh) -> None:
+    """Write a preview of a mesh as JSON.
 
     Raises
     ------
     DataError
         If the file cannot be written.
     """
-    write_text(path, dense_json(sketch_of(mesh).to_dict()))
+    write_text(path, dense_json(preview_of(mesh).to_dict()))
 
 
 def _base64(values: npt.NDArray[Any], kind: str) -> str:

@@ -1,6 +1,6 @@
-"""What a run keeps of an instance besides its errors: enough to draw it and to judge its numbers.
+"""Instance records: camera, keypoints, truth and estimates, enough to draw an instance.
 
-An exhibit is a row of ``exhibits.parquet``: category, model id, view, and a JSON object ::
+A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON object ::
 
     {
       "camera": {"width": 640, "height": 480, "fx": 935.0, "fy": 935.0, "cx": 319.5, "cy": 239.5},
@@ -27,22 +27,20 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
-from cadalign.evaluation.accuracy.outcome import OK, Outcome
 from cadalign.evaluation.instances.instance import Instance
-from cadalign.evaluation.runs.work import Columns, Row
-from cadalign.fitting.result import Alternative, FitResult
-from cadalign.fitting.uncertainty import Deviation
+from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.files import dense_json
 
-EXHIBIT_COLUMNS: Columns = (
+RECORD_COLUMNS: Columns = (
     ("category", str),
     ("model_id", str),
     ("view", int),
@@ -55,53 +53,30 @@ _LONGEST_NAME = 200  # bytes
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """What a method made of an instance.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    sigma : float, optional
-        Standard deviation of the keypoints that was reckoned with [px].
-    std : Deviation, optional
-        Predicted standard deviations; None for methods that have none.
-    warnings : tuple of str
-        What the keypoints do not determine.
-    alternatives : tuple of Alternative
-        Other alignments that explain the keypoints as well.
-    """
-
-    alignment: Alignment
-    sigma: float | None = None
-    std: Deviation | None = None
-    warnings: tuple[str, ...] = ()
-    alternatives: tuple[Alternative, ...] = ()
-
-    @classmethod
-    def of_fit(cls, result: FitResult) -> Estimate:
-        """What a fit says of itself."""
-        return cls(result.alignment, result.sigma, result.std, result.warnings, result.alternatives)
+Estimate = FitResult | Alignment | CadalignError
+"""A fit, an alignment of a method that tells no more, or the reason why there is none."""
 
 
-def exhibit_row(
-    instance: Instance,
-    outcomes: Sequence[Outcome],
-    estimates: Sequence[Estimate | CadalignError],
+def pose_of(estimate: FitResult | Alignment) -> Alignment:
+    """The alignment of an estimate."""
+    return estimate.alignment if isinstance(estimate, FitResult) else estimate
+
+
+def record_row(
+    instance: Instance, outcomes: Sequence[Outcome], estimates: Sequence[Estimate]
 ) -> Row:
-    """The row of an instance.
+    """The record of an instance as a table row.
 
     Parameters
     ----------
     instance : Instance
     outcomes : sequence of Outcome
         One for each method.
-    estimates : sequence of Estimate or CadalignError
-        What these are the outcomes of, in the same order.
+    estimates : sequence of FitResult, Alignment or CadalignError
+        Those that these are the outcomes of, in the same order.
     """
-    names = outcomes[0]
     camera = instance.camera
-    exhibit = {
+    record = {
         "camera": {
             name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
         },
@@ -116,44 +91,42 @@ def exhibit_row(
             for outcome, estimate in zip(outcomes, estimates, strict=True)
         ],
     }
-    return {
-        "category": names.category,
-        "model_id": names.model_id,
-        "view": names.view,
-        "exhibit": dense_json(exhibit),
-    }
+    names = {name: outcomes[0].names[name] for name in ("category", "model_id", "view")}
+    return {**names, "exhibit": dense_json(record)}
 
 
-def exhibit_stem(category: str, model_id: str, view: int = 0) -> str:
+def record_stem(category: str, model_id: str, view: int = 0) -> str:
     """The name, without an ending, of the files with an instance's pictures.
 
     Examples
     --------
-    >>> exhibit_stem("chair", "88382b87", 2)
+    >>> record_stem("chair", "88382b87", 2)
     'chair_88382b87_2'
     """
     name = f"{category}_{model_id}"
     stem = name.replace("/", "_").replace("\0", "_")
     coded = name.encode("utf-8", "replace")
-    # What no file can be called, and what would read as another model's view.
+    # Not a possible name of a file, or the same as that of another model's view.
     if stem != name or len(coded) > _LONGEST_NAME or _LIKE_A_VIEW.search(name):
         stem = f"{stem[:40]}-{hashlib.sha256(coded).hexdigest()[:12]}"
     return stem if view == 0 else f"{stem}_{view}"
 
 
-def _described(outcome: Outcome, estimate: Estimate | CadalignError) -> dict[str, Any]:
-    if outcome.status != OK or isinstance(estimate, CadalignError):
-        return {"method": outcome.method, "reason": outcome.reason}
+def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
+    method = outcome.names["method"]
+    if not outcome.is_ok or isinstance(estimate, CadalignError):
+        return {"method": method, "reason": outcome.reason}
+    fit = estimate if isinstance(estimate, FitResult) else None
     return {
-        "method": outcome.method,
-        **_pose(estimate.alignment),
-        "rms_px": None if outcome.rms_px is None else round(outcome.rms_px, _PIXEL_DIGITS),
-        "sigma": estimate.sigma,
-        "std": None if estimate.std is None else vars(estimate.std),
-        "warnings": estimate.warnings,
+        "method": method,
+        **_pose(pose_of(estimate)),
+        "rms_px": round(outcome.values["rms_px"], _PIXEL_DIGITS),
+        "sigma": None if fit is None else fit.sigma,
+        "std": None if fit is None or fit.std is None else vars(fit.std),
+        "warnings": () if fit is None else fit.warnings,
         "alternatives": [
             {**_pose(other.alignment), "likelihood": other.relative_likelihood}
-            for other in estimate.alternatives
+            for other in (() if fit is None else fit.alternatives)
         ],
     }
 

@@ -1,59 +1,75 @@
-"""The sparse-keypoint experiment on KeypointNet: every model, every method, any number of views."""
+"""Errors of methods on views of annotated models.
+
+Columns of the result table, one row per view and method: what names the row (``category``,
+``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
+
+visibility
+    Rule by which keypoints count as seen, ``rays`` or ``hull``; empty if it failed before.
+keypoints
+    Number of keypoints that the method was given.
+stretch_y, stretch_z
+    Factors that the model was stretched by; the true scales are one over these.
+rotation_error_deg
+    [degrees]
+translation_error
+    [diagonals of the model's bounding box]
+scale_y_error, scale_z_error
+    Relative errors, fractions.
+box_iou
+    Of the stretched model's true and predicted box; empty for a model without volume.
+rms_px
+    Of the residuals [px].
+symmetry
+    The model's: ``none``, ``circle``, or the number of rotations that map it onto itself.
+sym_rotation_error_deg, sym_translation_error, sym_box_iou
+    The same errors from the nearest truth that looks the same; see
+    `cadalign.evaluation.instances.symmetry`. Errors of the scale do not depend on it.
+
+The metrics of failed rows are empty.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, fit_batch_with, fit_with, has_statistics
-from cadalign.evaluation.accuracy.outcome import Outcome
 from cadalign.evaluation.instances.hull import KeypointHull
-from cadalign.evaluation.instances.instance import Instance, make_hull_instance, make_instance
-from cadalign.evaluation.instances.record import EXHIBIT_COLUMNS, Estimate, exhibit_row
+from cadalign.evaluation.instances.instance import (
+    Instance,
+    load_scene,
+    make_hull_instance,
+    make_instance,
+)
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
 from cadalign.evaluation.instances.symmetry import SymmetryGroup
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
+from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import AbortError, Columns, Result, Row, reason_of
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 
 if TYPE_CHECKING:
     from cadalign.render import Scene
 
-_TIMING = ("category", "model_id", "view", "method", "seconds")
-_TYPES: dict[str, type] = {"int": int, "float": float, "str": str}
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """What became of one view of one model.
-
-    Parameters
-    ----------
-    instance : Instance or str
-        Or why there is none.
-    outcomes : list of Outcome
-        One for each method.
-    estimates : list of Estimate or CadalignError
-        What these are the outcomes of; empty where there is no instance.
-    """
-
-    instance: Instance | str
-    outcomes: list[Outcome]
-    estimates: list[Estimate | CadalignError]
-
-    @property
-    def exhibits(self) -> list[Row]:
-        """Its row in the table of exhibits, if there is an instance to show."""
-        if isinstance(self.instance, str):
-            return []
-        return [exhibit_row(self.instance, self.outcomes, self.estimates)]
+_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
+_POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
+COLUMNS: Columns = (
+    *_NAMES,
+    *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
+    *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
+    *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
+    *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
+    *((f"sym_{name}", float) for name in _POSE_ERRORS),
+)
 
 
 @dataclass(frozen=True)
@@ -67,33 +83,23 @@ class KeypointNetExperiment:
     noise_px : float
         Standard deviation of the keypoints' noise [px].
     min_visible : int
-        How many keypoints a view must show.
+        Least number of keypoints that a view must show.
     seed : int
     drawn_in : RunFolder, optional
-        Where the first method's alignment of every instance with a mesh is drawn; its folders
-        `overlays`, `thumbs`, `pictures` and `sketches` must exist.
+        Where the first method's alignment of every instance with a mesh is drawn; its folders for
+        pictures must exist.
     """
+
+    columns: ClassVar[Columns] = COLUMNS
+    # A method's share of the seconds that its chunk took.
+    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    record_columns: ClassVar[Columns] = RECORD_COLUMNS
 
     methods: tuple[str, ...]
     noise_px: float = 1.0
     min_visible: int = 6
     seed: int = 0
     drawn_in: RunFolder | None = None
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table; see `Outcome`."""
-        return _columns_of(Outcome.columns())
-
-    @property
-    def timing_columns(self) -> Columns:
-        """The instance, the method, and its share of the seconds that its chunk took."""
-        return _columns_of(list(_TIMING))
-
-    @property
-    def exhibit_columns(self) -> Columns:
-        """Columns of the instance records; see `evaluation/instances/record.py`."""
-        return EXHIBIT_COLUMNS
 
     def warm_up(self) -> None:
         """Compile solvers and metrics."""
@@ -108,66 +114,60 @@ class KeypointNetExperiment:
         )
         self.evaluate([task])
 
-    def evaluate(self, tasks: Sequence[KeypointTask]) -> Result:
-        """A row for every task and method."""
-        trials = self.trials(tasks)
-        outcomes = [outcome for trial in trials for outcome in trial.outcomes]
-        return Result(
-            [outcome.row() for outcome in outcomes],
-            [outcome.timing() for outcome in outcomes],
-            [row for trial in trials for row in trial.exhibits],
-        )
-
-    def failure(self, task: KeypointTask, reason: str) -> Result:
-        """A failed row for every method."""
-        outcomes = [self._failure(task, method, reason) for method in self.methods]
-        return Result([row.row() for row in outcomes], [row.timing() for row in outcomes])
-
-    def trials(self, tasks: Sequence[KeypointTask]) -> list[Trial]:
-        """The same as `evaluate`, not yet as rows of tables."""
-        made = _Instances(self)
-        trials = []
-        seconds = []
+    def evaluate(self, tasks: Sequence[KeypointTask]) -> Rows:
+        """A row for every task and method, and a record for every instance."""
+        instances: list[Instance | str] = []
+        extra = []
+        maker = _InstanceMaker(self)
         for task in tasks:
             start = time.perf_counter()
             try:
-                trials.append(Trial(made.instance(task), [], []))
+                instances.append(maker.instance(task))
             except Exception as error:
-                trials.append(Trial(reason_of(error), [], []))
-            seconds.append(time.perf_counter() - start)
-        for method in self.methods:
-            self._run(method, tasks, trials)
-        # The first method's row bears the time of making the instance.
-        for trial, extra in zip(trials, seconds, strict=True):
-            _add_seconds(trial.outcomes[0], extra)
-        return trials
+                instances.append(reason_of(error))
+            extra.append(time.perf_counter() - start)
+        per_method = [self._evaluate_method(method, tasks, instances) for method in self.methods]
+        outcomes, records = [], []
+        for k, instance in enumerate(instances):
+            answers = [answers[k] for answers in per_method]
+            found = [outcome for outcome, _ in answers]
+            # The first method's row bears the time of making the instance.
+            outcomes += [found[0].after(extra[k]), *found[1:]]
+            if isinstance(instance, Instance):
+                records.append(record_row(instance, found, [estimate for _, estimate in answers]))
+        return Rows.of(outcomes, records)
 
-    def _run(self, method: str, tasks: Sequence[KeypointTask], trials: Sequence[Trial]) -> None:
-        """Add one method's estimate and outcome to every trial."""
-        usable = [trial.instance for trial in trials if isinstance(trial.instance, Instance)]
+    def failure(self, task: KeypointTask, reason: str) -> Rows:
+        """A failed row for every method."""
+        return Rows.of(_failure(task, method, reason) for method in self.methods)
+
+    def _evaluate_method(
+        self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | str]
+    ) -> list[tuple[Outcome, Estimate]]:
+        """One method's outcome, and the estimate it is of, for every task."""
+        usable = [instance for instance in instances if isinstance(instance, Instance)]
         start = time.perf_counter()
         estimates = iter(self._estimates(method, usable))
         share = (time.perf_counter() - start) / max(len(usable), 1)
-        for task, trial in zip(tasks, trials, strict=True):
-            if isinstance(trial.instance, str):
-                trial.outcomes.append(self._failure(task, method, trial.instance))
+        answers: list[tuple[Outcome, Estimate]] = []
+        for task, instance in zip(tasks, instances, strict=True):
+            if isinstance(instance, str):
+                error = DataError(instance)
+                answers.append((_failure(task, method, instance), error))
                 continue
             start = time.perf_counter()
             estimate = next(estimates)
             try:
-                outcome = self._outcome(task, trial.instance, method, estimate)
+                outcome = self._outcome(task, instance, method, estimate)
             except AbortError:
                 raise
             except Exception as error:
-                outcome = self._failure(task, method, reason_of(error), trial.instance)
-            _add_seconds(outcome, share + time.perf_counter() - start)
-            trial.outcomes.append(outcome)
-            trial.estimates.append(estimate)
+                outcome = _failure(task, method, reason_of(error), instance)
+            answers.append((outcome.after(share + time.perf_counter() - start), estimate))
+        return answers
 
-    def _estimates(
-        self, method: str, instances: Sequence[Instance]
-    ) -> list[Estimate | CadalignError]:
-        """What a method makes of every instance."""
+    def _estimates(self, method: str, instances: Sequence[Instance]) -> list[Estimate]:
+        """A method's estimate of every instance."""
         if method == LIMIT or has_statistics(method):
             return [self._estimate(method, instance) for instance in instances]
         if not instances:
@@ -180,67 +180,50 @@ class KeypointNetExperiment:
             sigma=self.noise_px or 1.0,
         )
         return [
-            batch.errors[b] if b in batch.errors else Estimate(batch.alignment(b))
-            for b in range(len(batch))
+            batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))
         ]
 
-    def _estimate(self, method: str, instance: Instance) -> Estimate | CadalignError:
-        """What the limit, or a method that tells more than an alignment, makes of an instance."""
+    def _estimate(self, method: str, instance: Instance) -> Estimate:
+        """The estimate of the bound, or of a method that tells more than an alignment."""
         given = instance.points_3d, instance.points_2d, instance.camera
         try:
             if method == LIMIT:
-                return Estimate(limit_estimate(*given, instance.gt))
-            return Estimate.of_fit(fit_with(method, *given, sigma=self.noise_px or 1.0))
+                return limit_estimate(*given, instance.gt)
+            return fit_with(method, *given, sigma=self.noise_px or 1.0)
         except CadalignError as error:
             return error
 
     def _outcome(
-        self,
-        task: KeypointTask,
-        instance: Instance,
-        method: str,
-        estimate: Estimate | CadalignError,
+        self, task: KeypointTask, instance: Instance, method: str, estimate: Estimate
     ) -> Outcome:
         if isinstance(estimate, CadalignError):
-            return self._failure(task, method, str(estimate), instance)
-        alignment = estimate.alignment
-        residuals = _projected(instance, alignment) - instance.points_2d
+            return _failure(task, method, str(estimate), instance)
+        alignment = pose_of(estimate)
         if self.drawn_in is not None and instance.scene is not None and method == self.methods[0]:
             _draw(self.drawn_in, task, instance, alignment)
-        return Outcome.of_alignment(
-            alignment,
-            gt=instance.gt,
-            gt_box=instance.gt_box,
-            bounds=instance.bounds,
-            symmetry=task.symmetry,
-            rms_px=float(np.sqrt((residuals**2).sum(axis=1).mean())),
-            category=task.category,
-            model_id=task.model_id,
-            view=task.view,
-            method=method,
-            seconds=0.0,
-            **_known(instance),
-        )
-
-    def _failure(
-        self, task: KeypointTask, method: str, reason: str, instance: Instance | None = None
-    ) -> Outcome:
-        return Outcome.of_failure(
-            reason,
-            category=task.category,
-            model_id=task.model_id,
-            view=task.view,
-            method=method,
-            symmetry="" if task.problem else str(task.symmetry),
-            **({} if instance is None else _known(instance)),
+        metrics = _errors(alignment, instance, instance.gt, instance.gt_box)
+        truth = task.symmetry.nearest_truth(est=alignment, gt=instance.gt)
+        aware = metrics
+        if truth is not instance.gt:
+            aware = _errors(alignment, instance, truth, Box.from_model(instance.bounds, truth))
+        return Outcome(
+            task.names(method),
+            {
+                **_facts(task, instance),
+                **metrics,
+                "rms_px": _rms(instance, alignment),
+                **{f"sym_{name}": aware[name] for name in _POSE_ERRORS},
+            },
         )
 
 
-class _Instances:
+class _InstanceMaker:
     """Makes the instances of a chunk; what views of one model share is made once."""
 
     def __init__(self, experiment: KeypointNetExperiment) -> None:
-        self._experiment = experiment
+        self._options = {
+            name: getattr(experiment, name) for name in ("noise_px", "min_visible", "seed")
+        }
         self._model: tuple[str, str] | None = None
         self._hull = KeypointHull(np.empty((0, 3)))
         self._scene: Scene | None = None
@@ -255,73 +238,65 @@ class _Instances:
         """
         if task.problem:
             raise DataError(task.problem)
-        experiment = self._experiment
-        if self._model != (task.category, task.model_id):
-            self._model, self._scene = (task.category, task.model_id), None
+        names = task.category, task.model_id
+        if self._model != names:
+            self._model, self._scene = names, None
             self._hull = KeypointHull(task.xyz)
         if task.model is None:
             return make_hull_instance(
-                self._hull,
-                task.semantic_ids,
-                names=(task.category, task.model_id),
-                noise_px=experiment.noise_px,
-                min_visible=experiment.min_visible,
-                seed=experiment.seed,
-                view_index=task.view,
+                self._hull, task.semantic_ids, names=names, view_index=task.view, **self._options
             )
-        from cadalign.evaluation.instances.instance import load_scene
-
         self._scene = self._scene or load_scene(task.model)
-        return make_instance(
-            task.model,
-            noise_px=experiment.noise_px,
-            min_visible=experiment.min_visible,
-            seed=experiment.seed,
-            view_index=task.view,
-            scene=self._scene,
-        )
+        return make_instance(task.model, view_index=task.view, scene=self._scene, **self._options)
 
 
-def _projected(instance: Instance, estimate: Alignment) -> FloatArray:
-    """Where an estimate puts the keypoints [px]; also behind the camera, for the limit's sake."""
-    points = (instance.points_3d @ estimate.linear.T) + estimate.translation
-    return instance.camera.pixels_from_normalized(points[:, :2] / points[:, 2:])
+def _errors(
+    est: Alignment, instance: Instance, gt: Alignment, gt_box: Box
+) -> dict[str, float | None]:
+    """Errors of an estimate by column, from one of the truths that look the same."""
+    box = Box.from_model(instance.bounds, est)
+    return {
+        **alignment_errors(est=est, gt=gt, length=instance.diagonal),
+        "box_iou": overlap(est=box, gt=gt_box),
+    }
 
 
-def _known(instance: Instance) -> dict[str, Any]:
-    """What an outcome says of its instance."""
+def _rms(instance: Instance, est: Alignment) -> float:
+    """Root mean square residual [px]; also of the bound's estimates behind the camera."""
+    points = (instance.points_3d @ est.linear.T) + est.translation
+    pixels = instance.camera.pixels_from_normalized(points[:, :2] / points[:, 2:])
+    return float(np.sqrt(((pixels - instance.points_2d) ** 2).sum(axis=1).mean()))
+
+
+def _facts(task: KeypointTask, instance: Instance) -> Row:
+    """Columns that do not depend on the estimate."""
     _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
     return {
         "visibility": instance.visibility,
         "keypoints": len(instance.points_3d),
         "stretch_y": stretch_y,
         "stretch_z": stretch_z,
+        "symmetry": str(task.symmetry),
     }
+
+
+def _failure(
+    task: KeypointTask, method: str, reason: str, instance: Instance | None = None
+) -> Outcome:
+    known = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
+    if instance is not None:
+        known = _facts(task, instance)
+    return Outcome.failure(reason, task.names(method), **known)
 
 
 def _draw(folder: RunFolder, task: KeypointTask, instance: Instance, estimate: Alignment) -> None:
     from cadalign.evaluation.instances.drawing import draw_instance
 
+    names = {"category": task.category, "model_id": task.model_id}
     try:
-        draw_instance(
-            folder,
-            instance,
-            estimate,
-            category=task.category,
-            model_id=task.model_id,
-            view=task.view,
-        )
+        draw_instance(folder, instance, estimate, view=task.view, **names)
     except (OSError, DataError) as error:
         raise AbortError(
             f"the overlay cannot be written: {error}",
             fix="free some space, and start the same command again: the run goes on",
         ) from None
-
-
-def _add_seconds(outcome: Outcome, seconds: float) -> None:
-    object.__setattr__(outcome, "seconds", outcome.seconds + seconds)  # fresh, seen by nobody yet
-
-
-def _columns_of(names: Sequence[str]) -> Columns:
-    kinds = {field.name: str(field.type).split(" ")[0] for field in fields(Outcome)}
-    return tuple((name, _TYPES[kinds[name]]) for name in names)

@@ -12,15 +12,15 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError
-from cadalign.evaluation.instances.instance import HULL, RAYS
+from cadalign.evaluation.instances.instance import RAYS
 from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+from cadalign.evaluation.runs.tables import Row
 
 if TYPE_CHECKING:
     from cadalign.datasets import AnnotatedModel, KeypointNet
 
 AUTO = "auto"
 """Rays where there is a mesh, the hull's rule elsewhere."""
-VISIBILITIES = (AUTO, RAYS, HULL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class KeypointTask:
     model : AnnotatedModel, optional
         The model with its mesh; None where it is evaluated on its keypoints alone.
     problem : str
-        Why the model cannot be evaluated; empty otherwise.
+        Reason why the model cannot be evaluated; empty otherwise.
     """
 
     category: str
@@ -49,6 +49,15 @@ class KeypointTask:
     symmetry: SymmetryGroup
     model: AnnotatedModel | None = None
     problem: str = ""
+
+    def names(self, method: str) -> Row:
+        """The cells that name the row of a method."""
+        return {
+            "category": self.category,
+            "model_id": self.model_id,
+            "view": self.view,
+            "method": method,
+        }
 
     @classmethod
     def of_model(
@@ -83,10 +92,10 @@ class KeypointTasks(Sequence[KeypointTask]):
     ----------
     dataset : KeypointNet
     views : int
-        How many of each model.
+        Number of views of each model.
     visibility : {"auto", "rays", "hull"}
     max_models : int, optional
-        How many models of each category at most.
+        Largest number of models of each category.
 
     Raises
     ------
@@ -124,7 +133,7 @@ class KeypointTasks(Sequence[KeypointTask]):
         return replace(self._describe(place), view=view)
 
     def fingerprint(self) -> str:
-        """A hash of what is known of the models: a run must not go on with other annotations."""
+        """Hash of the annotations: a run must not go on with others."""
         digest = hashlib.sha256()
         for category, model_id in self._keys:
             digest.update(f"{category}\0{model_id}\0".encode())

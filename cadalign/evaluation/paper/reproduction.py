@@ -6,78 +6,43 @@ import csv
 import io
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
+from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.methods import LIMIT
-from cadalign.evaluation.accuracy.summary import ALL, CategorySummary
-from cadalign.evaluation.api import KeypointNetOptions, run_keypointnet, run_sweep, sweep_of
-from cadalign.evaluation.keypointnet.figures import write_keypointnet_report
+from cadalign.evaluation.api import run
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.keypointnet.spec import SPEC as KEYPOINTNET
+from cadalign.evaluation.keypointnet.summary import CategorySummary
+from cadalign.evaluation.paper.table import PAPER_TABLE, PERCENT_NOTE, STATED
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.simulation.experiment import SWEEPS
-from cadalign.evaluation.simulation.figures import write_sweep_report
+from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
+from cadalign.evaluation.simulation.spec import SPEC as SIMULATION
+from cadalign.evaluation.summary import ALL
 from cadalign.io.files import write_text, writing
 
-
-@dataclass(frozen=True)
-class PaperRow:
-    """A row of the paper's Table 1, as printed.
-
-    Parameters
-    ----------
-    rotation_error_deg, translation_error : float
-        Medians [degrees, model units].
-    scale_y_error, scale_z_error : float
-        What the paper's two last columns print under "%". By the numbers in its own source these
-        are fractions: 0.008 means 0.8 %.
-    keypoints : float
-        Mean number of keypoints.
-    """
-
-    rotation_error_deg: float
-    translation_error: float
-    scale_y_error: float
-    scale_z_error: float
-    keypoints: float
-
-
-PAPER_TABLE = {
-    "chair": PaperRow(0.998, 0.004, 0.008, 0.012, 7),
-    "bottle": PaperRow(7.004, 0.100, 0.089, 0.107, 7),
-    "car": PaperRow(1.599, 0.011, 0.029, 0.011, 10),
-    "vessel": PaperRow(4.592, 0.046, 0.063, 0.041, 7),
-}
-"""The paper's Table 1: 1 px noise."""
-PERCENT_NOTE = (
-    'The paper\'s columns s1 and s2 are headed "%", but by the numbers in its own source they are '
-    "fractions: 0.008 means 0.8 %. They are shown here as such, times 100."
-)
-_METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
+_METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
 
 
 @dataclass(frozen=True)
 class PaperPlan:
-    """What to run for the paper's tables and figures.
+    """Runs for the paper's tables and figures."""
 
-    Parameters
-    ----------
-    out : Path
-        The folder for everything.
-    root : Path, optional
-        A dataset in KeypointNet's layout, besides the sample dataset.
-    quick : bool
-        A pass of about two minutes, with fewer problems.
-    seed, workers : int
-    dask : str, optional
-    """
-
-    out: Path
+    out: Path = Path("paper")
+    """Folder to write to."""
     root: Path | None = None
+    """Dataset in KeypointNet's layout, besides the sample dataset."""
     quick: bool = False
+    """Few problems: about two minutes."""
     seed: int = 0
+    """Seed of everything random."""
     workers: int = -1
+    """Processes; -1 for all cores."""
     dask: str | None = None
+    """Address of a Dask scheduler to use instead."""
 
 
 Announce = Callable[[str], Callable[[Progress], object]]
@@ -90,7 +55,7 @@ def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda
     ----------
     plan : PaperPlan
     announce : callable
-        Told what is run next; gives what to tell the progress to.
+        Told the name of the next run; returns the function to tell its progress to.
 
     Returns
     -------
@@ -114,33 +79,32 @@ def _settings(plan: PaperPlan) -> str:
     return (
         f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
         "more figures, lies beside this file. Lines are medians, bands quartiles; the dashed line "
-        "is the Cramer-Rao limit, the least error that any unbiased method can have.\n"
+        "is the Cramer-Rao bound, the least error that any unbiased method can have.\n"
     )
 
 
 def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
     """Do one sweep and describe it."""
-    kind = sweep_of(name)
-    if plan.quick:
-        kind = replace(kind, runs=max(kind.runs // 25, 20))
+    runs = max(SWEEPS[name].runs // 25, 20) if plan.quick else None
+    options = SweepOptions(name, runs=runs, seed=plan.seed)
+    kind = options.kind
     folder = RunFolder(plan.out / f"simulate_{name}")
-    run_sweep(
-        kind,
+    run(
+        options,
         folder,
-        seed=plan.seed,
-        workers=1 if kind.is_timed else plan.workers,
+        workers=None if kind.is_timed else plan.workers,
         dask=None if kind.is_timed else plan.dask,
         on_progress=announce(f"simulation: {name}"),
     )
-    summaries = write_sweep_report(folder, kind)
-    metrics = list(dict.fromkeys(summary.metric for summary in summaries))
-    pictures = [f"{name}_{metric}" for metric in metrics[: 1 if kind.is_timed else None]]
+    summaries = SIMULATION.write(Run.open(folder.path))
+    keys = list(dict.fromkeys(summary.metric for summary in summaries))
+    pictures = [f"{name}_{key}" for key in keys[: 1 if kind.is_timed else None]]
     for picture in pictures:
         for ending in ("png", "pdf"):
             _copy(folder.figures / f"{picture}.{ending}", plan.out / "figures")
     head = ["", *kind.methods]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    shown = [summary for summary in summaries if summary.metric == metrics[0]]
+    shown = [summary for summary in summaries if summary.metric == keys[0]]
     for value in kind.values:
         cells = [f"{summary.median:.3g}" for summary in shown if summary.value == value]
         lines.append(f"| {value:g} | {' | '.join(cells)} |")
@@ -148,7 +112,7 @@ def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
     table = "\n".join(lines)
     return (
         f"## Simulation: {name}\n\n{images}\n\n"
-        f"Median {metrics[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
+        f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
         f"{table}\n"
     )
 
@@ -165,19 +129,17 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
     texts = []
     for name, (root, views) in roots.items():
         folder = RunFolder(plan.out / f"evaluate_{name}")
-        options = KeypointNetOptions(views_per_model=views, seed=plan.seed)
-        run_keypointnet(
-            root,
-            options,
+        run(
+            KeypointNetOptions(root, views_per_model=views, seed=plan.seed),
             folder,
             workers=plan.workers,
             dask=plan.dask,
             on_progress=announce(f"keypoints: {name}"),
         )
-        summaries = write_keypointnet_report(folder)
+        summaries = KEYPOINTNET.write(Run.open(folder.path))
         for metric in _METRICS:
             for ending in ("png", "pdf"):
-                source = folder.figures / f"categories_{metric}.{ending}"
+                source = folder.figures / f"categories_{metric.key}.{ending}"
                 _copy(source, plan.out / "figures", f"{name}_{source.name}")
         table = _table_rows(summaries)
         rows += [[name, *row] for row in table]
@@ -206,22 +168,14 @@ def _table_rows(summaries: Sequence[CategorySummary]) -> list[list[str]]:
         of_category = [summary for summary in summaries if summary.category == category]
         for summary in of_category:
             ratio = "-" if summary.over_limit != summary.over_limit else f"{summary.over_limit:.2f}"
-            name = "Cramer-Rao limit" if summary.method == LIMIT else summary.method
-            rows.append([category, name, *summary.cells()[:5], ratio])
+            name = "Cramer-Rao bound" if summary.method == LIMIT else summary.method
+            rows.append([category, name, *summary.texts()[:5], ratio])
         stated = PAPER_TABLE.get(category) if category != ALL else None
         if stated is not None:
-            rows.append(
-                [
-                    category,
-                    "AEPnP, stated in the paper",
-                    f"{stated.keypoints:.0f}",
-                    f"{stated.rotation_error_deg:.3f}",
-                    f"{stated.translation_error:.3f}",
-                    f"{100 * stated.scale_y_error:.1f}",
-                    f"{100 * stated.scale_z_error:.1f}",
-                    "",
-                ]
-            )
+            # With the digits that the paper prints.
+            errors = f"{stated.rotation_error_deg:.3f}", f"{stated.translation_error:.3f}"
+            scales = f"{100 * stated.scale_y_error:.1f}", f"{100 * stated.scale_z_error:.1f}"
+            rows.append([category, STATED, f"{stated.keypoints:.0f}", *errors, *scales, ""])
     return rows
 
 

@@ -5,49 +5,76 @@ view, and some of its visible keypoints are handed over with noise. Models whose
 same after stretch, to within 1 % of their extent and with the same set of keypoints, count as the
 true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
 it and all that count as it are taken out. All methods get the same keypoints.
+
+Columns of the result table, one row per query, protocol and method: what names the row
+(``category``, ``model_id``, ``noise_px``, ``keypoints``, ``protocol``, ``method``), ``status``,
+which is ``no view`` where there was nothing to ask, ``reason``, and then
+
+alike
+    Number of models that count as the true one, itself included.
+rank
+    Of the first of these, 1 for the best match; empty beyond 50, and in the leave-out protocol.
+matched_category, matched_id, score
+    The best match and its probability.
+shared, rms_px
+    Keypoints that it shares with the image, and their residuals [px].
+shape_distance
+    Of its keypoints from the true model's after stretch, as a share of their extent; empty for
+    another category.
+box_iou
+    Of its box with the true model's, both posed and stretched; empty for a model without volume.
+rotation_error_deg
+    [degrees]
 """
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.accuracy.outcome import FAILED
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.retrieval.outcome import (
-    LEAVE_IN,
-    LEAVE_OUT,
-    NO_VIEW,
-    RetrievalOutcome,
-)
-from cadalign.evaluation.retrieval.tasks import (
-    METHODS,
-    RetrievalEvaluation,
-    RetrievalTask,
-    observe_model,
-    retrieval_tasks,
-)
-from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress, execute, workers_of
-from cadalign.evaluation.runs.work import Columns, Result, reason_of
+from cadalign.evaluation.outcome import FAILED, Outcome, overlap, reason_of
+from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
+from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Rows
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import rotation_error
 from cadalign.retrieval.library import Library
+from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey
-from cadalign.retrieval.shape import SAME_SHAPE, distances
+from cadalign.retrieval.shape import SAME_SHAPE, distances, shape_distance
 
+NO_VIEW = "no view"
+"""Status of a model of which no view shows as many keypoints as are to be handed over."""
 TOP = 50
 """Ranks beyond this are not told apart."""
 _LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
-# Part of a run's configuration: another size would cut a half-done run into other chunks.
-_CHUNK = 16
+_UNIT_BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "optimal": {},
+    "optimal-unstretched": {"stretch": "none"},
+    "epnp": {"method": "epnp"},
+}
+"""Options of `cadalign.Library.retrieve` by method."""
+_NAMES: Columns = (
+    *(("category", str), ("model_id", str), ("noise_px", float), ("keypoints", int)),
+    *(("protocol", str), ("method", str)),
+)
+COLUMNS: Columns = (
+    *(*_NAMES, ("status", str), ("reason", str), ("alike", int), ("rank", int)),
+    *(("matched_category", str), ("matched_id", str), ("score", float), ("shared", int)),
+    *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
+    ("rotation_error_deg", float),
+)
 
 
 @dataclass(frozen=True)
@@ -58,21 +85,14 @@ class RetrievalExperiment:
     ----------
     library : str
         The library's file, which all workers map into memory.
-    options : RetrievalEvaluation
+    options : RetrievalRunOptions
     """
 
+    columns: ClassVar[Columns] = COLUMNS
+    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+
     library: str
-    options: RetrievalEvaluation
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table; see `RetrievalOutcome`."""
-        return RetrievalOutcome.columns()
-
-    @property
-    def timing_columns(self) -> Columns:
-        """What names the row, and the seconds of the retrieval."""
-        return (*RetrievalOutcome.columns()[:6], ("seconds", float))
+    options: RetrievalRunOptions
 
     def warm_up(self) -> None:
         """Compile the kernels."""
@@ -85,65 +105,112 @@ class RetrievalExperiment:
         pixels = KEYPOINT_CAMERA.project(pose.apply(models[0].xyz))
         Library.from_models(models).retrieve(pixels, np.arange(9), KEYPOINT_CAMERA)
 
-    def evaluate(self, tasks: Sequence[RetrievalTask]) -> Result:
+    def evaluate(self, tasks: Sequence[RetrievalTask]) -> Rows:
         """A row for every task, protocol and method."""
-        return Result.joined([self._evaluate_one(task) for task in tasks])
+        return Rows.of(outcome for task in tasks for outcome in self._outcomes(task))
 
-    def failure(self, task: RetrievalTask, reason: str) -> Result:
+    def failure(self, task: RetrievalTask, reason: str) -> Rows:
         """A failed row for every protocol and method."""
-        return self._without_match(task, FAILED, reason)
+        return Rows.of(self._without_match(task, FAILED, reason))
 
-    def _without_match(self, task: RetrievalTask, status: str, reason: str) -> Result:
-        outcomes = [
-            RetrievalOutcome(**asdict(task), protocol=p, method=m, status=status, reason=reason)
-            for p in self.options.protocols
-            for m in self.options.methods
+    def _without_match(self, task: RetrievalTask, status: str, reason: str) -> list[Outcome]:
+        return [
+            Outcome(task.names(protocol, method), dict(_NO_MATCH), status, reason)
+            for protocol in self.options.protocols
+            for method in self.options.methods
         ]
-        return Result(
-            [asdict(o) for o in outcomes], [{**o.key(), "seconds": None} for o in outcomes]
-        )
 
-    def _evaluate_one(self, task: RetrievalTask) -> Result:
-        library = _opened(self.library)
-        gt = library[task.category, task.model_id]
+    def _outcomes(self, task: RetrievalTask) -> list[Outcome]:
+        gt = _opened(self.library)[task.category, task.model_id]
         try:
             query = observe_model(gt, task, seed=self.options.seed)
         except DegenerateError as error:
             return self._without_match(task, NO_VIEW, str(error))
+        return [
+            self._outcome(task, query, gt, protocol, method)
+            for protocol in self.options.protocols
+            for method in self.options.methods
+        ]
+
+    def _outcome(
+        self,
+        task: RetrievalTask,
+        query: RetrievalQuery,
+        gt: LibraryModel,
+        protocol: str,
+        method: str,
+    ) -> Outcome:
+        library, names = _opened(self.library), task.names(protocol, method)
         alike = same_shapes(self.library, gt.key)
-        rows, timings = [], []
-        for protocol in self.options.protocols:
-            for method in self.options.methods:
-                labels = {**asdict(task), "protocol": protocol, "method": method}
-                start = time.perf_counter()
-                try:
-                    matches = library.retrieve(
-                        query.points_2d,
-                        query.semantic_ids,
-                        query.camera,
-                        top=TOP,
-                        category=None if self.options.whole_library else task.category,
-                        sigma=max(task.noise_px, _LEAST_SIGMA),
-                        shape_sigma=self._shape_sigma(protocol, method),
-                        exclude=alike if protocol == LEAVE_OUT else (),
-                        workers=1,
-                        **METHODS[method],
-                    )
-                    seconds: float | None = time.perf_counter() - start
-                    best = library[matches[0].category, matches[0].model_id]
-                    outcome = RetrievalOutcome.of_matches(
-                        matches, best=best, gt=gt, placed=query.gt, alike=alike, **labels
-                    )
-                except CadalignError as error:
-                    seconds = None
-                    outcome = RetrievalOutcome(**labels, status=FAILED, reason=reason_of(error))
-                rows.append(asdict(outcome))
-                timings.append({**outcome.key(), "seconds": seconds})
-        return Result(rows, timings)
+        start = time.perf_counter()
+        try:
+            matches = library.retrieve(
+                query.points_2d,
+                query.semantic_ids,
+                query.camera,
+                top=TOP,
+                category=None if self.options.whole_library else task.category,
+                sigma=max(task.noise_px, _LEAST_SIGMA),
+                shape_sigma=self._shape_sigma(protocol, method),
+                exclude=alike if protocol == LEAVE_OUT else (),
+                workers=1,
+                **_OPTIONS[method],
+            )
+            seconds = time.perf_counter() - start
+            best = library[matches[0].category, matches[0].model_id]
+            values = match_values(matches, best=best, gt=gt, placed=query.gt, alike=alike)
+        except CadalignError as error:
+            return Outcome.failure(reason_of(error), names, **_NO_MATCH)
+        return Outcome(names, values, seconds=seconds)
 
     def _shape_sigma(self, protocol: str, method: str) -> float:
         exact = protocol == LEAVE_IN and method == "optimal"
         return 0.0 if exact else self.options.shape_sigma
+
+
+_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
+
+
+def match_values(
+    matches: Sequence[Match],
+    *,
+    best: LibraryModel,
+    gt: LibraryModel,
+    placed: Alignment,
+    alike: Collection[ModelKey],
+) -> Row:
+    """Compare matches with the truth; metrics by column.
+
+    Parameters
+    ----------
+    matches : sequence of Match
+    best : LibraryModel
+        The model of the first match.
+    gt : LibraryModel
+        The true model.
+    placed : Alignment
+        Its pose and stretch.
+    alike : collection of (category, model id)
+        The models that count as the true one.
+    """
+    first = matches[0]
+    ranks = [
+        place
+        for place, match in enumerate(matches, start=1)
+        if (match.category, match.model_id) in alike
+    ]
+    return {
+        "alike": len(alike),
+        "rank": ranks[0] if ranks else None,
+        "matched_category": first.category,
+        "matched_id": first.model_id,
+        "score": first.score,
+        "shared": first.shared,
+        "rms_px": first.rms,
+        "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
+        "box_iou": overlap(est=first.box, gt=Box.from_model(gt.bounds, placed)),
+        "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+    }
 
 
 @lru_cache(maxsize=64)
@@ -173,73 +240,3 @@ def _by_keypoints(
         ids: ([model.key for model in models], np.array([model.xyz for model in models]))
         for ids, models in groups.items()
     }
-
-
-def run_retrieval(
-    root: str | os.PathLike[str],
-    options: RetrievalEvaluation,
-    folder: RunFolder,
-    *,
-    workers: int = -1,
-    dask: str | None = None,
-    on_progress: Callable[[Progress], object] = lambda progress: None,
-) -> None:
-    """Evaluate retrieval in a run's folder, or what is left of it.
-
-    Parameters
-    ----------
-    root : str or path-like
-        Folder in KeypointNet's layout, or a library's file.
-    options : RetrievalEvaluation
-    folder : RunFolder
-        Gets the library as ``library.cadalign``.
-    workers, dask
-        See `cadalign.evaluation.runs.run.workers_of`.
-    on_progress : callable
-        Told of every chunk.
-
-    Raises
-    ------
-    InputError
-        If a category is unknown.
-    DataError
-        If there are no models, or the folder holds another run.
-    """
-    library = _library_of(Path(root), options)
-    tasks = retrieval_tasks(library, options)
-    pool = workers_of(workers, dask=dask)
-    folder.make()
-    file = folder.path / "library.cadalign"
-    name = library.fingerprint[:16]
-    claimed = folder.read_config()
-    # One that no run.json speaks of is from a run that died before it began, perhaps another's; the
-    # library of another run, which is to be refused, stays as it is.
-    if claimed is None or claimed.get("library") == name:
-        library.save(file)
-    execute(
-        RetrievalExperiment(str(file.absolute()), options),
-        tasks,
-        folder,
-        config={
-            "experiment": "retrieval",
-            "root": str(Path(root).absolute()),
-            "library": name,
-            **asdict(options),
-        },
-        chunk_size=_CHUNK,
-        workers=pool,
-        on_progress=on_progress,
-    )
-
-
-def _library_of(root: Path, options: RetrievalEvaluation) -> Library:
-    """The library at a place, or one of the data set there."""
-    from cadalign.datasets import KeypointNet
-
-    if root.is_file():
-        return Library.open(root)
-    categories = None if options.whole_library else options.categories
-    return Library.from_dataset(KeypointNet(root), categories=categories)
-
-
-_UNIT_BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])

@@ -1,9 +1,9 @@
-"""The queries of the retrieval experiment: how to make them, which there are, what they hold."""
+"""Queries of the retrieval experiment: tasks, and views of stretched models."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
-from cadalign.evaluation.retrieval.outcome import PROTOCOLS
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng
@@ -20,87 +21,22 @@ if TYPE_CHECKING:
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.models import LibraryModel
 
-METHODS: dict[str, dict[str, Any]] = {
-    "optimal": {},
-    "optimal-unstretched": {"stretch": "none"},
-    "epnp": {"method": "epnp"},
-}
-"""What can be evaluated, with the options of `cadalign.Library.retrieve`."""
-
-
-@dataclass(frozen=True)
-class RetrievalEvaluation:
-    """How to evaluate retrieval.
-
-    Parameters
-    ----------
-    categories : tuple of str, optional
-        Of the models to find; by default all.
-    noises_px : tuple of float
-        Standard deviations of the keypoints' noise [px]; kept sorted.
-    keypoints : tuple of int
-        How many keypoints are handed over; kept sorted.
-    protocols : tuple of str
-        ``leave-in``, ``leave-out``.
-    methods : tuple of str
-        Names in `METHODS`.
-    whole_library : bool
-        Whether the category is to be found, too: the models of all categories are compared.
-    shape_sigma : float
-        Handed to `cadalign.Library.retrieve` where the right shape is not to be had: in the
-        leave-out protocol, and by methods that don't stretch.
-    max_models : int, optional
-        How many models of each category at most, evenly spread over their ids.
-    seed : int
-
-    Raises
-    ------
-    InputError
-        If a value is out of range or unknown.
-    """
-
-    categories: tuple[str, ...] | None = None
-    noises_px: tuple[float, ...] = (1.0, 3.0, 5.0)
-    keypoints: tuple[int, ...] = (6, 7, 8, 9, 10)
-    protocols: tuple[str, ...] = PROTOCOLS
-    methods: tuple[str, ...] = ("optimal", "epnp")
-    whole_library: bool = False
-    shape_sigma: float = 0.02
-    max_models: int | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, known in (("methods", tuple(METHODS)), ("protocols", PROTOCOLS)):
-            chosen = tuple(dict.fromkeys(getattr(self, name)))
-            object.__setattr__(self, name, chosen)
-            unknown = [value for value in chosen if value not in known]
-            if unknown or not chosen:
-                what = f"unknown: {unknown[0]!r}" if unknown else "none is given"
-                raise InputError(what, where=name, fix=f"known are {', '.join(known)}")
-        for name, least in (("noises_px", 0), ("keypoints", 4)):
-            values = tuple(sorted(set(getattr(self, name))))
-            object.__setattr__(self, name, values)
-            if not values:
-                raise InputError("none is given", where=name)
-            if not least <= values[0] or not values[-1] < np.inf:
-                raise InputError(f"{values[0]:g} is less than {least}", where=name)
-        for name, least in (("seed", 0), ("max_models", 1), ("shape_sigma", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{value} is less than {least}", where=name)
-
 
 @dataclass(frozen=True)
 class RetrievalTask:
-    """One view of one model, with so much noise and so many keypoints."""
+    """One view of one model, with a level of noise and a number of keypoints."""
 
     category: str
     model_id: str
     noise_px: float
     keypoints: int
 
+    def names(self, protocol: str, method: str) -> Row:
+        """The cells that name the row of a protocol and method."""
+        return {**asdict(self), "protocol": protocol, "method": method}
 
-def retrieval_tasks(library: Library, options: RetrievalEvaluation) -> list[RetrievalTask]:
+
+def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
     """Every model with every noise and number of keypoints that it has, those of a model together.
 
     Raises
@@ -133,7 +69,7 @@ def retrieval_tasks(library: Library, options: RetrievalEvaluation) -> list[Retr
 
 @dataclass(frozen=True, eq=False)
 class RetrievalQuery:
-    """What one image shows of a stretched model.
+    """View of a stretched model: a query to a library.
 
     Parameters
     ----------
@@ -154,7 +90,7 @@ class RetrievalQuery:
 def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> RetrievalQuery:
     """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
 
-    Everything random follows from the seed and the task. Which keypoints are seen follows from the
+    Everything random follows from the seed and the task. Visibility follows from the
     keypoints alone; see `cadalign.evaluation.instances.hull`.
 
     Raises

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.runs.parallel import Chunk, evaluate_on
-from cadalign.evaluation.runs.work import Experiment, Result
+from cadalign.evaluation.runs.work import Experiment, Rows
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ class DaskWorkers:
     address : str
         The scheduler's, such as ``tcp://10.0.0.1:8786``.
     timeout : float
-        How long to wait for the scheduler, and for its first worker [s].
+        Longest wait for the scheduler, and for its first worker [s].
     """
 
     address: str
@@ -35,7 +35,7 @@ class DaskWorkers:
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Result]]:
+    ) -> Iterator[tuple[Chunk[T], Rows]]:
         """See `cadalign.evaluation.runs.parallel.Workers`."""
         try:
             from distributed import Client, KilledWorker

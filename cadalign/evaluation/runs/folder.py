@@ -1,16 +1,16 @@
-"""The folder of a run: what is where, who may write there, and which run it holds.
+"""Folder of a run: its files, its lock, and its configuration.
 
 A run's folder::
 
     run.json          configuration and versions; the same command makes the same file
     results.parquet   one row per task and method; the same bytes however the run went
-    exhibits.parquet  what a report shows of a task besides its errors; the same bytes, too
+    exhibits.parquet  instance records: what a report shows of a task besides its errors
     timings.parquet   seconds of each row: differs from run to run
-    progress.json     how far it is, since when, on which host: differs, too
+    progress.json     progress, start and host: differs, too
     parts/            tables of finished chunks while the run is not finished
-    summary.csv, figures/             whatever the experiment makes of its results
+    summary.csv, figures/             summary of the results
     overlays/, thumbs/                instances with their boxes, large and small
-    pictures/, sketches/              instances without boxes, and their models in few triangles
+    pictures/, sketches/              instances without boxes, and previews of their models' meshes
     report.html                       all of it as one page
 """
 
@@ -34,6 +34,16 @@ _FORMAT = 2
 _FIX = "give another folder (--out), or remove this one"
 
 
+class _Inside:
+    """A file or folder inside a run's folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, folder: RunFolder, owner: type[RunFolder]) -> Path:
+        return folder.path / self._name
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """A run's folder.
@@ -45,74 +55,23 @@ class RunFolder:
 
     path: Path
 
-    @property
-    def config_file(self) -> Path:
-        """``run.json``"""
-        return self.path / "run.json"
-
-    @property
-    def results(self) -> Path:
-        """``results.parquet``; there once the run is finished."""
-        return self.path / "results.parquet"
-
-    @property
-    def timings(self) -> Path:
-        """``timings.parquet``"""
-        return self.path / "timings.parquet"
-
-    @property
-    def exhibits(self) -> Path:
-        """``exhibits.parquet``; not all experiments have one."""
-        return self.path / "exhibits.parquet"
-
-    @property
-    def progress(self) -> Path:
-        """``progress.json``"""
-        return self.path / "progress.json"
-
-    @property
-    def summary(self) -> Path:
-        """``summary.csv``"""
-        return self.path / "summary.csv"
-
-    @property
-    def figures(self) -> Path:
-        """``figures``"""
-        return self.path / "figures"
-
-    @property
-    def overlays(self) -> Path:
-        """``overlays``"""
-        return self.path / "overlays"
-
-    @property
-    def pictures(self) -> Path:
-        """``pictures``"""
-        return self.path / "pictures"
-
-    @property
-    def thumbs(self) -> Path:
-        """``thumbs``"""
-        return self.path / "thumbs"
-
-    @property
-    def sketches(self) -> Path:
-        """``sketches``"""
-        return self.path / "sketches"
-
-    @property
-    def report(self) -> Path:
-        """``report.html``"""
-        return self.path / "report.html"
-
-    @property
-    def parts(self) -> Path:
-        """``parts``"""
-        return self.path / "parts"
+    config_file = _Inside("run.json")
+    results = _Inside("results.parquet")
+    timings = _Inside("timings.parquet")
+    records = _Inside("exhibits.parquet")
+    progress = _Inside("progress.json")
+    summary = _Inside("summary.csv")
+    figures = _Inside("figures")
+    overlays = _Inside("overlays")
+    pictures = _Inside("pictures")
+    thumbs = _Inside("thumbs")
+    previews = _Inside("sketches")
+    report = _Inside("report.html")
+    parts = _Inside("parts")
 
     @property
     def is_finished(self) -> bool:
-        """Whether all results are there."""
+        """True once all results are there."""
         return self.results.is_file()
 
     def part(self, index: int) -> Path:
@@ -123,8 +82,8 @@ class RunFolder:
         """The timings of a chunk."""
         return self.parts / f"{index:07d}.timings.parquet"
 
-    def part_exhibits(self, index: int) -> Path:
-        """The exhibits of a chunk."""
+    def part_records(self, index: int) -> Path:
+        """The instance records of a chunk."""
         return self.parts / f"{index:07d}.exhibits.parquet"
 
     def make(self) -> None:
@@ -138,12 +97,19 @@ class RunFolder:
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
 
-    def make_for_pictures(self) -> None:
-        """Make the folder and those in it that pictures go to; see `make`."""
+    def made_for_pictures(self) -> RunFolder:
+        """Make the folder and those in it that pictures go to; returns it by its full path."""
         self.make()
-        for path in (self.overlays, self.thumbs, self.pictures, self.sketches):
+        for path in (self.overlays, self.thumbs, self.pictures, self.previews):
             with writing(path):
                 path.mkdir(exist_ok=True)
+        return RunFolder(self.path.absolute())
+
+    def made_figures(self) -> Path:
+        """Make the folder of figures; returns it."""
+        with writing(self.figures):
+            self.figures.mkdir(exist_ok=True)
+        return self.figures
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -166,7 +132,7 @@ class RunFolder:
             yield
 
     def read_config(self) -> dict[str, Any] | None:
-        """What ``run.json`` holds; None where there is none.
+        """Read ``run.json``; None where there is none.
 
         Raises
         ------
@@ -210,7 +176,7 @@ class RunFolder:
 
 
 def _versions() -> dict[str, Any]:
-    """What results depend on besides the configuration, to their last bits."""
+    """Versions that results depend on to their last bits."""
     return {
         "format": _FORMAT,
         "versions": {
@@ -223,7 +189,7 @@ def _versions() -> dict[str, Any]:
 
 
 def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
-    """Where two configurations differ, in words."""
+    """Differences of two configurations, as text."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         return [
             difference

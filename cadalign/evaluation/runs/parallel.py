@@ -10,6 +10,7 @@ rows.
 
 from __future__ import annotations
 
+import copy
 import os
 import threading
 import time
@@ -20,7 +21,8 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar, cast
 
 from cadalign.errors import CadalignError
-from cadalign.evaluation.runs.work import Experiment, Result, evaluate_chunk, reason_of
+from cadalign.evaluation.outcome import reason_of
+from cadalign.evaluation.runs.work import AbortError, Experiment, Rows
 
 T = TypeVar("T")
 
@@ -48,11 +50,11 @@ class Chunk(Generic[T]):
 
 
 class Workers(Protocol):
-    """Where chunks are evaluated."""
+    """Place where chunks are evaluated."""
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Result]]:
+    ) -> Iterator[tuple[Chunk[T], Rows]]:
         """Evaluate chunks; yields each with its result, in any order."""
 
 
@@ -61,7 +63,7 @@ class InProcess:
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Result]]:
+    ) -> Iterator[tuple[Chunk[T], Rows]]:
         """See `Workers.evaluate`."""
         for chunk in chunks:
             yield chunk, evaluate_chunk(experiment, chunk.tasks)
@@ -74,14 +76,14 @@ class LocalProcesses:
     Parameters
     ----------
     count : int
-        How many; -1 for as many as there are cores.
+        Number of them; -1 for one for each core.
     """
 
     count: int = -1
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Result]]:
+    ) -> Iterator[tuple[Chunk[T], Rows]]:
         """See `Workers.evaluate`."""
         from joblib import cpu_count
         from joblib.externals.loky import get_reusable_executor
@@ -129,7 +131,7 @@ def evaluate_on(
     *,
     window: int,
     deadly: tuple[type[BaseException], ...],
-) -> Iterator[tuple[Chunk[T], Result]]:
+) -> Iterator[tuple[Chunk[T], Rows]]:
     """Evaluate chunks on an executor.
 
     Parameters
@@ -140,14 +142,14 @@ def evaluate_on(
     chunks : iterable of Chunk
         Asked for only as fast as they are evaluated.
     window : int
-        How many chunks are under way at a time.
+        Number of chunks under way at a time.
     deadly : tuple of exception types
-        What a future raises whose worker has died.
+        Raised by a future whose worker has died.
 
     Yields
     ------
     chunk : Chunk
-    result : Result
+    rows : Rows
 
     Raises
     ------
@@ -156,7 +158,7 @@ def evaluate_on(
     """
     _check_life(executor, experiment, deadly)
     source = iter(chunks)
-    running: dict[Future[Result], Chunk[T]] = {}
+    running: dict[Future[Rows], Chunk[T]] = {}
     suspects: list[Chunk[T]] = []
     exhausted = False
     try:
@@ -203,7 +205,7 @@ def _alone(
     experiment: Experiment[T],
     tasks: Sequence[T],
     deadly: tuple[type[BaseException], ...],
-) -> Result:
+) -> Rows:
     """Evaluate tasks with nothing else under way, to find out which of them kills its worker."""
     for _ in range(_STRIKES if len(tasks) == 1 else 1):
         try:
@@ -214,7 +216,7 @@ def _alone(
         return experiment.failure(tasks[0], KILLED_REASON)
     middle = len(tasks) // 2
     halves = [tasks[:middle], tasks[middle:]]
-    return Result.joined([_alone(executor, experiment, half, deadly) for half in halves])
+    return Rows.joined([_alone(executor, experiment, half, deadly) for half in halves])
 
 
 def _check_life(
@@ -241,3 +243,21 @@ def _check_life(
             ) from error
         else:
             return
+
+
+def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
+    """Evaluate tasks; one that raises becomes failed rows and does not stop the others.
+
+    Raises
+    ------
+    AbortError
+        If the run cannot go on.
+    """
+    try:
+        return experiment.evaluate(tasks)
+    except AbortError as error:
+        raise copy.copy(error) from None
+    except Exception as error:
+        if len(tasks) == 1:
+            return experiment.failure(tasks[0], reason_of(error))
+    return Rows.joined([evaluate_chunk(experiment, [task]) for task in tasks])

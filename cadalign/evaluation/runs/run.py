@@ -6,8 +6,7 @@ the same whatever the number of workers, and their rows follow from the run's se
 names, so nothing in ``results.parquet`` tells how often the run was interrupted or who did the
 work.
 
-To evaluate something else, write an `Experiment` (``work.py``) and a sequence of tasks, and call
-`execute`.
+An experiment of one's own is a `Spec` (`cadalign.evaluation.registry`).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,8 +23,8 @@ from typing import Any, TypeVar
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, InProcess, LocalProcesses, Workers
-from cadalign.evaluation.runs.tables import read_table, write_rows, write_tables
-from cadalign.evaluation.runs.work import Columns, Exhibiting, Experiment
+from cadalign.evaluation.runs.tables import Columns, read_table, write_rows, write_tables
+from cadalign.evaluation.runs.work import Experiment, Plan, Recording
 from cadalign.io.files import write_json, writing
 
 T = TypeVar("T")
@@ -35,40 +34,28 @@ _PROGRESS_EVERY = 1.0  # seconds
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is.
-
-    Parameters
-    ----------
-    done, total : int
-        Tasks.
-    """
+    """Number of tasks that are done, and of all."""
 
     done: int
     total: int
 
 
+OnProgress = Callable[[Progress], object]
+
+
 def execute(
-    experiment: Experiment[T],
-    tasks: Sequence[T],
+    plan: Plan[T],
     folder: RunFolder,
     *,
-    config: dict[str, Any],
-    chunk_size: int,
     workers: Workers | None = None,
-    on_progress: Callable[[Progress], object] = lambda progress: None,
+    on_progress: OnProgress = lambda progress: None,
 ) -> None:
     """Do a run, or what is left of it.
 
     Parameters
     ----------
-    experiment : Experiment
-    tasks : sequence
-        In the order of the result table. Sliced, and only as far as chunks are handed out.
+    plan : Plan
     folder : RunFolder
-    config : dict
-        All that the results depend on, JSON; the run can only go on with the same.
-    chunk_size : int
-        How many tasks a worker gets at a time.
     workers : Workers, optional
         By default a process for each core.
     on_progress : callable
@@ -82,32 +69,31 @@ def execute(
         If workers cannot work.
     """
     folder.make()
+    total = len(plan.tasks)
     with folder.locked():
-        folder.claim({**config, "tasks": len(tasks), "chunk_size": chunk_size})
+        folder.claim({**plan.config, "tasks": total, "chunk_size": plan.chunk_size})
         _sweep(folder.path)
         if not folder.is_finished:
-            _do_chunks(
-                experiment, tasks, folder, chunk_size, workers or LocalProcesses(), on_progress
-            )
-            _assemble(experiment, folder, -(-len(tasks) // chunk_size))
-        on_progress(Progress(len(tasks), len(tasks)))
+            _do_chunks(plan, folder, workers or LocalProcesses(), on_progress)
+            _assemble(plan.experiment, folder, -(-total // plan.chunk_size))
+        on_progress(Progress(total, total))
         shutil.rmtree(folder.parts, ignore_errors=True)
 
 
 def workers_of(count: int, *, dask: str | None = None) -> Workers:
-    """The workers that the command line's options name.
+    """Choose workers by the command line's options.
 
     Parameters
     ----------
     count : int
         Processes; -1 for one for each core, 0 for none: all in this process.
     dask : str, optional
-        The address of a Dask scheduler, whose workers are used instead.
+        Address of a Dask scheduler, whose workers are used instead.
 
     Raises
     ------
     InputError
-        If the number is none.
+        If the number is less than -1.
     """
     if dask is not None:
         from cadalign.evaluation.runs.cluster import DaskWorkers
@@ -122,67 +108,53 @@ def workers_of(count: int, *, dask: str | None = None) -> Workers:
     return LocalProcesses(count) if count else InProcess()
 
 
-def _do_chunks(
-    experiment: Experiment[T],
-    tasks: Sequence[T],
-    folder: RunFolder,
-    chunk_size: int,
-    workers: Workers,
-    on_progress: Callable[[Progress], object],
-) -> None:
+def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:
     """Do the chunks that are not done."""
     with writing(folder.parts):
         folder.parts.mkdir(exist_ok=True)
         _sweep(folder.parts)
-    starts = range(0, len(tasks), chunk_size)
+    experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
+    starts = range(0, len(tasks), size)
     missing = [index for index in range(len(starts)) if not folder.part(index).is_file()]
-    done = len(tasks) - sum(min(chunk_size, len(tasks) - starts[index]) for index in missing)
-    diary = _Diary(folder, len(tasks), done)
+    done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
+    progress_file = _ProgressFile(folder, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
-    chunks = (Chunk(index, tasks[starts[index] : starts[index] + chunk_size]) for index in missing)
     if not missing:
         return
-    exhibited = _exhibit_columns(experiment)
-    for chunk, result in workers.evaluate(experiment, chunks):
+    chunks = (Chunk(index, tasks[starts[index] : starts[index] + size]) for index in missing)
+    recorded = _record_columns(experiment)
+    for chunk, found in workers.evaluate(experiment, chunks):
         # The results last: they say that the chunk is done.
-        write_rows(folder.part_timings(chunk.index), experiment.timing_columns, result.timings)
-        if exhibited:
-            write_rows(folder.part_exhibits(chunk.index), exhibited, result.exhibits)
-        write_rows(folder.part(chunk.index), experiment.columns, result.rows)
+        write_rows(folder.part_timings(chunk.index), experiment.timing_columns, found.timings)
+        if recorded:
+            write_rows(folder.part_records(chunk.index), recorded, found.records)
+        write_rows(folder.part(chunk.index), experiment.columns, found.rows)
         done += len(chunk.tasks)
-        diary.note(done)
+        progress_file.note(done)
         on_progress(Progress(done, len(tasks)))
-    diary.note(done, last=True)
+    progress_file.note(done, last=True)
 
 
 def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:
     """Make one table of the chunks' tables."""
-    write_tables(
-        folder.timings,
-        experiment.timing_columns,
-        (read_table(folder.part_timings(index)) for index in range(chunks)),
-    )
-    exhibited = _exhibit_columns(experiment)
-    if exhibited:
-        write_tables(
-            folder.exhibits,
-            exhibited,
-            (read_table(folder.part_exhibits(index)) for index in range(chunks)),
-        )
+
+    def assemble(path: Path, columns: Columns, part: Callable[[int], Path]) -> None:
+        write_tables(path, columns, (read_table(part(index)) for index in range(chunks)))
+
+    assemble(folder.timings, experiment.timing_columns, folder.part_timings)
+    recorded = _record_columns(experiment)
+    if recorded:
+        assemble(folder.records, recorded, folder.part_records)
     # The results last: they say that the run is finished.
-    write_tables(
-        folder.results,
-        experiment.columns,
-        (read_table(folder.part(index)) for index in range(chunks)),
-    )
+    assemble(folder.results, experiment.columns, folder.part)
 
 
-def _exhibit_columns(experiment: Experiment[Any]) -> Columns:
-    """The columns of an experiment's exhibits; none if it has no exhibits."""
-    return experiment.exhibit_columns if isinstance(experiment, Exhibiting) else ()
+def _record_columns(experiment: Experiment[Any]) -> Columns:
+    """The columns of an experiment's instance records; none if it keeps none."""
+    return experiment.record_columns if isinstance(experiment, Recording) else ()
 
 
-class _Diary:
+class _ProgressFile:
     """Keeps ``progress.json``."""
 
     def __init__(self, folder: RunFolder, total: int, done: int) -> None:
@@ -193,7 +165,7 @@ class _Diary:
         self._written = 0.0
 
     def note(self, done: int, *, last: bool = False) -> None:
-        """Write how far the run is, if it was not written just now."""
+        """Write the progress, if it was not written just now."""
         now = time.time()
         if not last and now - self._written < _PROGRESS_EVERY:
             return

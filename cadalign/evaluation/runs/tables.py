@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cadalign.errors import DataError
-from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.io.files import write_whole
+
+Row = dict[str, Any]
+"""Cells of a table by column; what is missing or None is an empty cell."""
+Columns = tuple[tuple[str, type], ...]
+"""Names of a table's columns and their types: str, int, float or bool."""
 
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 16

@@ -1,31 +1,28 @@
-"""What a run does: an experiment turns tasks into table rows, chunk by chunk.
+"""Experiments as the engine sees them: tasks become table rows, chunk by chunk.
 
-An experiment is a small picklable object; a task is whatever it needs to know of one instance,
-also picklable. Nothing here says on which machine or in which order chunks are handled, and an
-experiment must not let its rows depend on that: all randomness comes from the run's seed and the
-task's name (`cadalign.seeding.instance_rng`).
+An experiment is a small picklable object; a task is all that it needs to know of one instance, also
+picklable. Chunks are handled on any machine and in any order, and an experiment must not let its
+rows depend on that: all randomness comes from the run's seed and the task's name
+(`cadalign.seeding.instance_rng`).
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError
+from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.runs.tables import Columns, Row
 
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
-Row = dict[str, Any]
-Columns = tuple[tuple[str, type], ...]
-"""Names of a table's columns and their types: str, int, float or bool. Cells may be None."""
-
 
 @dataclass(frozen=True)
-class Result:
-    """The rows that came of some tasks.
+class Rows:
+    """Table rows of some tasks.
 
     Parameters
     ----------
@@ -33,26 +30,32 @@ class Result:
         Of the result table; the same in every run.
     timings : list of dict
         Of the table of what differs from run to run.
-    exhibits : list of dict
-        Of the table of what there is to see, for experiments that are `Exhibiting`.
+    records : list of dict
+        Of the table of instance records, for experiments that are `Recording`.
     """
 
     rows: list[Row]
     timings: list[Row]
-    exhibits: list[Row] = field(default_factory=list)
+    records: list[Row] = field(default_factory=list)
 
     @classmethod
-    def joined(cls, parts: Sequence[Result]) -> Result:
-        """Put results of successive tasks together."""
+    def of(cls, outcomes: Iterable[Outcome], records: Iterable[Row] = ()) -> Rows:
+        """The rows of outcomes."""
+        found = list(outcomes)
+        return cls([o.row() for o in found], [o.timing() for o in found], list(records))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """The rows of successive tasks."""
         return cls(
             [row for part in parts for row in part.rows],
             [row for part in parts for row in part.timings],
-            [row for part in parts for row in part.exhibits],
+            [row for part in parts for row in part.records],
         )
 
 
 class Experiment(Protocol[T_contra]):
-    """What a run needs to know to turn tasks into rows."""
+    """Interface by which a run turns tasks into rows."""
 
     @property
     def columns(self) -> Columns:
@@ -65,44 +68,43 @@ class Experiment(Protocol[T_contra]):
     def warm_up(self) -> None:
         """Compile, in one worker, what all workers will need; must not depend on tasks."""
 
-    def evaluate(self, tasks: Sequence[T_contra]) -> Result:
+    def evaluate(self, tasks: Sequence[T_contra]) -> Rows:
         """The rows of some tasks, in their order."""
 
-    def failure(self, task: T_contra, reason: str) -> Result:
+    def failure(self, task: T_contra, reason: str) -> Rows:
         """The rows of a task that could not be evaluated."""
 
 
 @runtime_checkable
-class Exhibiting(Protocol):
-    """An experiment that also records what there is to see of its tasks, the same in every run."""
+class Recording(Protocol):
+    """An experiment that also records its instances, the same in every run."""
 
     @property
-    def exhibit_columns(self) -> Columns:
-        """The columns of the table of exhibits."""
+    def record_columns(self) -> Columns:
+        """The columns of the table of instance records."""
+
+
+@dataclass(frozen=True)
+class Plan(Generic[T]):
+    """All that a run needs to be done.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    tasks : sequence
+        In the order of the result table. Sliced, and only as far as chunks are handed out.
+    config : dict
+        All that the results depend on, JSON; the run can only go on with the same.
+    chunk_size : int
+        How many tasks a worker gets at a time. Part of the configuration: another size would cut a
+        half-done run into other chunks.
+    """
+
+    experiment: Experiment[T]
+    tasks: Sequence[T]
+    config: dict[str, Any]
+    chunk_size: int = 64
 
 
 class AbortError(DataError):
-    """Something that no other instance would fare better with, such as a full disk."""
-
-
-def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Result:
-    """Evaluate tasks; one that raises becomes failed rows and does not stop the others.
-
-    Raises
-    ------
-    AbortError
-        If the run cannot go on.
-    """
-    try:
-        return experiment.evaluate(tasks)
-    except AbortError as error:
-        raise copy.copy(error) from None
-    except Exception as error:
-        if len(tasks) == 1:
-            return experiment.failure(tasks[0], reason_of(error))
-    return Result.joined([evaluate_chunk(experiment, [task]) for task in tasks])
-
-
-def reason_of(error: Exception) -> str:
-    """An error in one line; ours speak for themselves, others are named."""
-    return str(error) if isinstance(error, CadalignError) else f"{type(error).__name__}: {error}"
+    """A failure that would repeat with every other instance, such as a full disk."""

@@ -7,84 +7,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError
+from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, fit_batch_with, fit_with
-from cadalign.evaluation.accuracy.outcome import FAILED, OK
-from cadalign.evaluation.runs.work import Columns, Result, Row
+from cadalign.evaluation.outcome import Outcome, alignment_errors
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Rows
+from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 from cadalign.seeding import instance_rng
 
 _REPEATS = 5
-SWEEP_METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
-
-
-@dataclass(frozen=True)
-class SweepKind:
-    """What is varied, and what is held.
-
-    Parameters
-    ----------
-    name : str
-    column : str
-        The column of the result table that is varied.
-    values : tuple of float
-        Its values.
-    points : int
-    noise_px : float
-        [px]
-    outlier_share : float
-    methods : tuple of str
-    runs : int
-        Problems for each value.
-    """
-
-    name: str
-    column: str
-    values: tuple[float, ...]
-    points: int = 1024
-    noise_px: float = 2.0
-    outlier_share: float = 0.0
-    methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", LIMIT)
-    runs: int = 2000
-
-    @property
-    def is_timed(self) -> bool:
-        """Whether the running time is what it is about."""
-        return self.name == "runtime"
-
-
-SWEEPS = {
-    kind.name: kind
-    for kind in (
-        SweepKind("noise", "noise_px", (0.5, *(float(noise) for noise in range(1, 11)))),
-        SweepKind("points", "points", (6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024)),
-        SweepKind(
-            "outliers",
-            "outlier_share",
-            tuple(round(0.1 * tenth, 1) for tenth in range(8)),
-            points=100,
-            methods=("ransac-optimal", "ransac-aepnp", "optimal-cauchy", "optimal", LIMIT),
-            runs=500,
-        ),
-        SweepKind(
-            "runtime",
-            "points",
-            (6, 10, 20, 50, 100, 200, 500, 1024, 2048),
-            methods=("optimal", "aepnp", "aepnp-paper", "epnp"),
-            runs=100,
-        ),
-    )
-}
+ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)
+COLUMNS: Columns = (
+    *(("points", int), ("noise_px", float), ("outlier_share", float), ("run", int)),
+    *(("method", str), ("status", str), ("reason", str)),
+    *((metric.key, float) for metric in ERRORS),
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +42,7 @@ class SweepTask:
     Parameters
     ----------
     value : float
-        What is varied.
+        Value of the quantity that is varied.
     run : int
     """
 
@@ -136,45 +84,31 @@ class SweepExperiment:
     seed : int
     """
 
+    columns: ClassVar[Columns] = COLUMNS
+    # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
+    timing_columns: ClassVar[Columns] = (
+        *(("points", int), ("run", int), ("method", str), ("seconds", float)),
+    )
+
     kind: SweepKind
     seed: int = 0
-
-    @property
-    def columns(self) -> Columns:
-        """The columns of the result table."""
-        names: Columns = (
-            ("points", int),
-            ("noise_px", float),
-            ("outlier_share", float),
-            ("run", int),
-            ("method", str),
-            ("status", str),
-            ("reason", str),
-        )
-        return (*names, *((name, float) for name in SWEEP_METRICS))
-
-    @property
-    def timing_columns(self) -> Columns:
-        """The problem, the method, and its seconds: of one call where time is what is varied."""
-        return (("points", int), ("run", int), ("method", str), ("seconds", float))
 
     def warm_up(self) -> None:
         """Compile the solvers."""
         self.evaluate([SweepTask(self.kind.values[0], 0)])
 
-    def evaluate(self, tasks: Sequence[SweepTask]) -> Result:
+    def evaluate(self, tasks: Sequence[SweepTask]) -> Rows:
         """A row for every task and method."""
-        return Result.joined(
-            [part for _, some in groupby(tasks, _value) for part in self._evaluate_same(list(some))]
+        return Rows.of(
+            outcome
+            for _, some in groupby(tasks, lambda task: task.value)
+            for outcome in self._evaluate_same(list(some))
         )
 
-    def failure(self, task: SweepTask, reason: str) -> Result:
+    def failure(self, task: SweepTask, reason: str) -> Rows:
         """A failed row for every method."""
-        return Result.joined(
-            [
-                Result([self._failed(task, method, reason)], [self._timing(task, method, None)])
-                for method in self.kind.methods
-            ]
+        return Rows.of(
+            Outcome.failure(reason, self._names(task, method)) for method in self.kind.methods
         )
 
     def problem(self, task: SweepTask) -> Problem:
@@ -188,12 +122,12 @@ class SweepExperiment:
             outlier_share=setting["outlier_share"],
         )
 
-    def _evaluate_same(self, tasks: Sequence[SweepTask]) -> list[Result]:
-        """Tasks of one value: methods are told the standard deviation of the noise."""
+    def _evaluate_same(self, tasks: Sequence[SweepTask]) -> list[Outcome]:
+        """Outcomes of tasks of one value: methods are told the standard deviation of the noise."""
         problems = [self.problem(task) for task in tasks]
         sigma = self._setting(tasks[0])["noise_px"] or 1.0
         per_method = [self._run(method, tasks, problems, sigma) for method in self.kind.methods]
-        return [part for parts in zip(*per_method, strict=True) for part in parts]
+        return [outcome for outcomes in zip(*per_method, strict=True) for outcome in outcomes]
 
     def _setting(self, task: SweepTask) -> Row:
         """Points, noise and outliers of a task."""
@@ -205,53 +139,44 @@ class SweepExperiment:
 
     def _run(
         self, method: str, tasks: Sequence[SweepTask], problems: Sequence[Problem], sigma: float
-    ) -> list[Result]:
-        """One method's result for every task."""
+    ) -> list[Outcome]:
+        """One method's outcome of every task."""
         if self.kind.is_timed:
             timed = [_timed(method, problem, sigma) for problem in problems]
-            estimates: list[Alignment | CadalignError] = [estimate for estimate, _ in timed]
-            seconds: list[float | None] = [second for _, second in timed]
         else:
             start = time.perf_counter()
             estimates = _estimates(method, problems, sigma)
-            seconds = [(time.perf_counter() - start) / len(problems)] * len(problems)
+            share = (time.perf_counter() - start) / len(problems)
+            timed = [(estimate, share) for estimate in estimates]
         return [
-            Result([self._row(task, method, problem, est)], [self._timing(task, method, second)])
-            for task, problem, est, second in zip(tasks, problems, estimates, seconds, strict=True)
+            self._outcome(task, method, problem, est, seconds)
+            for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True)
         ]
 
-    def _row(
-        self, task: SweepTask, method: str, problem: Problem, est: Alignment | CadalignError
-    ) -> Row:
+    def _outcome(
+        self,
+        task: SweepTask,
+        method: str,
+        problem: Problem,
+        est: Alignment | CadalignError,
+        seconds: float | None,
+    ) -> Outcome:
+        names = self._names(task, method)
         if isinstance(est, CadalignError):
-            return self._failed(task, method, str(est))
-        gt = problem.alignment
-        _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
-        errors = (rotation_error(est=est, gt=gt), translation_error(est=est, gt=gt))
-        metrics = dict(zip(SWEEP_METRICS, (*errors, scale_y, scale_z), strict=True))
-        return {**self._names(task, method), "status": OK, "reason": "", **metrics}
-
-    def _failed(self, task: SweepTask, method: str, reason: str) -> Row:
-        return {**self._names(task, method), "status": FAILED, "reason": reason}
+            return replace(Outcome.failure(str(est), names), seconds=seconds)
+        errors = alignment_errors(est=est, gt=problem.alignment)
+        return Outcome(names, errors, seconds=seconds)
 
     def _names(self, task: SweepTask, method: str) -> Row:
         return {**self._setting(task), "run": task.run, "method": method}
-
-    def _timing(self, task: SweepTask, method: str, seconds: float | None) -> Row:
-        points = self._setting(task)["points"]
-        return {"points": points, "run": task.run, "method": method, "seconds": seconds}
-
-
-def _value(task: SweepTask) -> float:
-    return task.value
 
 
 def _estimates(
     method: str, problems: Sequence[Problem], sigma: float
 ) -> list[Alignment | CadalignError]:
-    """What a method makes of every problem."""
+    """A method's estimate of every problem."""
     if method == LIMIT:
-        return [_limit(problem) for problem in problems]
+        return [_bound(problem) for problem in problems]
     batch = fit_batch_with(
         method,
         [problem.points_3d for problem in problems],
@@ -267,7 +192,7 @@ def _timed(
 ) -> tuple[Alignment | CadalignError, float | None]:
     """An estimate, and the time of the quickest of some calls."""
     if method == LIMIT:
-        return _limit(problem), None
+        return _bound(problem), None
     best = np.inf
     try:
         for _ in range(_REPEATS):
@@ -281,42 +206,8 @@ def _timed(
     return result.alignment, best
 
 
-# What may be varied: a check, what it is, and what to give.
-_CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
-    "points": (
-        lambda value: value >= 4 and value == int(value),
-        "a number of points",
-        "give 4 or more",
-    ),
-    "noise_px": (lambda value: 0 <= value < np.inf, "a noise level", "give pixels, 0 or more"),
-    "outlier_share": (lambda value: 0 <= value < 1, "a share", "give 0 to 0.95"),
-}
-
-
-def check_values(kind: SweepKind) -> SweepKind:
-    """Return the sweep if its values make sense.
-
-    Raises
-    ------
-    InputError
-        If one does not.
-    """
-    if not kind.values:
-        raise InputError("none is given", where="values")
-    settings = {column: (getattr(kind, column),) for column in _CHECKS}
-    for column, values in {**settings, kind.column: kind.values}.items():
-        valid, what, fix = _CHECKS[column]
-        for value in values:
-            if not valid(value):
-                where = "values" if column == kind.column else column
-                raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
-    if kind.runs < 1:
-        raise InputError(f"{kind.runs} is not positive", where="runs")
-    return kind
-
-
-def _limit(problem: Problem) -> Alignment | CadalignError:
-    """The limit of an estimator that knows which observations are outliers."""
+def _bound(problem: Problem) -> Alignment | CadalignError:
+    """The bound of an estimator that knows the outliers."""
     kept = slice(None) if problem.outliers is None else ~problem.outliers
     try:
         return limit_estimate(

@@ -10,7 +10,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_bounds, focal_grid
-from cadalign.fitting.noise import Sigma, rays_of, whitening_of
+from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
 
 
@@ -87,8 +88,3 @@ def log_limits(camera: Camera, prior: FocalPrior | None) -> tuple[float, float]:
     if prior is not None:
         low, high = min(low, prior.focal), max(high, prior.focal)
     return math.log(low), math.log(high)
-
-
-def log_prior(prior: FocalPrior | None) -> tuple[float, float]:
-    """Mean and inverse variance of the focal length's logarithm; the weight 0 for none."""
-    return (0.0, 0.0) if prior is None else (math.log(prior.focal), prior.relative_sigma**-2)

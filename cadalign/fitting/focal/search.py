@@ -15,19 +15,16 @@ from cadalign.fitting.focal.grid import (
     focal_view,
     focal_views,
     log_limits,
-    log_prior,
 )
 from cadalign.fitting.focal.prior import focal_bounds
-from cadalign.fitting.noise import Sigma
-from cadalign.fitting.options import LOSSES, Options
+from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.batch import optimal_batch
+from cadalign.solvers.constants import DEGENERATE, NOT_FOUND, POSE_SIZE, TOO_FEW, UNKNOWNS
 from cadalign.solvers.focal import focal_covariance, linear_focal, refine_focal
-from cadalign.solvers.minimal import POSE_SIZE
-from cadalign.solvers.objective import UNKNOWNS, Objective
+from cadalign.solvers.objective import Objective
 from cadalign.solvers.optimal import MAX_MINIMA, has_collapsed, orthonormalize, uncenter
-from cadalign.solvers.status import DEGENERATE, NOT_FOUND, TOO_FEW
 
 _MOST_STARTS = 8
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
@@ -73,7 +70,7 @@ class _Task:
     points_2d: FloatArray
     camera: Camera
     sigma: Sigma | None
-    options: Options
+    options: FitOptions
     noise: float
 
     def objective(self, focal: float) -> Objective:
@@ -90,7 +87,7 @@ class _Task:
     @property
     def prior(self) -> tuple[float, float]:
         """Mean and inverse variance of the focal length's logarithm; the weight 0 for none."""
-        center, weight = log_prior(self.options.focal_prior)
+        center, weight = self.options.log_focal_prior
         return center, weight * self.noise**2
 
 
@@ -103,7 +100,7 @@ class _Minimum:
 
 def search_focal(
     problems: Problems,
-    options: Options,
+    options: FitOptions,
     points: FloatArray,
     sigmas: Sequence[Sigma] | None,
     errors: dict[int, CadalignError],
@@ -114,7 +111,7 @@ def search_focal(
     Parameters
     ----------
     problems : Problems
-    options : Options
+    options : FitOptions
     points : (n, 3) float
         Model points, the known axis first.
     sigmas : sequence of B, optional

@@ -1,0 +1,132 @@
+"""Opening of a session: photos, model, camera and keypoints are read and checked."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.annotate.document import Document, FocalChoice
+from cadalign.annotate.files import (
+    SAME_PLACE,
+    AnnotationFiles,
+    keypoints_file,
+    read_given_keypoints,
+    read_own_keypoints,
+)
+from cadalign.annotate.history import History
+from cadalign.annotate.intrinsics import intrinsics_of, read_camera
+from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.model import CadModel
+from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.session import PhotoState, Session
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+
+logger = logging.getLogger("cadalign")
+
+
+def open_session(
+    *,
+    image: Path,
+    model: Path,
+    observation: Path | None = None,
+    camera: Path | None = None,
+    keypoints: Path | None = None,
+    out: Path | None = None,
+) -> Session:
+    """Open an annotation session.
+
+    The parameters are the options of `cadalign annotate`.
+
+    Raises
+    ------
+    CadalignError
+        If a file is missing or malformed, or the arguments contradict each other.
+    """
+    paths = find_photos(image)
+    if observation is not None and (image.is_dir() or out is not None):
+        raise InputError(
+            "names the file of a single photo, but a folder is given too",
+            where="--observation",
+            fix="use --out for a folder of photos, and not both options",
+        )
+    photos = [Photo.open(paths[0])] if not image.is_dir() else _readable(paths)
+    photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
+    if observation is None:
+        files = _observation_files(photos, out or paths[0].parent)
+    else:
+        files = [observation]
+    folder = files[0].parent
+    given_camera = None if camera is None else read_camera(camera)
+    mesh = load_mesh(model)
+    cad = CadModel(mesh)
+    registry_file = keypoints_file(model, folder)
+    registry = _open_registry(
+        registry_file, keypoints or keypoints_file(model, model.parent), model, mesh
+    )
+    photo_states = [
+        _open_photo_state(photo, file, model, given_camera, registry, cad.diagonal)
+        for photo, file in zip(photos, files, strict=True)
+    ]
+    return Session(cad, registry, photo_states, registry_file)
+
+
+def _open_registry(own: Path, source: Path, model: Path, mesh: Mesh) -> KeypointRegistry:
+    """Read the keypoints given with the model and those of earlier sessions."""
+    came: tuple[ModelKeypoint, ...] = ()
+    if source != own and (source.exists() or source != keypoints_file(model, model.parent)):
+        came = read_given_keypoints(source, model, mesh)
+    registry = KeypointRegistry(came)
+    if own.exists():
+        low, high = mesh.bounds
+        before = read_own_keypoints(own, model, mesh)
+        registry.merge(before, tolerance=SAME_PLACE * float(np.linalg.norm(high - low)))
+    return registry
+
+
+def _open_photo_state(
+    photo: Photo,
+    file: Path,
+    model: Path,
+    camera: Camera | None,
+    registry: KeypointRegistry,
+    diagonal: float,
+) -> PhotoState:
+    files = AnnotationFiles(file, photo.path, model)
+    document, own = files.read(Document(), registry, diagonal)
+    if own is not None and not own.focal_known:
+        # The file leaves it to be estimated; the given camera's is kept for the user to choose.
+        intrinsics = intrinsics_of(photo, camera or own)
+        known = False
+    else:
+        intrinsics = intrinsics_of(photo, own or camera)
+        known = intrinsics.calibrated
+    document = document.choose_focal(FocalChoice(known=known))
+    return PhotoState(photo, files, intrinsics, History(document))
+
+
+def _readable(paths: list[Path]) -> list[Photo]:
+    """Open the files that are photos, with a warning about the others."""
+    photos = []
+    for path in paths:
+        try:
+            photos.append(Photo.open(path))
+        except DataError as error:
+            logger.warning("left out: %s", error)
+    if not photos:
+        raise DataError("none of the photos in this folder can be read", where=str(paths[0].parent))
+    return photos
+
+
+def _observation_files(photos: list[Photo], folder: Path) -> list[Path]:
+    """Name a file for each photo, with its suffix if two photos differ only in that."""
+    stems = [photo.path.stem for photo in photos]
+    return [
+        folder / f"{photo.path.name if stems.count(photo.path.stem) > 1 else photo.path.stem}.json"
+        for photo in photos
+    ]

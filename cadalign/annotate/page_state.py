@@ -1,0 +1,156 @@
+"""State of one photo as the page shows it, as plain data for JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from cadalign.annotate.actions import Outcome
+from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
+from cadalign.annotate.session import PhotoState, Session
+from cadalign.annotate.suggestion import Suggestion
+from cadalign.annotate.wireframe import box_lines
+from cadalign.arrays import FloatArray
+
+
+def page_state(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
+    """Collect everything that the page shows of a photo.
+
+    Parameters
+    ----------
+    session : Session
+    number : int
+        Number of the photo, counted from 0.
+    outcome : Outcome, optional
+        Outcome of the last action.
+
+    Raises
+    ------
+    InputError
+        If there is no such photo.
+    """
+    outcome = outcome or Outcome()
+    with session.lock:
+        state = session.photo_state(number)
+        live, suggestion = session.live(state)
+        return {
+            "image": _image(session, number, state),
+            "saved": {
+                "path": state.files.observation.name,
+                "at": state.saved_at,
+                "trouble": state.save_error,
+            },
+            "selected": outcome.selected,
+            "message": outcome.message,
+            "can_undo": state.history.can_undo,
+            "can_redo": state.history.can_redo,
+            "focal": _focal(state),
+            "pairs": _pairs(session, state, live),
+            "keypoints": _keypoints(session, state),
+            "alignment": _alignment(session, live),
+            "suggestion": _suggestion(session, suggestion),
+        }
+
+
+def _image(session: Session, number: int, state: PhotoState) -> dict[str, Any]:
+    photo = state.photo
+    return {
+        "number": number,
+        "count": len(session.photos),
+        "name": photo.path.name,
+        "width": photo.width,
+        "height": photo.height,
+        "model": state.files.model.name,
+    }
+
+
+def _focal(state: PhotoState) -> dict[str, Any]:
+    choice = state.document.focal
+    return {
+        "known": choice.known,
+        "pixels": round(state.intrinsics.with_focal(choice).fx, 2),
+        "typed": choice.pixels,
+        "note": state.intrinsics.note,
+    }
+
+
+def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
+    pairs, row = [], 0
+    for position, pair in enumerate(state.document.pairs, start=1):
+        entry: dict[str, Any] = {
+            "pair": pair.number,
+            "position": position,
+            "uv": pair.uv,
+            "keypoint": pair.keypoint,
+            "name": "" if pair.keypoint is None else session.registry[pair.keypoint].name,
+            "xyz": None,
+            "residual": None,
+            "off": None,
+        }
+        if pair.keypoint is not None:
+            entry["xyz"] = session.model.to_display(session.registry[pair.keypoint].xyz).tolist()
+        if pair.complete:
+            if live.result is not None:
+                entry["residual"] = _finite(live.result.residuals[row])
+                entry["off"] = live.outliers.get(row)
+            row += 1
+        pairs.append(entry)
+    return pairs
+
+
+def _keypoints(session: Session, state: PhotoState) -> list[dict[str, Any]]:
+    used = state.document.keypoints
+    return [
+        {
+            "keypoint": number,
+            "name": point.name,
+            "xyz": session.model.to_display(point.xyz).tolist(),
+            "used": number in used,
+        }
+        for number, point in session.registry
+    ]
+
+
+def _alignment(session: Session, live: LiveAlignment) -> dict[str, Any]:
+    result = live.result
+    if result is None:
+        return {"status": "none" if session.ready else "preparing", "message": live.message}
+    camera = result.camera
+    return {
+        "status": "done",
+        "message": "",
+        "facts": [asdict(fact) for fact in facts_of(live)],
+        "notes": notes_of(live),
+        "alignment": result.alignment.to_dict(),
+        "eye": session.model.to_display(result.alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
+        "focal": camera.fx,
+        "rms": result.rms,
+        "box": _flat(box_lines(session.model.scene.bounds, camera, result.alignment)),
+        "lines": _flat(session.wireframe.seen_in(camera, result.alignment)),
+    }
+
+
+def _suggestion(session: Session, suggestion: Suggestion | None) -> dict[str, Any] | None:
+    if suggestion is None:
+        return None
+    point = suggestion.point
+    name = point.name or "The marked corner"
+    return {
+        "keypoint": point.semantic_id,
+        "xyz": session.model.to_display(point.xyz).tolist(),
+        "uv": suggestion.uv,
+        "text": next_best_text(suggestion.next_best, name),
+    }
+
+
+def _finite(residual: FloatArray) -> list[float] | None:
+    return residual.tolist() if np.isfinite(residual).all() else None
+
+
+def _flat(lines: FloatArray) -> list[float]:
+    """Lines (k, 2, 2) as x1, y1, x2, y2, ... to a tenth of a pixel."""
+    inside = lines[(np.abs(lines) < 1e6).all(axis=(1, 2))]
+    return np.round(inside, 1).ravel().tolist()

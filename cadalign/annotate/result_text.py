@@ -1,0 +1,107 @@
+"""Alignment, standard deviations and next-best keypoint as text for the page."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.next_best import NextBest, unknown_name
+from cadalign.fitting.result import FitResult
+
+_ROTATIONS = 3
+_UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
+_UNDETERMINED = "not determined", "these pairs leave it open"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One row of the result: label, value, and a remark on the value."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
+    """Stretch, pose and residuals, with standard deviations scaled to the residuals."""
+    result = live.cautious
+    if result is None:
+        return ()
+    facts = [_stretch(result, axis) for axis in result.stretched_axes]
+    if result.std is not None:
+        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°"))
+    facts += [_distance(result), _focal(result)]
+    if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
+        note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
+        note = f"rms; the standard deviations above are {note}"
+        facts.append(Fact("Pairs agree to", f"{_short(result.rms)} px", note))
+    return tuple(facts)
+
+
+def notes_of(live: LiveAlignment) -> tuple[str, ...]:
+    """Assumptions, alternative alignments and warnings."""
+    result = live.cautious
+    if result is None:
+        return ()
+    notes = [live.message] if live.message else []
+    others = len(result.alternatives)
+    if others:
+        notes.append(
+            f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs as "
+            "well: one more pair tells them apart"
+        )
+    return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
+
+
+def next_best_text(next_best: NextBest, name: str) -> str:
+    """Name of the next-best keypoint, and the uncertainty that it would leave."""
+    factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
+    before, after = (_short(factor * std) + unit for std in (next_best.before, next_best.after))
+    unknown = unknown_name(next_best.unknown)
+    return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
+
+
+def _stretch(result: FitResult, axis: str) -> Fact:
+    value = float(result.alignment.scale["xyz".index(axis)])
+    label = f"Stretch along {axis}"
+    std = result.std
+    relative = 0.0 if std is None else std.scale["xyz".index(axis)]
+    if relative > _UNCERTAIN:
+        return Fact(label, *_UNDETERMINED)
+    percent = 100 * (value - 1)
+    if abs(percent) < 0.5:
+        note = "as long as the model"
+    else:
+        note = f"{abs(percent):.0f} % {'longer' if percent > 0 else 'shorter'} than the model"
+    uncertainty = f" ± {_short(value * relative)}" if std is not None else ""
+    if relative > 0 and abs(percent) < 100 * relative:
+        note = "the model's length lies within the standard deviation"
+    return Fact(label, f"{value:.3g}{uncertainty}", note)
+
+
+def _distance(result: FitResult) -> Fact:
+    translation = result.alignment.translation
+    distance = float(np.linalg.norm(translation))
+    if result.covariance is None or not distance > 0:
+        return Fact("Distance", f"{distance:.3g} model units")
+    along = translation / distance
+    std = math.sqrt(max(float(along @ result.covariance[3:6, 3:6] @ along), 0.0))
+    return Fact("Distance", f"{distance:.3g} ± {_short(std)}", "model units")
+
+
+def _focal(result: FitResult) -> Fact:
+    focal, covariance = result.camera.fx, result.covariance
+    if covariance is None or len(covariance) < 9:
+        return Fact("Focal length", f"{focal:.0f} px", "taken as known")
+    relative = math.sqrt(max(float(covariance[8, 8]), 0.0))
+    if relative > _UNCERTAIN:
+        return Fact("Focal length", *_UNDETERMINED)
+    return Fact("Focal length", f"{focal:.0f} ± {_short(focal * relative)} px", "estimated")
+
+
+def _short(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

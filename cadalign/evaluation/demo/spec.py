@@ -1,0 +1,120 @@
+"""The demonstration: stretched models aligned to pictures of the originals."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+from collections.abc import Sequence
+from typing import Any
+
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.errors import DataError
+from cadalign.evaluation import metrics
+from cadalign.evaluation.demo.options import DemoOptions
+from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
+from cadalign.evaluation.keypointnet.summary import TABLE, CategorySummary
+from cadalign.evaluation.keypointnet.tasks import KeypointTask
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.spec import Spec
+from cadalign.evaluation.summary import ALL, ConsoleTable
+from cadalign.io.files import write_text
+
+METHOD = "optimal"
+_LEAST_SAMPLE = 12  # models of each category of a sample dataset
+
+
+def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
+    """Plan one view of the first models with a mesh of every category.
+
+    Another demonstration in the folder is replaced, one that was interrupted goes on.
+
+    Raises
+    ------
+    DataError
+        If no model has a mesh.
+    """
+    root = options.root
+    if root is None:
+        folder.make()
+        least = max(options.per_category, _LEAST_SAMPLE)
+        root = write_sample_dataset(folder.path / "sample_dataset", per_category=least)
+    dataset = KeypointNet(root)
+    meshed = dataset.subset(categories=options.categories, with_mesh=True)
+    keys = [
+        key
+        for category in meshed.categories
+        for key in meshed.ids(category)[: options.per_category]
+    ]
+    if not keys:
+        raise DataError(
+            "none of the annotated models has a mesh",
+            where="root",
+            fix="put the meshes beside the annotations, or name the folder that holds both",
+        )
+    config = {
+        "experiment": options.experiment,
+        "root": str(dataset.root.absolute()),
+        "noise_px": options.noise_px,
+        "seed": options.seed,
+        "methods": [METHOD],
+        "models": ["/".join(key) for key in keys],
+    }
+    _clear(folder, config)
+    experiment = KeypointNetExperiment(
+        (METHOD,),
+        noise_px=options.noise_px,
+        seed=options.seed,
+        drawn_in=folder.made_for_pictures(),
+    )
+    tasks = [KeypointTask.of_model(dataset, *key) for key in keys]
+    return Plan(experiment, tasks, config, chunk_size=1)
+
+
+def _clear(folder: RunFolder, config: dict[str, Any]) -> None:
+    """Remove a demonstration that is finished or another one."""
+    found = folder.read_config()
+    if found is None or found.get("experiment") != config["experiment"]:
+        return
+    if not folder.is_finished and all(found.get(name) == config[name] for name in config):
+        return
+    for path in (folder.results, folder.timings, folder.records, folder.config_file):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder.parts, ignore_errors=True)
+
+
+def _table(run: Run, summaries: Sequence[CategorySummary]) -> ConsoleTable:
+    """Medians per category."""
+    counts = (metrics.INSTANCES, metrics.FAILED)
+    return ConsoleTable(
+        title="Medians per category",
+        labels=("category",),
+        heads=tuple(column.heading for column in (*counts, *TABLE)),
+        rows=[
+            (s.category, *(column.text(getattr(s, column.key)) for column in (*counts, *TABLE)))
+            for s in summaries
+            if s.category != ALL
+        ],
+        grouped=False,
+        wraps=True,
+    )
+
+
+def _write_csv(run: Run, summaries: Sequence[CategorySummary]) -> None:
+    """Write ``results.csv`` with all rows, the seed and the seconds."""
+    text = io.StringIO()
+    names = [*(name for name, _ in COLUMNS), "seed", "seconds"]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    seconds = run.timings["seconds"].to_pylist()
+    for row, time in zip(run.results.to_pylist(), seconds, strict=True):
+        writer.writerow({**row, "seed": run.config["seed"], "seconds": time})
+    write_text(run.folder.path / "results.csv", text.getvalue())
+
+
+SPEC = Spec(
+    options=DemoOptions, plan=plan, write_more=_write_csv, **{**ON_INSTANCES, "table": _table}
+)

@@ -1,0 +1,95 @@
+"""Specification of the KeypointNet experiment, and what it shares with others on instances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+from cadalign.datasets import KeypointNet
+from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.figures import draw_figures
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
+from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
+from cadalign.evaluation.metrics import INSTANCE_METRICS
+from cadalign.evaluation.paper.table import PERCENT_NOTE, paper_lines
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.spec import Reference, Spec, on_datasets
+
+_CHUNK, _CHUNK_DRAWN = 64, 8
+
+
+def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
+    """Plan a run over the views of a dataset's models."""
+    dataset = KeypointNet(options.root).subset(categories=options.categories, split=options.split)
+    tasks = KeypointTasks(
+        dataset,
+        views=options.views_per_model,
+        visibility=options.visibility,
+        max_models=options.max_models,
+    )
+    drawn = options.render == "overlay"
+    experiment = KeypointNetExperiment(
+        methods=options.methods,
+        noise_px=options.noise_px,
+        min_visible=options.min_visible,
+        seed=options.seed,
+        drawn_in=folder.made_for_pictures() if drawn else None,
+    )
+    config = {
+        **asdict(options),
+        "experiment": options.experiment,
+        "root": str(options.root.absolute()),
+        "annotations": tasks.fingerprint(),
+    }
+    return Plan(experiment, tasks, config, _CHUNK_DRAWN if drawn else _CHUNK)
+
+
+def describe(run: Run) -> str:
+    """Numbers of views, models and categories, the dataset and the noise."""
+    views, models = run.count("category", "model_id", "view"), run.count("category", "model_id")
+    categories = run.count("category")
+    view_words = "" if views == models else f"{views:,} views of "
+    model_words = "1 model" if models == 1 else f"{models:,} models"
+    category_words = "1 category" if categories == 1 else f"{categories:,} categories"
+    noise = f"{run.noise_px or 0:g} px of noise"
+    return f"on {view_words}{model_words} in {category_words} of {run.dataset}, {noise}"
+
+
+def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
+    """The paper's numbers on the same categories; all of them are about 1 px of noise."""
+    if 1.0 not in {run.noise_px for run in runs}:
+        return Reference()
+    stated = tuple(line for line in paper_lines() if line.group in groups)
+    return Reference(stated, f"{PERCENT_NOTE} Its models and views are others." if stated else "")
+
+
+ON_INSTANCES: dict[str, Any] = {
+    "columns": HEADLINE,
+    "summarize": summarize,
+    "lines": lines,
+    "table": console_table,
+    "metrics": INSTANCE_METRICS,
+    "kind": lambda run: "views of models",
+    "title": partial(on_datasets, "alignment"),
+    "describe": describe,
+    "about": (
+        "Each picture shows a model as it is; methods get its visible keypoints, with noise, and "
+        "the model stretched by unknown factors along y and z. Green is the truth, red the "
+        "prediction."
+    ),
+    "note": (
+        "Medians over the instances that did not fail; the rates count failures. The "
+        "symmetry-aware error (sym.) takes rotations that map a model onto itself for right. A "
+        "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
+        "model and both scales are that good."
+    ),
+    "reference": reference,
+}
+"""Members of the specification of every experiment on views of models."""
+
+SPEC = Spec(options=KeypointNetOptions, plan=plan, write_more=draw_figures, **ON_INSTANCES)

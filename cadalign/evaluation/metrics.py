@@ -1,0 +1,183 @@
+"""The table of metrics: name, label, unit and direction of every number that experiments report.
+
+Result tables, figures, pages, Markdown, CSV, LaTeX and the console all read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+LOW, HIGH = "low", "high"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number of a result table or of a summary.
+
+    Parameters
+    ----------
+    key : str
+        Name of the column or field.
+    label : str
+        Name in figures and on pages.
+    unit : str
+        Empty for pure numbers.
+    digits : int
+        Shown after the point.
+    better : {"low", "high"}, optional
+        Direction; None for what is no quality, such as a count.
+    factor : float
+        Shown is the value times this.
+    head : str
+        Name at the head of tables; the label by default.
+    symbol : str
+        Name, with unit, at the head of the console's narrow tables; the head by default.
+    log : bool
+        Best seen on a logarithmic axis.
+    limit : float
+        End of cumulative curves, as shown.
+    """
+
+    key: str
+    label: str
+    unit: str = ""
+    digits: int = 2
+    better: str | None = LOW
+    factor: float = 1.0
+    head: str = ""
+    symbol: str = ""
+    log: bool = True
+    limit: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "head", self.head or self.label)
+        object.__setattr__(self, "symbol", self.symbol or self.head)
+
+    @property
+    def axis(self) -> str:
+        """Label with unit."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    @property
+    def heading(self) -> str:
+        """Head with unit."""
+        return f"{self.head} [{self.unit}]" if self.unit else self.head
+
+    def shown(self, value: Any) -> float | None:
+        """Convert a value to the unit; None for what is missing or not finite."""
+        return None if value is None or not np.isfinite(value) else self.factor * value
+
+    def text(self, value: Any) -> str:
+        """Format a value in the unit, rounded; a dash for what is missing or not finite."""
+        shown = self.shown(value)
+        return "-" if shown is None else f"{shown:.{self.digits}f}"
+
+    def page(self) -> dict[str, Any]:
+        """The metric for the page."""
+        names = ("key", "label", "unit", "factor", "digits", "better", "log", "limit")
+        return {name: getattr(self, name) for name in names}
+
+    def column(self) -> dict[str, Any]:
+        """The metric as a column of the page's headline table, whose cells are as shown."""
+        rest = {name: getattr(self, name) for name in ("unit", "digits", "better")}
+        return {"key": self.key, "label": self.head, **rest}
+
+
+INSTANCES = Metric("instances", "instances", digits=0, better=None, symbol="n")
+FAILED = Metric("failed", "failed", digits=0, better=None)
+KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
+
+ROTATION = Metric(
+    "rotation_error_deg", "rotation error", "deg", 3, head="R error", symbol="R deg", limit=20.0
+)
+TRANSLATION = Metric(
+    "translation_error", "translation error", "diagonals", 4, head="t error", symbol="t", limit=0.2
+)
+"""In diagonals of the model's bounding box."""
+TRANSLATION_IN_UNITS = replace(TRANSLATION, unit="model units")
+"""Of models that have no bounding box: the simulation's random points."""
+TRANSLATION_OF_DISTANCE = replace(
+    TRANSLATION, unit="% of distance", digits=2, factor=100.0, symbol="t %"
+)
+"""Over the distance from the camera to the mean of the points."""
+SCALE_Y = Metric(
+    "scale_y_error", "error of s_y", "%", factor=100.0, head="s_y error", symbol="s_y %", limit=20.0
+)
+SCALE_Z = replace(
+    SCALE_Y, key="scale_z_error", label="error of s_z", head="s_z error", symbol="s_z %"
+)
+BOX_IOU = Metric("box_iou", "box IoU", digits=3, better=HIGH, symbol="IoU", log=False)
+RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
+
+# From the nearest truth that looks the same.
+SYM_ROTATION = replace(
+    ROTATION,
+    key="sym_rotation_error_deg",
+    label="rotation error, symmetry-aware",
+    head="R error, sym.",
+    symbol="R deg*",
+)
+SYM_TRANSLATION = replace(
+    TRANSLATION, key="sym_translation_error", label="translation error, symmetry-aware"
+)
+SYM_BOX_IOU = replace(BOX_IOU, key="sym_box_iou", label="box IoU, symmetry-aware")
+
+_RATE = Metric("", "", "%", 1, better=HIGH, factor=100.0, log=False)
+SUCCESS = replace(_RATE, key="success", label="success", head="success", symbol="succ%")
+SUCCESS_5 = replace(
+    _RATE,
+    key="success_5deg_5pct",
+    label="within 5 deg, 5 %",
+    head="within 5 deg, 5 %",
+    symbol="5/5 %*",
+)
+SUCCESS_10 = replace(
+    _RATE, key="success_10deg_10pct", label="within 10 deg, 10 %", head="within 10 deg, 10 %"
+)
+OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
+INLIER_RECALL = replace(
+    _RATE, key="inlier_recall", label="inliers kept", head="inliers kept", symbol="found%"
+)
+
+RANK_1 = replace(
+    _RATE, key="rank_1", label="true model first", head="true model first", symbol="first%"
+)
+RANK_5 = replace(
+    _RATE,
+    key="rank_5",
+    label="true model among the first 5",
+    head="among the first 5",
+    symbol="top5%",
+)
+RECIPROCAL_RANK = Metric(
+    "reciprocal_rank", "mean reciprocal rank", digits=3, better=HIGH, symbol="MRR", log=False
+)
+SCORE = replace(_RATE, key="score", label="score", head="score", symbol="score%", better=None)
+SHAPE_DISTANCE = Metric(
+    "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
+)
+MATCH_ROTATION = replace(ROTATION, digits=2)
+"""Of the best match, which is another object as a rule."""
+
+MILLISECONDS = Metric("milliseconds", "time of one call", "ms", symbol="ms")
+QUERY_MILLISECONDS = replace(
+    MILLISECONDS, label="time of a query", head="time of a query", digits=1
+)
+MICROSECONDS = Metric("microseconds", "time of one call", "µs", digits=1)
+
+# What tasks are grouped by.
+CATEGORY = Metric("category", "category", better=None)
+QUERIES = replace(CATEGORY, label="queries", head="queries")
+OUTLIERS = Metric("outliers", "outliers", "%", better=None, factor=100.0, symbol="outl", log=False)
+OUTLIER_SHARE = replace(OUTLIERS, key="outlier_share")
+NOISE = Metric("noise_px", "noise of the keypoints", "px", better=None, log=False)
+POINTS = Metric("points", "number of points", better=None)
+
+INSTANCE_METRICS = (
+    *(ROTATION, TRANSLATION, SCALE_Y, SCALE_Z, BOX_IOU),
+    *(SYM_ROTATION, SYM_TRANSLATION, SYM_BOX_IOU, RMS),
+)
+"""Columns of runs over views of models."""

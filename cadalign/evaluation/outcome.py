@@ -1,0 +1,94 @@
+"""Outcome of one task with one method: a row of a result table, or the reason of its failure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from cadalign.errors import CadalignError, InputError
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import box_iou, rotation_error, scale_error, translation_error
+
+OK = "ok"
+FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one method reached on one task.
+
+    Parameters
+    ----------
+    names : dict
+        Columns that name the row, such as category, model id and method.
+    values : dict
+        Columns of facts and metrics, as far as they are known.
+    status : str
+        ``ok``, ``failed``, or another one of the experiment's own.
+    reason : str
+        Why it is not ok; empty otherwise.
+    seconds : float, optional
+        Time taken; not part of a result table, since no two runs agree on it.
+    """
+
+    names: Row
+    values: Row = field(default_factory=dict)
+    status: str = OK
+    reason: str = ""
+    seconds: float | None = None
+
+    @classmethod
+    def failure(cls, reason: str, names: Row, **values: Any) -> Outcome:
+        """A failed task; ``values`` are the columns that are known of it all the same."""
+        return cls(names, values, FAILED, reason)
+
+    @property
+    def is_ok(self) -> bool:
+        """True where there are metrics."""
+        return self.status == OK
+
+    def row(self) -> Row:
+        """The row of the result table."""
+        return {**self.names, "status": self.status, "reason": self.reason, **self.values}
+
+    def timing(self) -> Row:
+        """The row of the table of timings."""
+        return {**self.names, "seconds": self.seconds}
+
+    def after(self, seconds: float) -> Outcome:
+        """The same outcome, with more time taken."""
+        return replace(self, seconds=(self.seconds or 0.0) + seconds)
+
+
+def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
+    """Errors of pose and stretch by column.
+
+    Parameters
+    ----------
+    est, gt : Alignment
+    length : float
+        Unit of the translation error [model units]: the diagonal of the model's bounding box,
+        for example.
+    """
+    _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
+    return {
+        "rotation_error_deg": rotation_error(est=est, gt=gt),
+        "translation_error": translation_error(est=est, gt=gt) / length,
+        "scale_y_error": scale_y,
+        "scale_z_error": scale_z,
+    }
+
+
+def overlap(*, est: Box, gt: Box) -> float | None:
+    """Intersection over union of two boxes; None where one has no volume."""
+    try:
+        return box_iou(est=est, gt=gt)
+    except InputError:
+        return None
+
+
+def reason_of(error: Exception) -> str:
+    """An error in one line; ours speak for themselves, others are named."""
+    return str(error) if isinstance(error, CadalignError) else f"{type(error).__name__}: {error}"

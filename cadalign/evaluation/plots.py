@@ -1,0 +1,206 @@
+"""Lines with quartile bands: plots of a report's page, and the same as figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
+from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.summary import Quartiles
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+QUARTILES_NOTE = "line: median, band: quartiles"
+_DIGITS = 6
+_DASHES = ("-", "--", ":", "-.")
+# Of lines and markers [points].
+_THINNEST, _SMALLEST, _STEP = 1.5, 4.5, 0.35
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A line of a plot, in the units of its axes.
+
+    Parameters
+    ----------
+    run : int
+        Place of the run among those that are compared.
+    method : str
+    x, y : list of float
+        None where there is no value.
+    low, high : list of float, optional
+        Ends of a band.
+    """
+
+    run: int
+    method: str
+    x: list[float]
+    y: list[float | None]
+    low: list[float | None] | None = None
+    high: list[float | None] | None = None
+
+    @classmethod
+    def of(
+        cls, run: int, method: str, x: Sequence[float], y: Sequence[float | Quartiles], unit: Metric
+    ) -> Trace:
+        """A line through values, or through medians with quartiles as its band."""
+        quartiles = [q for q in y if isinstance(q, Quartiles)]
+        if not quartiles:
+            return cls(run, method, list(x), compact([unit.shown(value) for value in y]))
+        middle, low, high = (
+            compact([unit.shown(getattr(q, name)) for q in quartiles])
+            for name in ("median", "lower", "upper")
+        )
+        return cls(run, method, list(x), middle, low, high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The line for the page."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot of lines.
+
+    Parameters
+    ----------
+    id : str
+    x, y : Metric
+        The axes.
+    traces : list of Trace
+    note : str
+    caption : str
+        What is held, and the number of problems; for the figure.
+    figure : str
+        Name of the figure; plots of the same name are drawn into one.
+    variant : str
+        What sets it apart from others in the same figure.
+    title : str
+        By default made of the axes' labels.
+    """
+
+    id: str
+    x: Metric
+    y: Metric
+    traces: list[Trace]
+    note: str = ""
+    caption: str = ""
+    figure: str = ""
+    variant: str = ""
+    title: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The plot for the page."""
+        axes = {
+            name: {key: axis.page()[key] for key in ("label", "unit", "log")}
+            for name, axis in (("x", self.x), ("y", self.y))
+        }
+        title = self.title or f"{self.y.label} against {self.x.label}"
+        return {
+            "id": self.id,
+            "title": f"{title[0].upper()}{title[1:]}",
+            "kind": "lines",
+            **axes,
+            "traces": [trace.to_dict() for trace in self.traces],
+            "note": self.note,
+        }
+
+
+def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None]:
+    """Numbers with 6 digits; None for what is not finite.
+
+    Examples
+    --------
+    >>> compact([1 / 3, float("nan"), 2.0])
+    [0.333333, None, 2.0]
+    """
+    numbers = np.asarray(values, dtype=float).tolist()
+    return [float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in numbers]
+
+
+def draw_plots(folder: Path, plots: Sequence[Plot]) -> list[Path]:
+    """Draw plots of one run into a folder, PNG and PDF; those with the same figure into one."""
+    files = []
+    for name in dict.fromkeys(plot.figure or plot.id for plot in plots):
+        files += draw_plot(
+            folder / name, [plot for plot in plots if (plot.figure or plot.id) == name]
+        )
+    return files
+
+
+def draw_plot(path: Path, plots: Sequence[Plot]) -> list[Path]:
+    """Draw plots with the same axes into one figure, PNG and PDF; ``path`` has no ending.
+
+    A line ends where there is no value, and a band without an upper end goes to the top.
+    """
+    x, y = plots[0].x, plots[0].y
+    with new_figure(figsize=(6.4, 4.2)) as figure:
+        axes = figure.add_subplot()
+        bands = [
+            band
+            for plot, dash in zip(plots, _DASHES * len(plots), strict=False)
+            for band in _draw_lines(axes, plot, dash)
+        ]
+        if y.log:
+            axes.set_yscale("log")
+        elif y.unit == "%":
+            axes.set_ylim(-3, max(103, axes.get_ylim()[1]))
+        bottom, top = axes.get_ylim()
+        for places, low, high, color in bands:
+            above = np.where(np.isnan(high) & ~np.isnan(low), top, high)
+            axes.fill_between(places, low, above, color=color, alpha=0.14, linewidth=0)
+        axes.set_ylim(bottom, top)
+        ticks = sorted({round(value, 6) for plot in plots for t in plot.traces for value in t.x})
+        if x.log:
+            axes.set_xscale("log")
+        axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
+        axes.minorticks_off()
+        axes.tick_params(axis="x", labelrotation=45 if len(ticks) > 9 else 0)
+        if y.log:
+            label_log_axis(axes)
+        axes.set_xlabel(in_math(x.axis))
+        axes.set_ylabel(in_math(y.axis))
+        caption = plots[0].caption or plots[0].note
+        axes.set_title(caption, fontsize=9, color="0.35", loc="left")
+        figure.legend(loc="outside lower center", ncols=2, handlelength=3.6)
+        return save_figure(figure, path)
+
+
+def in_math(label: str) -> str:
+    """A label with its indices set as such."""
+    return re.sub(r"\bs_([yz])\b", r"$s_\1$", label)
+
+
+def _draw_lines(axes: Axes, plot: Plot, dash: str) -> list[tuple[Any, Any, Any, str]]:
+    """Draw lines, thinner ones last, since they often coincide; returns their bands."""
+    bands = []
+    for place, trace in enumerate(plot.traces):
+        look = look_of(trace.method)
+        middle = np.array(trace.y, dtype=float)
+        if not np.isfinite(middle).any():
+            continue
+        below = len(plot.traces) - 1 - place
+        axes.plot(
+            trace.x,
+            middle,
+            color=look.color,
+            linestyle=dash if plot.variant else look.dash,
+            marker=look.marker,
+            label=f"{look.label}, {plot.variant}" if plot.variant else look.label,
+            linewidth=_THINNEST + _STEP * below,
+            markersize=_SMALLEST + 2 * _STEP * below,
+        )
+        # The Cramer-Rao bound, without markers, is a floor whose band would hide the others.
+        if trace.low is not None and trace.high is not None and look.marker:
+            low, high = (np.array(end, dtype=float) for end in (trace.low, trace.high))
+            axes.plot(trace.x, low, trace.x, high, alpha=0)  # make room for the band
+            bands.append((trace.x, low, high, look.color))
+    return bands

@@ -1,0 +1,141 @@
+"""Specification of an experiment: all that command line, report and `evaluate show` know of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cadalign.evaluation.metrics import CATEGORY, Metric
+from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.plots import Plot, draw_plots
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.summary import Conclusion, ConsoleTable, Line, summary_csv
+from cadalign.io.files import write_text
+
+Summaries = Sequence[Any]
+"""Summaries of one experiment, each with a method ``cells()``."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Published numbers beside a headline table, and a note on them."""
+
+    lines: tuple[Line, ...] = ()
+    note: str = ""
+
+
+def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
+    statuses = run.results["status"].to_pylist()
+    return Conclusion(len(statuses), statuses.count(FAILED))
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Specification of an experiment.
+
+    Parameters
+    ----------
+    options : type
+        A frozen dataclass derived from `ExperimentOptions`, which names the experiment; at once
+        keywords of the API, flags of the command line and configuration of the run.
+    plan : callable
+        Makes the plan of a run from its options and its folder, in which it may put files.
+    columns : tuple of Metric
+        Columns of the headline table; those are left out that no line has a value of.
+    summarize : callable
+        Makes summaries of a run, finished or not; see `cadalign.evaluation.summary.medians`.
+    lines : callable
+        Makes lines of the headline table from summaries; by default they are such lines.
+    table : callable, optional
+        Makes the table for the console of a run and its summaries; by default the headline table.
+    group : callable
+        The column that a run's tasks are grouped by.
+    plots : callable
+        Makes the plots of a page of runs to be compared.
+    write_more : callable
+        Writes more files of a run and its summaries.
+    conclude : callable
+        Counts rows and failures of a run.
+    metrics : tuple of Metric
+        Columns of the result table that a page's gallery shows, for experiments on instances.
+    kind : callable
+        Runs of one kind, whose name this gives, can be compared.
+    title : callable
+        Names runs of one kind in a few words.
+    describe : callable
+        Says what the methods were run on.
+    about : str
+        Explains the pictures.
+    note : str
+        Explains the numbers of the headline table.
+    reference : callable
+        Published numbers for the groups of some runs.
+    """
+
+    options: type[ExperimentOptions]
+    plan: Callable[[Any, RunFolder], Plan[Any]]
+    columns: tuple[Metric, ...]
+    summarize: Callable[[Run], Summaries]
+    lines: Callable[[Summaries], Sequence[Line]] = list
+    table: Callable[[Run, Summaries], ConsoleTable] | None = None
+    group: Callable[[Run], Metric] = lambda run: CATEGORY
+    plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
+    write_more: Callable[[Run, Summaries], object] = lambda run, summaries: None
+    conclude: Callable[[Run, Summaries], Conclusion] = _count_failures
+    metrics: tuple[Metric, ...] = ()
+    kind: Callable[[Run], str] = lambda run: run.experiment
+    title: Callable[[Sequence[Run]], str] = lambda runs: on_datasets(runs[0].experiment, runs)
+    describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
+    about: str = ""
+    note: str = ""
+    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda runs, groups: Reference()
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.options.experiment
+
+    def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
+        """The table for the console."""
+        if self.table is not None:
+            return self.table(run, summaries)
+        lines = self.lines(summaries)
+        columns = self.shown_columns(lines)
+        return ConsoleTable(
+            title="Medians per group and method",
+            labels=(self.group(run).heading, "method"),
+            heads=tuple(column.symbol for column in columns),
+            rows=[
+                (line.group, line.method, *(c.text(line.values.get(c.key)) for c in columns))
+                for line in lines
+            ],
+        )
+
+    def shown_columns(self, lines: Sequence[Line]) -> list[Metric]:
+        """The columns that some line has a value of."""
+        return [c for c in self.columns if any(c.key in line.values for line in lines)]
+
+    def write(self, run: Run) -> Summaries:
+        """Write ``summary.csv`` and ``figures`` of a finished run.
+
+        Raises
+        ------
+        DataError
+            If the files cannot be written.
+        """
+        summaries = self.summarize(run)
+        write_text(run.folder.summary, summary_csv(summaries))
+        plots = self.plots([run])
+        if plots:
+            draw_plots(run.folder.made_figures(), plots)
+        self.write_more(run, summaries)
+        return summaries
+
+
+def on_datasets(topic: str, runs: Sequence[Run]) -> str:
+    """A title such as ``alignment on keypointnet``."""
+    return f"{topic} on {', '.join(dict.fromkeys(run.dataset for run in runs))}"

@@ -1,0 +1,254 @@
+"""Reading JSON documents against declared types, with errors that name the file and the field.
+
+A format is declared as a `Document`: its fields, their types, meaning and defaults. `read_document`
+and `convert` check data against it without coercion (``true`` is no number, ``"1"`` is no number)
+and refuse unknown fields. Formats of other programs are a `ForeignDocument`, whose further fields
+are ignored. What the types cannot express is checked in ``__post_init__``, which raises
+`cadalign.errors.InputError`; its place is completed here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from cadalign.errors import CadalignError, DataError, InputError, quote
+
+_MAX = sys.float_info.max
+Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
+Positive = Annotated[float, Meta(gt=0, le=_MAX)]
+NotNegative = Annotated[float, Meta(ge=0, le=_MAX)]
+Index = Annotated[int, Meta(ge=-(2**63) + 1, le=2**63 - 1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_PATH = r"\A[^\0]+\Z"
+_FILE_NAME = r"\A(?!\.{1,2}\Z)[^/\\\0]+\Z"
+Text = Annotated[str, Meta(pattern=r"\S")]
+PathText = Annotated[str, Meta(pattern=_PATH)]
+Id = Annotated[str, Meta(pattern=_FILE_NAME)]  # becomes a part of paths and must not leave a folder
+Point2 = tuple[Finite, Finite]
+Point3 = tuple[Finite, Finite, Finite]
+
+T = TypeVar("T")
+
+
+class Document(Struct, forbid_unknown_fields=True):
+    """Base of declared formats; unknown fields are refused."""
+
+
+class ForeignDocument(Struct):
+    """Base of declared formats of other programs; unknown fields are ignored."""
+
+
+def read_document(path: Path, kind: type[T]) -> T:
+    """Read a JSON file of a declared type.
+
+    Raises
+    ------
+    DataError
+        If it is missing, cannot be read, is not JSON, or not of this type; names file and field.
+    """
+    data = read_json(path)
+    with in_file(path):
+        return convert(data, kind)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of any content.
+
+    Raises
+    ------
+    DataError
+        If it is missing, cannot be read or is not JSON; names the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DataError("no such file", where=str(path)) from None
+    except (OSError, ValueError) as error:  # not UTF-8, or a NUL in the path
+        raise DataError(f"cannot be read ({error})", where=str(path)) from None
+    with in_file(path):
+        return parse_json(text)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON text.
+
+    Raises
+    ------
+    DataError
+        If it is not JSON; names the line.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"not valid JSON: {error.msg}", where=f"line {error.lineno}") from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise DataError(f"not valid JSON: {str(error)[:200]}") from None
+    except RecursionError:
+        raise DataError("not valid JSON: nested too deeply") from None
+
+
+def convert(
+    data: Any, kind: type[T] | Any, *, where: str | None = None, strict: bool = True
+) -> T | Any:
+    """Convert parsed JSON to a declared type.
+
+    Parameters
+    ----------
+    data : object
+    kind : type
+        A `Document`, or any type of which its fields can be.
+    where : str, optional
+        The place of ``data``, which the fields' paths are appended to.
+    strict : bool
+        False reads numbers out of text, as in CSV files.
+
+    Raises
+    ------
+    DataError
+        If a field is missing, unknown or invalid; ``where`` is its path, as ``keypoints[3].uv``.
+    """
+    try:
+        return msgspec.convert(data, kind, strict=strict)
+    except msgspec.ValidationError as error:
+        raise _located(error, data, kind, where or "") from None
+
+
+@contextmanager
+def in_file(path: Path | str) -> Iterator[None]:
+    """Let errors about a file's content name the file, or the file and a line."""
+    try:
+        yield
+    except CadalignError as error:
+        where = str(path)
+        if error.where:
+            where += (", " if error.where.startswith("line ") else ": ") + error.where
+        raise DataError(error.what, where=where, fix=error.fix) from None
+
+
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """Let errors about a part of a file's content name the part, as ``frames[3]``."""
+    try:
+        yield
+    except CadalignError as error:
+        where = ".".join(part for part in (place, error.where) if part)
+        raise DataError(error.what, where=where or None, fix=error.fix) from None
+
+
+def path_from(text: str, folder: Path | None) -> Path:
+    """The path that a file in a folder writes relative to the folder."""
+    path = Path(text) if folder is None else folder / text
+    # Such that a path outside the folder is the one that was written, with no ".." in its midst.
+    return path.resolve() if ".." in Path(text).parts and folder is not None else path
+
+
+def written_path(path: Path, *, folder: Path | None) -> str:
+    """A path as it is written into a file: relative to the folder that it is read relative to."""
+    if folder is None:
+        return str(path)
+    for base in (folder, folder.resolve()):
+        if path.is_relative_to(base):
+            return path.relative_to(base).as_posix()
+    there = path.resolve()
+    try:
+        return Path(os.path.relpath(there, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return there.as_posix()
+
+
+_MESSAGE = re.compile(r"(?P<text>.*?)(?: - at `(?P<path>\$[^`]*)`)?", re.DOTALL)
+_STEP = re.compile(r"\[(?P<row>\d+|\.\.\.)\]|\.?(?P<name>[^.\[\]]+)")
+_FIELD = re.compile(r"Object (missing required|contains unknown) field `(.*)`", re.DOTALL)
+_EXPECTED = re.compile(r"Expected `(?P<kinds>[^`]*)`(?P<rule>.*)", re.DOTALL)
+_WORDS = {
+    "float": "a finite number",
+    "int": "a whole number",
+    "str": "a text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "an object",
+}
+_PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
+
+
+def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
+    """The library's error as ours: the value and its problem, its path, the remedy."""
+    found = _MESSAGE.fullmatch(str(error))
+    text, path = (found["text"], found["path"]) if found else (str(error), None)
+    value = data
+    for step in _STEP.finditer((path or "$")[1:]):
+        where += step[0] if step["row"] else f".{step['name']}" if where else step["name"]
+        value = _entry(value, step)
+    cause = error.__cause__
+    if isinstance(cause, InputError):
+        place = ".".join(part for part in (where, cause.where) if part)
+        return DataError(cause.what, where=place or None, fix=cause.fix)
+    field = _FIELD.fullmatch(text)
+    if field and field[1] == "missing required":
+        return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
+    if field:
+        known = sorted(each.encode_name for each in _type_at(kind, path).fields)
+        return DataError(
+            f"unknown field {quote(field[2])}",
+            where=where or "top level",
+            fix=f"known are {', '.join(known)}",
+        )
+    if text.startswith("Invalid enum value"):
+        allowed = ", ".join(map(repr, _type_at(kind, path).values))
+        return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
+    return DataError(f"{quote(value)} is not {_wanted(text)}", where=where or None)
+
+
+def _entry(value: Any, step: re.Match[str]) -> Any:
+    try:
+        return value[int(step["row"])] if step["row"] else value[step["name"]]
+    except (KeyError, IndexError, TypeError, ValueError):  # the key of a map is not told
+        return value
+
+
+def _wanted(text: str) -> str:
+    """The library's "Expected ..." in this project's words."""
+    found = _EXPECTED.fullmatch(text)
+    if found is None:  # a number beyond all floats
+        return "a finite number"
+    kinds = [kind for kind in found["kinds"].split(" | ") if kind != "null"]
+    words = " or ".join(_WORDS.get(kind, kind) for kind in kinds)
+    rule, _, _ = found["rule"].partition(", got")
+    if " matching regex " in rule:
+        return _PATTERN_WORDS.get(rule.removeprefix(" matching regex "), words)
+    bound = re.fullmatch(r" (>|>=|<|<=) (\S+)", rule)
+    length = re.fullmatch(r" of length (>= )?(\d+)", rule)
+    if length:
+        return f"{words} of {'at least ' if length[1] else ''}{length[2]}"
+    if bound is None or abs(float(bound[2])) == _MAX:
+        return words
+    return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
+
+
+def _type_at(kind: Any, path: str | None) -> Any:
+    """The declared type at a path."""
+    kind = msgspec.inspect.type_info(kind)
+    for step in _STEP.finditer((path or "$")[1:]):
+        kind = _without_none(kind)
+        if isinstance(kind, msgspec.inspect.StructType):
+            kind = next(each.type for each in kind.fields if each.encode_name == step["name"])
+        else:
+            kind = kind.value_type if step["row"] == "..." else kind.item_type
+    return _without_none(kind)
+
+
+def _without_none(kind: Any) -> Any:
+    """The type that an optional type is of."""
+    if not isinstance(kind, msgspec.inspect.UnionType):
+        return kind
+    return next(each for each in kind.types if not isinstance(each, msgspec.inspect.NoneType))

@@ -1,0 +1,280 @@
+"""Hostile files: memory and time are bounded by the file's size; every error is in the family."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import pickle
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cadalign import Camera
+from cadalign.datasets import BlindPnP, Colmap, KeypointNet, load_mesh, read_image_keypoints
+from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.errors import CadalignError, DataError
+from cadalign.io.images import read_photo
+from cadalign.render.views.camera_files import read_camera_views
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+MANY_DIGITS = "9" * 5000
+
+
+def gltf(**changes: Any) -> str:
+    """A triangle in one accessor of positions and one of indices."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    content = points + np.array(changes.pop("faces", [0, 1, 2]), "<u4").tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(content).decode()
+    scene: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": len(content), "uri": uri}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 12},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
+        ],
+    }
+    return json.dumps(scene | changes)
+
+
+EMPTY = {"componentType": 5126, "count": 2**28, "type": "VEC3"}
+INDICES = {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("wide.obj", "v 0 0 0\n" * 20_000 + "v " + "1 " * 100_000 + "\nf 1 2 3\n"),
+        ("integer.obj", TRIANGLE + f"f 1/1/1 2//2 {'9' * 25}\n"),
+        ("negative.obj", TRIANGLE + f"f 1 2 -{'9' * 25}\n"),
+        ("digits.obj", TRIANGLE + f"f 1//1 2/1 {MANY_DIGITS}\n"),
+        ("infinite.obj", f"v 1e999 0 0\n{TRIANGLE}f 1 2 3\n"),
+        ("empty.gltf", gltf(accessors=[EMPTY, INDICES])),
+        ("matrix.gltf", gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}])),
+        ("nan.gltf", gltf(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}])),
+        ("short.gltf", gltf(nodes=[{"mesh": 0, "matrix": [1, 2, 3]}])),
+        ("index.gltf", gltf(faces=[0, 1, 2**31 + 7])),
+        ("text.gltf", gltf(accessors=[{"count": "many"}, 3])),
+        ("list.gltf", "[]"),
+        ("digits.gltf", f'{{"accessors": {MANY_DIGITS}}}'),
+        (
+            "digits.ply",
+            f"ply\nformat ascii 1.0\nelement vertex {MANY_DIGITS}\nproperty float x\n"
+            "element face 1\nproperty list uchar int vertex_indices\nend_header\n0\n",
+        ),
+        ("digits.off", f"OFF\n3 {MANY_DIGITS} 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
+    ],
+    ids=lambda value: value if len(value) < 20 else "",
+)
+@pytest.mark.filterwarnings("error")
+def test_hostile_meshes_are_refused_quickly(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    started = time.perf_counter()
+    with pytest.raises(DataError) as caught:
+        load_mesh(tmp_path / name)
+    assert time.perf_counter() - started < 5
+    assert len(str(caught.value)) < 600 + len(str(tmp_path))
+
+
+def test_time_for_continued_lines_grows_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "continued.obj"
+    path.write_text(TRIANGLE + "f " + "1 \\\n" * 400_000 + "2 3\n")
+    started = time.perf_counter()
+    assert len(load_mesh(path).faces) == 400_000
+    assert time.perf_counter() - started < 10
+
+
+@pytest.mark.parametrize("options", ["-s 1 1", "-s 1", "-o", "-s", "-mm 1", ""])
+def test_texture_options_without_a_file_are_passed_over(tmp_path: Path, options: str) -> None:
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\nusemtl a\n{TRIANGLE}f 1 2 3\n")
+    (tmp_path / "a.mtl").write_text(f"newmtl a\nmap_Kd {options}\n")
+    assert load_mesh(tmp_path / "a.obj").materials[0].texture is None
+
+
+def test_texture_that_is_far_larger_than_its_file_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Image.new("1", (13_000, 13_000)).save(tmp_path / "a.png")
+    faces = "".join(f"usemtl {n}\nf 1 2 3\n" for n in range(10))
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}{faces}")
+    (tmp_path / "a.mtl").write_text("".join(f"newmtl {n}\nmap_Kd a.png\n" for n in range(10)))
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert all(material.texture is None for material in mesh.materials)
+    assert "13000 x 13000 pixels in" in caplog.text
+
+
+def test_materials_share_the_texture_that_they_name(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    faces = "".join(f"usemtl {n}\nf 1 2 3\n" for n in range(3))
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}{faces}")
+    (tmp_path / "a.mtl").write_text("".join(f"newmtl {n}\nmap_Kd a.png\n" for n in range(3)))
+    first, second, third = (m.texture for m in load_mesh(tmp_path / "a.obj").materials)
+    assert first is second
+    assert second is third
+
+
+# --- pickles ----------------------------------------------------------------------------------
+
+
+def doubled(levels: int) -> list[Any]:
+    """Lists that each hold the next one twice: 2^levels values in a few bytes."""
+    value: list[Any] = [0.0]
+    for _ in range(levels):
+        value = [value, value]
+    return value
+
+
+PICKLES = {
+    "itself": b"\x80\x02]q\x00(h\x00h\x00e.",
+    "doubled": pickle.dumps(doubled(40), protocol=2),
+    "tuples": b"\x80\x02" + b"(" * 1_000_000 + b"t" * 1_000_000 + b".",
+    "key": b"\x80\x02})" + b"\x85" * 1_000_000 + b"K\x01s.",
+    "member": b"\x80\x04\x8f()" + b"\x85" * 1_000_000 + b"\x90.",
+    "memory": b"\x80\x02]r\xff\xff\xff\x0f.",
+    "put": b"\x80\x02]p268435455\n.",
+    "integer": b"\x80\x02\x8b\xff\xff\xff\x7f.",
+    "bytes": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.",
+    "array": b"\x80\x05\x96\xff\xff\xff\xff\xff\xff\xff\x0f.",
+    "frame": b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x0f].",
+    "stack": b"\x80\x02" + b"0" * 10 + b".",
+    "nothing": b"",
+}
+
+
+@pytest.mark.parametrize("name", PICKLES)
+def test_hostile_pickles_are_refused_quickly(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a.pkl").write_bytes(PICKLES[name])
+    # In its own process, which may neither crash nor take more than 300 MB on top.
+    code = (
+        "import resource, sys\n"
+        "from cadalign.datasets.sfm.unpickling import load_pickle\n"
+        "from cadalign.errors import DataError\n"
+        "size = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (size + 300_000_000,) * 2)\n"
+        "try:\n"
+        "    load_pickle(sys.argv[1])\n"
+        "except DataError as error:\n"
+        "    sys.exit(7 if len(str(error)) < 500 + len(sys.argv[1]) else 8)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.pkl"], timeout=60, check=False)
+    assert done.returncode == 7
+
+
+def test_shared_and_nested_values_of_honest_pickles_are_loaded(tmp_path: Path) -> None:
+    shared = np.arange(6.0).reshape(2, 3)
+    value = {"a": [shared, shared, (1, (2.5, [None, {"b": "text"}]))], "c": {1, 2}}
+    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+        (tmp_path / "a.pkl").write_bytes(pickle.dumps(value, protocol=protocol))
+        loaded = load_pickle(tmp_path / "a.pkl")
+        np.testing.assert_array_equal(loaded["a"][0], shared)
+        assert loaded["a"][2] == (1, (2.5, [None, {"b": "text"}]))
+        assert loaded["c"] == {1, 2}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["matches", "R", "t", "inlier_matches"])
+@pytest.mark.parametrize("value", [1e308, 1e30, -1e30, 10**400, float("nan")])
+def test_numbers_beyond_all_bounds_concern_one_sample(
+    tmp_path: Path, name: str, value: float
+) -> None:
+    rows = np.array([[0.1, 0.2, 0.1, 0.2, 1.0]] * 4)
+    samples: dict[str, Any] = {
+        "matches": rows.tolist(),
+        "R": np.eye(3).tolist(),
+        "t": [0.0, 0.0, 0.0],
+        "inlier_matches": [[0, 0], [1, 1], [2, 2]],
+    }
+    bad = json.loads(json.dumps(samples[name]))
+    if isinstance(bad[0], list):
+        bad[0][0] = value
+    else:
+        bad[0] = value
+    for file, good in samples.items():
+        content = [good, bad if file == name else good]
+        (tmp_path / f"{file}.pkl").write_bytes(pickle.dumps(content, protocol=2))
+    data = BlindPnP(tmp_path)
+    assert len(data[0]) in (3, 4)
+    with pytest.raises(CadalignError):
+        data[1]
+
+
+# --- text and JSON ----------------------------------------------------------------------------
+
+
+def test_colmap_numbers_beyond_64_bits_are_refused_with_their_line(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    (tmp_path / "images.txt").write_text("")
+    (tmp_path / "points3D.txt").write_text(f"{2**63} 0 0 0 1 1 1 0.5\n")
+    with pytest.raises(DataError, match=r"points3D\.txt, line 1"):
+        Colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "value", ["NaN", "Infinity", "1e999", "1" * 400, "-1" + "0" * 400, "true", "[]", '"9"', "null"]
+)
+@pytest.mark.parametrize("field", ["width", "fx", "cx"])
+def test_hostile_numbers_of_cameras_are_refused(tmp_path: Path, field: str, value: str) -> None:
+    numbers = {"width": "640", "fx": "500", "cx": "320"} | {field: value}
+    params = f"[{numbers['fx']}, 500, {numbers['cx']}, 240]"
+    text = f'{{"model": "PINHOLE", "width": {numbers["width"]}, "height": 480, "params": {params}}}'
+    with pytest.raises(CadalignError) as caught:
+        Camera.from_dict(json.loads(text))
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("value", ["NaN", "1e999", "1" * 400, "true", '"9"', "[[]]", "{}"])
+@pytest.mark.parametrize("field", ["w", "fl_x", "camera_angle_x", "cx", "k1", "transform_matrix"])
+def test_hostile_numbers_of_camera_files_are_refused(
+    tmp_path: Path, field: str, value: str
+) -> None:
+    data: dict[str, Any] = {"w": 8, "h": 8, "fl_x": 5, "transform_matrix": np.eye(4).tolist()}
+    text = json.dumps(data | {field: "here"}).replace('"here"', value)
+    (tmp_path / "transforms.json").write_text(f'{{"frames": [{text}]}}')
+    with pytest.raises(DataError) as caught:
+        read_camera_views(tmp_path / "transforms.json")
+    assert len(str(caught.value)) < 400 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "keypoints",
+    ["[1, [2], 3]", "[[1, 2], 3]", "[[1, 2], [3]]", "[[[1, 2, 2]]]", "[{}]", "[1e999, 1, 2]", "{}"],
+)
+def test_ragged_coco_keypoints_are_refused(tmp_path: Path, keypoints: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'[{{"keypoints": {keypoints}}}]')
+    with pytest.raises(DataError, match=r"\[0\]\.keypoints"):
+        read_image_keypoints(path)
+
+
+def test_digits_without_end_in_annotations_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "annotations" / "chair.json").write_text(f'[{{"keypoints": {MANY_DIGITS}}}]')
+    with pytest.raises(DataError, match="not valid JSON"):
+        KeypointNet(tmp_path)["chair"]
+
+
+@pytest.mark.parametrize("read", [read_photo, read_camera_views, read_image_keypoints, load_mesh])
+def test_paths_with_a_nul_are_refused(read: Callable[[str], object]) -> None:
+    with pytest.raises(CadalignError):
+        read("a\0b.obj")
+
+
+def test_pipe_is_no_photo(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "photo.png")
+    with pytest.raises(DataError, match="not a regular file"):
+        read_photo(tmp_path / "photo.png")

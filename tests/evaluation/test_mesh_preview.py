@@ -1,0 +1,124 @@
+"""Sketches: models in few triangles that can still be recognised."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign import Mesh
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError
+from cadalign.evaluation.instances.preview import MeshPreview, preview_of, write_preview
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def cube() -> Mesh:
+    faces = [(q[0], q[a], q[a + 1]) for q in QUADS for a in (1, 2)]
+    return Mesh(CUBE, np.array(faces))
+
+
+def sphere(rings: int, *, squash: float = 1.0) -> Mesh:
+    latitude, longitude = np.mgrid[0 : rings + 1, 0 : 2 * rings]
+    theta, phi = np.pi * latitude / rings, np.pi * longitude / rings
+    points = np.stack(
+        [np.sin(theta) * np.cos(phi), squash * np.cos(theta), np.sin(theta) * np.sin(phi)], axis=-1
+    ).reshape(-1, 3)
+    number = np.arange(len(points)).reshape(rings + 1, 2 * rings)
+    a, b = number[:-1], np.roll(number[:-1], -1, axis=1)
+    c, d = number[1:], np.roll(number[1:], -1, axis=1)
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)]).reshape(-1, 3)
+    return Mesh(points, faces)
+
+
+def test_a_light_model_stays_as_it_is_and_its_creases_are_edges() -> None:
+    preview = preview_of(cube())
+    assert len(preview.faces) == 12
+    assert len(preview.vertices) == 8
+    assert len(preview.edges) == 12
+    lengths = np.linalg.norm(np.diff(preview.vertices[preview.edges], axis=1), axis=2)
+    np.testing.assert_allclose(lengths, 1)  # no diagonals
+
+
+@given(rings=st.integers(5, 60), squash=st.floats(0.01, 3.0), most=st.integers(8, 2000))
+def test_there_are_never_more_triangles_or_lines_than_asked_for(
+    rings: int, squash: float, most: int
+) -> None:
+    mesh = sphere(rings, squash=squash)
+    preview = preview_of(mesh, max_faces=most, max_edges=most)
+    assert len(preview.faces) <= most
+    assert len(preview.edges) <= most
+    assert np.isfinite(preview.vertices).all()
+    for corners in (preview.faces, preview.edges):
+        assert corners.min(initial=0) >= 0
+        assert corners.max(initial=0) < len(preview.vertices)
+    if most > 300:  # means of cells stay within a cell of the surface
+        size = np.linalg.norm(np.ptp(mesh.bounds, axis=0))
+        found = np.array([preview.vertices.min(axis=0), preview.vertices.max(axis=0)])
+        assert np.abs(found - mesh.bounds).max() < 0.1 * size
+
+
+def test_a_mast_thinner_than_a_cell_becomes_a_line() -> None:
+    hull = sphere(60)
+    mast = (CUBE - 0.5) * [1e-3, 3.0, 1e-3] + [0, 2.4, 0]
+    faces = np.concatenate([hull.faces, cube().faces + len(hull.vertices)])
+    mesh = Mesh(np.concatenate([hull.vertices, mast]), faces)
+    preview = preview_of(mesh)
+    assert preview.vertices[:, 1].max() > 3.8
+    top = int(preview.vertices[:, 1].argmax())
+    assert (preview.edges == top).any()
+
+
+def test_parts_without_area_do_no_harm() -> None:
+    point = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    preview = preview_of(point)
+    assert len(preview.faces) == len(preview.edges) == 0
+    assert decoded(preview) is not None
+
+
+def decoded(preview: MeshPreview) -> dict[str, np.ndarray]:
+    data = json.loads(json.dumps(preview.to_dict()))
+    index = "<u4" if data["wide"] else "<u2"
+    counts = np.frombuffer(base64.b64decode(data["vertices"]), "<u2").reshape(-1, 3)
+    return {
+        "vertices": np.array(data["lo"]) + counts * data["step"],
+        "faces": np.frombuffer(base64.b64decode(data["faces"]), index).reshape(-1, 3),
+        "edges": np.frombuffer(base64.b64decode(data["edges"]), index).reshape(-1, 2),
+    }
+
+
+@pytest.mark.parametrize("rings", [20, 200])
+def test_json_holds_the_same_to_16_bits(rings: int) -> None:
+    preview = preview_of(sphere(rings), max_faces=200_000)
+    found = decoded(preview)
+    assert (len(preview.vertices) > 65536) == (rings == 200)
+    np.testing.assert_allclose(found["vertices"], preview.vertices, atol=2 / 65535)
+    np.testing.assert_array_equal(found["faces"], preview.faces)
+    np.testing.assert_array_equal(found["edges"], preview.edges)
+
+
+def test_a_flat_model_is_written_too() -> None:
+    flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    np.testing.assert_allclose(decoded(preview_of(flat))["vertices"][:, 2], 0)
+
+
+def test_a_sketch_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be written"):
+        write_preview(tmp_path / "no" / "such.json", cube())
+
+
+def test_real_models_keep_their_extent(real_data: Path) -> None:
+    dataset = KeypointNet(real_data / "keypointnet").subset(with_mesh=True)
+    for model in dataset:
+        mesh = model.load_mesh()
+        preview = preview_of(mesh)
+        found = np.array([preview.vertices.min(axis=0), preview.vertices.max(axis=0)])
+        assert np.abs(found - mesh.bounds).max() < 0.03, model.model_id
+        assert len(preview.faces) >= min(800, len(mesh.faces) // 2), model.model_id

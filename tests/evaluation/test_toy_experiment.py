@@ -1,0 +1,221 @@
+"""An experiment in one file, this one: its run, tables, page, figures and `evaluate show`."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import pytest
+import tyro
+
+import cadalign
+from cadalign.cli import main
+from cadalign.errors import DataError
+from cadalign.evaluation import registry
+from cadalign.evaluation.api import run
+from cadalign.evaluation.metrics import CATEGORY, FAILED, INSTANCES, Metric
+from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.plots import Plot, Trace
+from cadalign.evaluation.registry import register
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.runs.tables import Columns
+from cadalign.evaluation.runs.work import Plan, Rows
+from cadalign.evaluation.spec import Spec
+from cadalign.evaluation.summary import medians
+from cadalign.report import headline_text, write_report
+from cadalign.seeding import instance_rng
+
+# --- the experiment: estimate the middle of noisy numbers -------------------------------------
+
+ERROR = Metric("middle_error", "error of the middle", "mm", digits=1, factor=1000.0)
+DRAWS = Metric("draws", "numbers", better=None)
+COLUMNS: Columns = (
+    *(("category", str), ("model_id", int), ("method", str)),
+    *(("status", str), ("reason", str), (ERROR.key, float)),
+)
+
+
+@dataclass(frozen=True)
+class MiddleOptions(ExperimentOptions):
+    """Estimate the middle of noisy numbers."""
+
+    experiment: ClassVar[str] = "middle"
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """File with the categories, a line each."""
+    _: KW_ONLY
+    draws: int = 5
+    """Numbers for each task."""
+    tasks: int = 6
+    """Tasks of each category."""
+    methods: tuple[str, ...] = ("mean", "median")
+    """mean, median."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(draws=1, tasks=1)
+
+
+@dataclass(frozen=True)
+class Middle:
+    options: MiddleOptions
+
+    @property
+    def columns(self) -> Columns:
+        return COLUMNS
+
+    @property
+    def timing_columns(self) -> Columns:
+        return (*COLUMNS[:3], ("seconds", float))
+
+    def warm_up(self) -> None:
+        pass
+
+    def evaluate(self, tasks: Sequence[tuple[str, int]]) -> Rows:
+        return Rows.of(outcome for task in tasks for outcome in self._outcomes(*task))
+
+    def failure(self, task: tuple[str, int], reason: str) -> Rows:
+        return Rows.of(Outcome.failure(reason, names(*task, m)) for m in self.options.methods)
+
+    def _outcomes(self, category: str, number: int) -> Iterator[Outcome]:
+        rng = instance_rng(self.options.seed, category, str(number))
+        values = rng.normal(0, 1, self.options.draws)
+        if category == "bad":
+            raise ValueError("no numbers")
+        for method in self.options.methods:
+            error = abs(float(getattr(np, method)(values)))
+            yield Outcome(names(category, number, method), {ERROR.key: error}, seconds=0.1)
+
+
+def names(category: str, number: int, method: str) -> dict[str, Any]:
+    return {"category": category, "model_id": number, "method": method}
+
+
+def plan(options: MiddleOptions, folder: RunFolder) -> Plan[tuple[str, int]]:
+    categories = options.root.read_text().split()
+    tasks = [(category, k) for category in categories for k in range(options.tasks)]
+    config = {**asdict(options), "experiment": "middle", "root": str(options.root)}
+    return Plan(Middle(options), tasks, config, chunk_size=4)
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    traces = [
+        Trace.of(index, line.method, [some.config["draws"]], [line.values[ERROR.key]], ERROR)
+        for index, some in enumerate(runs)
+        for line in medians(some, [ERROR])
+    ]
+    return [Plot("middle", DRAWS, ERROR, traces)]
+
+
+SPEC = Spec(
+    options=MiddleOptions,
+    plan=plan,
+    columns=(INSTANCES, FAILED, ERROR),
+    summarize=partial(medians, columns=(ERROR,), group=CATEGORY),
+    plots=plots,
+    note="Medians of toys.",
+)
+
+
+# --- what it gets without another file ---------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    register(SPEC)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    path = tmp_path / "categories"
+    path.write_text("bad\ncup\nspoon\n")
+    return path
+
+
+def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["evaluate", "middle", "--help"])
+    text = capsys.readouterr().out
+    assert "Numbers for each task." in text
+    assert "Address of a Dask scheduler" in text
+    out = tmp_path / "run"
+    arguments = ["evaluate", "middle", str(root), "--draws", "9", "--workers", "0"]
+    assert main([*arguments, "--out", str(out)]) == 3
+    shown = capsys.readouterr()
+    (line,) = [line for line in shown.out.splitlines() if "spoon" in line and "mean" in line]
+    error = np.median(
+        [abs(instance_rng(0, "spoon", str(k)).normal(0, 1, 9).mean()) for k in range(6)]
+    )
+    assert line.replace("│", " ").split() == ["spoon", "mean", "6", "0", f"{1000 * error:.1f}"]
+    assert "12 of 36 rows failed" in shown.err
+    assert main(["evaluate", "middle", str(root), "--draws", "0", "--out", str(out)]) == 1
+    assert "--draws: 0 is less than 1" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
+    options = MiddleOptions(root)
+    whole, cut = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "cut")
+    run(options, whole, workers=0)
+
+    def stop(progress: Progress) -> None:
+        if progress.done >= 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(options, cut, workers=0, on_progress=stop)
+    assert not cut.is_finished
+    unfinished = write_report([cut.path], tmp_path / "unfinished.html").path
+    assert "8 of 18 tasks are done" in unfinished.read_text()
+    seen: list[int] = []
+    run(options, cut, workers=0, on_progress=lambda progress: seen.append(progress.done))
+    assert seen[0] == 8
+    assert cut.results.read_bytes() == whole.results.read_bytes()
+    with pytest.raises(DataError, match="draws is 5 there and 6 now"):
+        run(MiddleOptions(root, draws=6), cut, workers=0)
+
+
+def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    table = cadalign.evaluate(root, "middle", methods=["mean"], workers=0, out=out)
+    assert table.groupby("category").status.first().to_dict() == {
+        "bad": "failed",
+        "cup": "ok",
+        "spoon": "ok",
+    }
+    text = headline_text([out], format="md")
+    assert text.splitlines()[0] == (
+        "| category | method | instances | failed | error of the middle \\[mm\\] |"
+    )
+    assert "Medians of toys." in text
+    page = write_report([out], tmp_path / "page.html").path.read_text()
+    payload = json.loads(page.split('id="payload">')[1].split("</script>")[0])
+    assert payload["title"] == "Middle on categories"
+    assert payload["headline"]["failures"][0]["reason"] == "ValueError: no numbers"
+    assert payload["plots"][0]["y"] == {"label": "error of the middle", "unit": "mm", "log": True}
+    assert ["draws", "5"] in payload["runs"][0]["settings"]
+
+
+def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    run(MiddleOptions(root), RunFolder(out), workers=0)
+    assert main(["evaluate", "show", str(out)]) == 3
+    assert "spoon" in capsys.readouterr().out
+    assert main(["evaluate", "show", str(out), "--json"]) == 3
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["rows"], shown["failed"], len(shown["summary"])) == (36, 12, 6)
+    with (out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["group"] == "bad"
+    assert rows[0][ERROR.key] == ""
+    assert float(rows[2][ERROR.key]) == shown["summary"][2]["values"][ERROR.key]
+    assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}

@@ -52,26 +52,14 @@ class ForeignDocument(Struct):
 
 
 def read_document(path: Path, kind: type[T]) -> T:
-    """Read a JSON file of a declared type.
-
-    Raises
-    ------
-    DataError
-        If it is missing, cannot be read, is not JSON, or not of this type; names file and field.
-    """
+    """Read a JSON file of a declared type; errors name the file and the field."""
     data = read_json(path)
     with in_file(path):
         return convert(data, kind)
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of any content.
-
-    Raises
-    ------
-    DataError
-        If it is missing, cannot be read or is not JSON; names the line.
-    """
+    """Read a JSON file of any content; errors name the file and the line."""
     with reading(path):
         text = path.read_text(encoding="utf-8")
     with in_file(path):
@@ -79,13 +67,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON text.
-
-    Raises
-    ------
-    DataError
-        If it is not JSON; names the line.
-    """
+    """Parse JSON text; a `DataError` names the line that is not JSON."""
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
@@ -99,22 +81,10 @@ def parse_json(text: str | bytes) -> Any:
 def convert(
     data: Any, kind: type[T] | Any, *, where: str | None = None, strict: bool = True
 ) -> T | Any:
-    """Convert parsed JSON to a declared type.
+    """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
 
-    Parameters
-    ----------
-    data : object
-    kind : type
-        A `Document`, or any type of which its fields can be.
-    where : str, optional
-        The place of ``data``, which the fields' paths are appended to.
-    strict : bool
-        False reads numbers out of text, as in CSV files.
-
-    Raises
-    ------
-    DataError
-        If a field is missing, unknown or invalid; ``where`` is its path, as ``keypoints[3].uv``.
+    ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
+    ``keypoints[3].uv``. ``strict=False`` reads numbers out of text, as in CSV files.
     """
     try:
         return msgspec.convert(data, kind, strict=strict)
@@ -143,8 +113,12 @@ def within(place: str) -> Iterator[None]:
     try:
         yield
     except CadalignError as error:
-        where = ".".join(part for part in (place, error.where) if part)
-        raise DataError(error.what, where=where or None, fix=error.fix) from None
+        raise _below(place, error) from None
+
+
+def _below(place: str, error: CadalignError) -> DataError:
+    where = ".".join(part for part in (place, error.where) if part)
+    return DataError(error.what, where=where or None, fix=error.fix)
 
 
 def path_from(text: str, folder: Path | None) -> Path:
@@ -209,8 +183,7 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
         value = _entry(value, step)
     cause = error.__cause__
     if isinstance(cause, InputError):
-        place = ".".join(part for part in (where, cause.where) if part)
-        return DataError(cause.what, where=place or None, fix=cause.fix)
+        return _below(where, cause)
     field = _FIELD.fullmatch(text)
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])

@@ -140,9 +140,8 @@ class BlindPnP(CorrespondenceSet):
         pairs = _rows(self._array("inlier_matches", position, shape=(None, 2)))
         bad = pairs[(pairs < 0) | (pairs >= len(rows))]
         if len(bad):
-            raise InputError(
-                f"names row {bad[0]} of {len(rows)} in matches", where="inlier_matches"
-            )
+            what = f"names row {bad[0]} of {len(rows)} in matches"
+            raise InputError(what, where="inlier_matches")
         return rays[pairs[:, 1]], points_3d[pairs[:, 0]]
 
     def _paired(self, position: int, pose: Alignment) -> tuple[FloatArray, FloatArray]:

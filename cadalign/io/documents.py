@@ -62,20 +62,16 @@ def read_json(path: Path) -> Any:
     """Read a JSON file of any content; errors name the file and the line."""
     with reading(path):
         text = path.read_text(encoding="utf-8")
-    with in_file(path):
-        return parse_json(text)
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON text; a `DataError` names the line that is not JSON."""
+    where, reason = str(path), "nested too deeply"
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise DataError(f"not valid JSON: {error.msg}", where=f"line {error.lineno}") from None
+        where, reason = f"{path}, line {error.lineno}", error.msg
     except ValueError as error:  # a whole number of thousands of digits
-        raise DataError(f"not valid JSON: {str(error)[:200]}") from None
+        reason = str(error)[:200]
     except RecursionError:
-        raise DataError("not valid JSON: nested too deeply") from None
+        pass
+    raise DataError(f"not valid JSON: {reason}", where=where)
 
 
 def convert(

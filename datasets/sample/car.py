@@ -38,14 +38,14 @@ def car(rng: np.random.Generator, index: int) -> Draft:
         (2, 3): (*house.corner(1.0), house.rear(1.0)),
         (4, 5): (*hub, p.z_axles[0]),
         (6, 7): (*hub, p.z_axles[1]),
-        (8, 9): (0.78 * half, p.nose - 0.09, -end - 0.1),
+        (8, 9): (0.78 * half, p.kind.nose - 0.09, -end - 0.1),
         (10, 11): (0.84 * half, p.tail_lamp, end + 0.1),
         (12, 13): (*house.corner(0.06), house.front(0.06)),
         (14, 15): (0.88 * half, 0.42, -end - 0.1),
         (16, 17): (0.9 * half, 0.43, end + 0.1),
-        (18, 19): (half + 0.16, p.belt + 0.07, house.front(0.0) + 0.36),
+        (18, 19): (half + 0.16, p.kind.belt + 0.07, house.front(0.0) + 0.36),
     }
-    bed = _bed(p) if p.kind == "pickup" else []
+    bed = _bed(p) if p.kind.name == "pickup" else []
     solids = (_body(p), *house.solids(), *_wheels(p), *_front(p), *_rear(p), *_sides(p), *bed)
     return Draft(solids, mirrored_places(pairs), tuple(pairs))
 
@@ -95,10 +95,10 @@ class _GlassHouse:
         return self.p.z_deck + share * (self.p.z_roof_rear - self.p.z_deck)
 
     def half(self, share: float) -> float:
-        return self.p.width / 2 * (0.9 - self.p.tumblehome * share)
+        return self.p.width / 2 * (0.9 - self.p.kind.tumblehome * share)
 
     def height(self, share: float) -> float:
-        return self.p.belt + share * (self.p.roof - self.p.belt)
+        return self.p.kind.belt + share * (self.p.roof - self.p.kind.belt)
 
     def corner(self, share: float) -> tuple[float, float]:
         """x and y of the right edge."""
@@ -128,7 +128,7 @@ class _GlassHouse:
         if p.z_panel is not None:
             levels = [self.level(share, grow=0.008, front=p.z_panel) for share in (-0.2, 0.9)]
             middle = (0, self.height(0.5), self.rear(0.5) + 0.005)
-            size = (1.3 * self.half(0.5), 0.5 * (p.roof - p.belt), 0.03)
+            size = (1.3 * self.half(0.5), 0.5 * (p.roof - p.kind.belt), 0.03)
             solids += [make.stacked(levels, p.paint, radius=0.1), make.box(middle, size, _GLASS)]
         elif p.steep:
             solids.append(self._tailgate())
@@ -165,7 +165,7 @@ def _bed(p: CarShape) -> list[Solid]:
     front, rear = p.z_deck + 0.1, p.length / 2 - 0.03
     middle, half = (front + rear) / 2, p.width / 2 - 0.09
     low = p.top(middle) - 0.03
-    tall = p.belt + 0.08 - low
+    tall = p.kind.belt + 0.08 - low
     y = low + tall / 2
     walls: list[tuple[Point, Point]] = [
         ((half, y, middle), (0.1, tall, rear - front)),
@@ -210,7 +210,7 @@ def _wheel(p: CarShape, z: float) -> list[Solid]:
 
 
 def _front(p: CarShape) -> list[Solid]:
-    z, half, y = -p.length / 2, p.width / 2, p.nose - 0.15
+    z, half, y = -p.length / 2, p.width / 2, p.kind.nose - 0.15
     lamp = make.ellipsoid(
         (0.72 * half, y, z + 0.04), (0.42 * half, 0.17, 0.2), _HEAD_LAMP, count=12
     )
@@ -227,10 +227,10 @@ def _front(p: CarShape) -> list[Solid]:
 
 def _rear(p: CarShape) -> list[Solid]:
     z, half = p.length / 2, p.width / 2
-    tall = 0.34 if p.kind in ("van", "suv") else 0.16
+    tall = 0.34 if p.kind.name in ("van", "suv") else 0.16
     center = (0.76 * half, p.tail_lamp - 0.5 * tall + 0.06, z - 0.03)
     lamp = make.rounded_box(center, (0.3 * half, tall, 0.16), _TAIL_LAMP, radius=0.03)
-    plate = make.box((0, p.tail - 0.24, z + 0.002), (0.52, 0.11, 0.02), _PLATE)
+    plate = make.box((0, p.kind.tail - 0.24, z + 0.002), (0.52, 0.11, 0.02), _PLATE)
     return [*make.both_sides(lamp), _bumper(p, 1.0, 0.42), plate]
 
 
@@ -246,7 +246,7 @@ def _bumper(p: CarShape, direction: float, height: float) -> Solid:
     x, z = make.smooth_curve([*right, (0.0, end + 0.065), *right[::-1] * (-1, 1)], 17).T
     path = np.stack([(x - x[::-1]) / 2, np.full(17, height), direction * z], axis=1)
     section = make.rounded_rectangle(0.2, 0.08, radius=0.03, steps=1)
-    color = _TRIM if p.kind in ("pickup", "van", "suv", "city") else _darker(p.paint)
+    color = _TRIM if p.kind.name in ("pickup", "van", "suv", "city") else _darker(p.paint)
     return make.sweep(path, section, color, side=(0, 1, 0))
 
 
@@ -256,11 +256,11 @@ def _darker(color: Color) -> Color:
 
 
 def _sides(p: CarShape) -> list[Solid]:
-    half, z = p.width / 2, p.z_cowl + 0.36
-    mirror = make.ellipsoid((half + 0.08, p.belt + 0.07, z), (0.2, 0.15, 0.12), p.paint, count=12)
-    root, tip = (half - 0.12, p.belt + 0.01, z), (half + 0.06, p.belt + 0.05, z)
+    half, belt, z = p.width / 2, p.kind.belt, p.z_cowl + 0.36
+    mirror = make.ellipsoid((half + 0.08, belt + 0.07, z), (0.2, 0.15, 0.12), p.paint, count=12)
+    root, tip = (half - 0.12, belt + 0.01, z), (half + 0.06, belt + 0.05, z)
     solids = [mirror, make.beam(root, tip, (0.04, 0.04), _DARK)]
-    shoulder = p.belt - p.shoulder_drop
+    shoulder = belt - p.shoulder_drop
     front, rear = p.z_axles[0] + 1.4 * p.wheel_radius, p.z_axles[1] - 1.4 * p.wheel_radius
     low = p.sill + 0.45 * (shoulder - p.sill)
     for z in (front + 0.12, *(z for z in p.pillars if z < rear)):

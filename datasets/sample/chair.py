@@ -120,9 +120,8 @@ def _base(p: ChairShape) -> list[Solid]:
 
 def _legs(p: ChairShape) -> list[Solid]:
     """Four legs and the bars between them; under a shell the struts that carry it."""
-    inset = {"straight": 0.6 * p.leg, "tapered": 0.8 * p.leg, "splayed": 0.11, "turned": 0.07}[
-        p.base
-    ]
+    insets = {"straight": 0.6 * p.leg, "tapered": 0.8 * p.leg, "splayed": 0.11, "turned": 0.07}
+    inset = insets[p.base]
     x, z = p.width / 2 - inset, p.depth / 2 - inset
     y = p.seat_height - (0.012 if p.back == "shell" else 0.4 * p.seat_thickness)
     tops = np.array([(x, y, -z), (x, y, z)])
@@ -189,7 +188,7 @@ def _swivel(p: ChairShape) -> list[Solid]:
         side = np.cross((0, 1, 0), tip)
         solids += [
             make.sweep(path, section, p.frame, scales=[1.0, 0.85, 0.6], side=side),
-            make.ellipsoid(0.96 * tip + (0, 0.03, 0), (0.05, 0.06, 0.05), _DARK),
+            make.ellipsoid(0.96 * tip + (0, 0.03, 0), (0.05, 0.06, 0.05), _DARK, count=16),
         ]
     return solids
 
@@ -271,11 +270,6 @@ def _spindle_back(p: ChairShape) -> list[Solid]:
     return solids
 
 
-def _shell(p: ChairShape) -> list[Solid]:
-    """Seat and back as one curved plate."""
-    return [make.sheet(p.shell(), 0.014, p.fabric)]
-
-
 def _club_back(p: ChairShape) -> list[Solid]:
     half, tall = p.back_half_width(1.0), p.back_height
     path = _rounded_end(np.array(p.back_point(-0.1)), np.array(p.back_point(tall)), 0.05)
@@ -300,6 +294,6 @@ _BACKS: dict[str, Callable[[ChairShape], list[Solid]]] = {
     "ladder": _ladder_back,
     "panel": _panel_back,
     "spindles": _spindle_back,
-    "shell": _shell,
+    "shell": lambda p: [make.sheet(p.shell(), 0.014, p.fabric)],  # seat and back as one plate
     "club": _club_back,
 }

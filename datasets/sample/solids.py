@@ -64,7 +64,7 @@ def both_sides(*solids: Solid) -> list[Solid]:
 # Outlines and curves ------------------------------------------------------------------------------
 
 
-def ellipse(width: float, height: float, *, count: int = 16, exponent: float = 2.0) -> FloatArray:
+def ellipse(width: float, height: float, *, count: int, exponent: float = 2.0) -> FloatArray:
     """An outline (count, 2): a superellipse ``|x/a|^exponent + |y/b|^exponent = 1`` (Lame curve).
 
     It starts at the top and is mirror symmetric in its first coordinate.
@@ -192,7 +192,7 @@ def stacked(
 
 
 def sweep(
-    path: npt.ArrayLike,
+    path: npt.ArrayLike | Sequence[npt.ArrayLike],
     section: FloatArray,
     color: Color,
     *,
@@ -253,7 +253,7 @@ def lathe(
     color: Color,
     *,
     center: npt.ArrayLike = (0, 0, 0),
-    count: int = 32,
+    count: int,
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
 ) -> Solid:
@@ -271,16 +271,14 @@ def lathe(
     return loft(np.array(rings) + np.asarray(center, dtype=float), color)
 
 
-def ellipsoid(
-    center: npt.ArrayLike, size: npt.ArrayLike, color: Color, *, count: int = 16
-) -> Solid:
+def ellipsoid(center: npt.ArrayLike, size: npt.ArrayLike, color: Color, *, count: int) -> Solid:
     """An ellipsoid of the given full extents (3,)."""
     angle = np.linspace(0, np.pi, count // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], axis=1), color, count=count)
     return unit.with_vertices(unit.vertices * np.asarray(size, dtype=float) / 2 + center)
 
 
-def wheel(center: npt.ArrayLike, profile: npt.ArrayLike, color: Color, *, count: int = 24) -> Solid:
+def wheel(center: npt.ArrayLike, profile: npt.ArrayLike, color: Color, *, count: int) -> Solid:
     """Turn a profile (radius, distance outward along x) around an axis along x."""
     upright = lathe(profile, color, count=count)
     return upright.with_vertices(upright.vertices[:, [1, 0, 2]] + np.asarray(center, dtype=float))

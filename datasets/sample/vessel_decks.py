@@ -246,8 +246,8 @@ def _towing_gear(p: VesselShape) -> list[Solid]:
     drum = [(0, 0), (0.035, 0), (0.035, 0.12), (0, 0.12)]
     cheek = [(0, 0), (0.052, 0), (0.052, 0.012), (0, 0.012)]
     solids = [
-        make.wheel((-0.06, deck + 0.04, 0.24), drum, STEEL),
-        *make.both_sides(make.wheel((0.05, deck + 0.04, 0.24), cheek, p.accent)),
+        make.wheel((-0.06, deck + 0.04, 0.24), drum, STEEL, count=24),
+        *make.both_sides(make.wheel((0.05, deck + 0.04, 0.24), cheek, p.accent, count=24)),
         make.beam((0, deck - 0.01, 0.33), (0, deck + 0.06, 0.33), (0.035, 0.025), BLACK),
     ]
     tyre = [(0.0, 0.006), (0.012, 0.0), (0.03, 0.0), (0.034, 0.01), (0.034, 0.02), (0.03, 0.028),

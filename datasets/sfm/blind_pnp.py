@@ -240,10 +240,8 @@ def _find_layout(root: Path) -> tuple[Path, _Layout]:
 
 def _load_samples(file: Path) -> Any:
     value = load_pickle(file)
-    is_list = isinstance(value, list | tuple | dict) or (
-        isinstance(value, np.ndarray) and value.ndim > 0
-    )
-    if not is_list:
+    is_array = isinstance(value, np.ndarray) and value.ndim > 0
+    if not is_array and not isinstance(value, list | tuple | dict):
         raise DataError(f"holds {type(value).__name__}, not a list of samples", where=str(file))
     return value
 

@@ -34,7 +34,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.meshes.load import load_mesh
-from cadalign.datasets.models.annotations import parse_entry, require_unique
+from cadalign.datasets.models.annotations import entry_id, parse_entry, require_unique
 from cadalign.datasets.models.keypointnet import AnnotatedModel
 from cadalign.datasets.models.keypoints import Keypoints
 from cadalign.errors import CadalignError, DataError, InputError, quote
@@ -245,9 +245,9 @@ class ModelKeypoints:
             raise DataError(what, where=str(path), fix=_WANTED)
         parts = model.absolute().parts
         ids = {*parts, Path(parts[-1]).stem, *(part.split(".")[0] for part in parts)}
-        for entry in data:
-            model_id = entry.get("model_id") if isinstance(entry, dict) else None
-            if isinstance(model_id, str) and model_id in ids:
+        for position, entry in enumerate(data):
+            model_id = entry_id(entry, position)
+            if model_id in ids:
                 annotation = parse_entry(entry, where=f"{path}, {model_id}")
                 return cls._of_keypoints(annotation.keypoints, model, {})
         raise DataError(

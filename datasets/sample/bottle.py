@@ -238,9 +238,7 @@ def _ring(
     first: int, radius: float, height: float, exponent: float, depth: float
 ) -> dict[int, Point]:
     """Four places around the axis at one height, by semantic id."""
-    places = {}
-    for i, azimuth in enumerate(_AZIMUTHS):
-        x, z = np.sin(azimuth), np.cos(azimuth)
-        reach = radius / float(abs(x) ** exponent + abs(z) ** exponent) ** (1 / exponent)
-        places[first + i] = (reach * x, height, reach * z * depth)
-    return places
+    x, z = np.sin(_AZIMUTHS), np.cos(_AZIMUTHS)
+    reach = radius / (np.abs(x) ** exponent + np.abs(z) ** exponent) ** (1 / exponent)
+    xz = np.stack([reach * x, reach * z * depth], axis=1).tolist()
+    return {first + i: (x, height, z) for i, (x, z) in enumerate(xz)}

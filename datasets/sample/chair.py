@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import solids as make
 from cadalign.datasets.sample.chair_shape import ChairShape, lighter
 from cadalign.datasets.sample.model import Draft, mirrored_places
@@ -272,7 +271,10 @@ def _spindle_back(p: ChairShape) -> list[Solid]:
 
 def _club_back(p: ChairShape) -> list[Solid]:
     half, tall = p.back_half_width(1.0), p.back_height
-    path = _rounded_end(np.array(p.back_point(-0.1)), np.array(p.back_point(tall)), 0.05)
+    low, high = np.array(p.back_point(-0.1)), np.array(p.back_point(tall))
+    # The last stations lie close together and round the upper end off.
+    rest = 1 - np.array([0.05, 0.025, 0.006, 0.0]) / np.linalg.norm(high - low)
+    path = low + np.array([0.0, 0.5, *rest])[:, None] * (high - low)
     scales = [(1, 1), (1, 1), (1, 1), (0.985, 0.9), (0.95, 0.65), (0.92, 0.3)]
     outline = make.rounded_rectangle(2 * half, 0.16, radius=0.05, steps=4)
     back = make.sweep(path, outline, p.fabric, scales=scales)
@@ -280,13 +282,6 @@ def _club_back(p: ChairShape) -> list[Solid]:
     size = (2 * half - 0.2, 0.75 * tall, 0.08)
     pad = make.rounded_box((0, y + 0.02, z - 0.085), size, lighter(p.fabric), radius=0.035, steps=3)
     return [back, pad, make.rod((0, y, z - 0.12), (0, y, z - 0.13), 0.012, p.frame)]
-
-
-def _rounded_end(low: FloatArray, high: FloatArray, length: float) -> FloatArray:
-    """A straight path whose last stations lie close together."""
-    rest = 1 - np.array([length, 0.5 * length, 0.12 * length, 0.0]) / np.linalg.norm(high - low)
-    shares = np.concatenate([[0.0, 0.5], rest])
-    return np.asarray(low + shares[:, None] * (high - low))
 
 
 _BACKS: dict[str, Callable[[ChairShape], list[Solid]]] = {

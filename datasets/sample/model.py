@@ -97,15 +97,13 @@ def _join(solids: Sequence[Solid]) -> tuple[FloatArray, IntArray, FloatArray]:
     return positions, faces, split_colors
 
 
-def split_creases(
-    vertices: FloatArray, faces: IntArray, *, crease: float = _CREASE_DEGREES
-) -> tuple[FloatArray, IntArray]:
-    """Double the vertices along edges sharper than an angle [degrees]: new vertices and faces.
+def split_creases(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """Double the vertices along sharp edges: new vertices and faces.
 
     Shading then stays smooth only where the shape is.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    smooth = mesh.face_adjacency_angles < np.radians(crease)
+    smooth = mesh.face_adjacency_angles < np.radians(_CREASE_DEGREES)
     beside, ends = mesh.face_adjacency[smooth], mesh.face_adjacency_edges[smooth]
     # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
     corner = (faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)

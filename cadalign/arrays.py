@@ -39,7 +39,8 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     try:
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"not an array of numbers ({error})", where=name) from None
+        what = f"not an array of numbers ({str(error)[:200]})"
+        raise InputError(what, where=name) from None
     if np.ndim(value) == 0:
         array = array.reshape(())
     if array.ndim != len(shape) or any(

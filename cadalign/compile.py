@@ -29,9 +29,19 @@ def fast_sums(function: F) -> F:
     return _compiled(function, {"reassoc"})
 
 
-def _compiled(function: F, fastmath: set[str]) -> F:
+def inlined(function: F) -> F:
+    """Like `kernel`, for a small function that is always compiled into its callers."""
+    return _compiled(function, set(), forceinline=True)
+
+
+def _compiled(function: F, fastmath: set[str], *, forceinline: bool = False) -> F:
     dispatcher = numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath=fastmath or False, boundscheck=False
+        cache=True,
+        nogil=True,
+        error_model="numpy",
+        fastmath=fastmath or False,
+        boundscheck=False,
+        forceinline=forceinline,
     )(function)
     # Numba recompiles a function when its own file changes, but not when a function that it calls
     # in another file does. One stamp for the files of its folder and of the solvers corrects that.

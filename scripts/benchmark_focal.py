@@ -5,7 +5,6 @@ Prints tables and writes a JSON file.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from cadalign import Camera, RansacOptions, metrics
 from cadalign.errors import CadalignError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.io.files import write_json
 
 UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 ERRORS = (
@@ -43,7 +43,7 @@ class Arguments:
     problems: int = 1000
     """Random problems per row of accuracy."""
     robust_problems: int = 40
-    """Random problems per share of wrong keypoints."""
+    """Random problems per share of outliers."""
     seed: int = 0
     """Seed of the problems."""
 
@@ -67,8 +67,7 @@ def main(arguments: Arguments) -> None:
             f"{100 * row['found']:.1f} % none of these was kept and over 90 % of the others"
         )
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    results = {"accuracy": accuracy, "robust": robust}
-    arguments.out.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    write_json(arguments.out, {"accuracy": accuracy, "robust": robust})
     console.print(f"written to {arguments.out}")
 
 

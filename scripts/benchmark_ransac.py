@@ -7,11 +7,11 @@ stretch. Prints a table and writes a JSON file.
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from timeit import timeit
 
 import cv2
 import numpy as np
@@ -23,9 +23,9 @@ from rich.table import Table
 import cadalign
 from cadalign import Alignment, RansacOptions, metrics
 from cadalign.datasets import Bundler, Colmap, Correspondences
+from cadalign.io.files import write_json
 
-MAX_REPROJ_ERROR = 4.0
-SUCCESS_PROB = 0.9999
+OPTIONS = {"max_reproj_error": 4.0, "success_prob": 0.9999}
 OPENCV_DRAWS = 2  # it takes the better part of a second
 
 
@@ -40,9 +40,9 @@ class Arguments:
     out: Path = Path("bench/ransac.json")
     """JSON file to write."""
     draws: int = 20
-    """How often scales and outliers are drawn for each image."""
+    """Draws of scales and outliers for each image."""
     outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
-    """Shares of wrong image points."""
+    """Shares of outliers among the image points."""
 
 
 def main(arguments: Arguments) -> None:
@@ -69,7 +69,7 @@ def main(arguments: Arguments) -> None:
             )
     console.print(table)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    write_json(arguments.out, rows)
 
 
 def _measure(images: list[Correspondences], share: float, draws: int) -> dict[str, float]:
@@ -85,12 +85,7 @@ def _measure(images: list[Correspondences], share: float, draws: int) -> dict[st
             wrong = rng.choice(len(points_2d), round(share * len(points_2d)), replace=False)
             size = [image.camera.width - 1, image.camera.height - 1]
             points_2d[wrong] = rng.uniform([0, 0], size, (len(wrong), 2))
-            options = RansacOptions(
-                max_reproj_error=MAX_REPROJ_ERROR,
-                max_iterations=max_iterations,
-                success_prob=SUCCESS_PROB,
-                seed=draw,
-            )
+            options = RansacOptions(**OPTIONS, max_iterations=max_iterations, seed=draw)
             model = image.points_3d / scale
             start = time.perf_counter()
             try:
@@ -102,9 +97,9 @@ def _measure(images: list[Correspondences], share: float, draws: int) -> dict[st
             except cadalign.CadalignError:
                 succeeded.append(False)
             ours.append(time.perf_counter() - start)
-            poselibs.append(_seconds(_poselib, image, points_2d, max_iterations))
+            poselibs.append(timeit(partial(_poselib, image, points_2d, max_iterations), number=1))
             if draw < OPENCV_DRAWS:
-                opencvs.append(_seconds(_opencv, image, points_2d, 10_000))
+                opencvs.append(timeit(partial(_opencv, image, points_2d), number=1))
     seconds = float(np.median(ours))
     return {
         "outliers": share,
@@ -113,17 +108,6 @@ def _measure(images: list[Correspondences], share: float, draws: int) -> dict[st
         "over_poselib": seconds / float(np.median(poselibs)),
         "over_opencv": seconds / float(np.median(opencvs)),
     }
-
-
-def _seconds(
-    run: Callable[[Correspondences, np.ndarray, int], object],
-    image: Correspondences,
-    points_2d: np.ndarray,
-    iterations: int,
-) -> float:
-    start = time.perf_counter()
-    run(image, points_2d, iterations)
-    return time.perf_counter() - start
 
 
 def _undistorted(image: Correspondences, points_2d: np.ndarray) -> np.ndarray:
@@ -142,25 +126,21 @@ def _poselib(image: Correspondences, points_2d: np.ndarray, iterations: int) -> 
             "height": camera.height,
             "params": [camera.fx, camera.fy, camera.cx, camera.cy],
         },
-        {
-            "max_reproj_error": MAX_REPROJ_ERROR,
-            "max_iterations": iterations,
-            "success_prob": SUCCESS_PROB,
-        },
+        OPTIONS | {"max_iterations": iterations},
         {},
     )
 
 
-def _opencv(image: Correspondences, points_2d: np.ndarray, iterations: int) -> object:
+def _opencv(image: Correspondences, points_2d: np.ndarray) -> object:
     return cv2.solvePnPRansac(
         image.points_3d,
         _undistorted(image, points_2d),
         image.camera.matrix,
         None,
         flags=cv2.SOLVEPNP_EPNP,
-        iterationsCount=iterations,
-        reprojectionError=MAX_REPROJ_ERROR,
-        confidence=SUCCESS_PROB,
+        iterationsCount=10_000,
+        reprojectionError=OPTIONS["max_reproj_error"],
+        confidence=OPTIONS["success_prob"],
     )
 
 

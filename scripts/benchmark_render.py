@@ -6,12 +6,12 @@ programs may share the machine.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -20,6 +20,7 @@ from rich.table import Table
 
 from cadalign import Alignment, Camera
 from cadalign.errors import RenderError
+from cadalign.io.files import write_json
 from cadalign.render import (
     RaycastRenderer,
     Renderer,
@@ -53,81 +54,69 @@ class Arguments:
     """Timed frames per figure; the median counts."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Times of one task [ms]."""
-
-    task: str
-    median: float
-    smallest: float
-    limit: float | None
-
-
 def main(arguments: Arguments) -> None:
     """Run all measurements."""
     camera = Camera.from_fov(640, 480, fov_x=50.0)
     scene = Scene(ball(5))
     rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
     pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
-    timings = measure(scene, camera, pose, arguments.repetitions)
-    print_table(timings, share=float(cast_geometry(scene, camera, pose).mask.mean()))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    rows = {"cores": os.cpu_count(), "timings": [asdict(timing) for timing in timings]}
-    arguments.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-
-
-def measure(scene: Scene, camera: Camera, pose: Alignment, repetitions: int) -> list[Timing]:
-    """Time everything, each after a first run that prepares what is prepared once."""
-    rng = np.random.default_rng(0)
-    keypoints = scene.mesh.vertices[rng.choice(len(scene.mesh.vertices), KEYPOINTS)]
-    tasks: dict[str, Callable[[], object]] = {
-        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
-        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
-        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
-        "raycast: geometry": lambda: cast_geometry(scene, camera, pose),
-    }
-    plain = RaycastRenderer(studio=Studio(occlusion=0))
-    tasks["raycast: colour"] = _drawing(RaycastRenderer(), scene, camera, pose)
-    tasks["raycast: colour, no ambient occlusion"] = _drawing(plain, scene, camera, pose)
-    for name in ("open3d", "pyrender"):
-        try:
-            tasks[f"{name}: colour"] = _drawing(make_renderer(name), scene, camera, pose)
-        except RenderError as error:
-            Console(stderr=True).print(str(error), markup=False)
-            continue
-        if name == "open3d":
-            tasks["open3d: geometry"] = lambda: cast_geometry(
-                scene, camera, pose, caster=scene.open3d_caster
-            )
-    return [_timed(name, task, repetitions) for name, task in tasks.items()]
-
-
-def print_table(timings: list[Timing], *, share: float) -> None:
-    """Print the times beside what is allowed."""
+    rows = [
+        timed(name, task, arguments.repetitions)
+        for name, task in tasks(scene, camera, pose).items()
+    ]
+    share = float(cast_geometry(scene, camera, pose).mask.mean())
     table = Table(title=f"640 x 480 px, 20,480 triangles on {100 * share:.0f} % of the image")
     table.add_column("task")
     for name in ("median ms", "smallest ms", "limit ms"):
         table.add_column(name, justify="right")
-    for timing in timings:
-        limit = "" if timing.limit is None else f"{timing.limit:g}"
-        table.add_row(timing.task, f"{timing.median:.2f}", f"{timing.smallest:.2f}", limit)
+    for row in rows:
+        limit = "" if row["limit"] is None else f"{row['limit']:g}"
+        table.add_row(row["task"], f"{row['median']:.2f}", f"{row['smallest']:.2f}", limit)
     Console(width=100).print(table)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(arguments.out, {"cores": os.cpu_count(), "timings": rows})
 
 
-def _drawing(
-    renderer: Renderer, scene: Scene, camera: Camera, pose: Alignment
-) -> Callable[[], object]:
-    return lambda: renderer.render(scene, camera, pose)
+def tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[], object]]:
+    """Everything that is timed, by name."""
+
+    def drawing(renderer: Renderer) -> Callable[[], object]:
+        return lambda: renderer.render(scene, camera, pose)
+
+    rng = np.random.default_rng(0)
+    keypoints = scene.mesh.vertices[rng.choice(len(scene.mesh.vertices), KEYPOINTS)]
+    plain = RaycastRenderer(studio=Studio(occlusion=0))
+    found: dict[str, Callable[[], object]] = {
+        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
+        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
+        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
+        "raycast: geometry": lambda: cast_geometry(scene, camera, pose),
+        "raycast: colour": drawing(RaycastRenderer()),
+        "raycast: colour, no ambient occlusion": drawing(plain),
+    }
+    for name in ("open3d", "pyrender"):
+        try:
+            found[f"{name}: colour"] = drawing(make_renderer(name))
+        except RenderError as error:
+            Console(stderr=True).print(str(error), markup=False)
+            continue
+        if name == "open3d":
+            found["open3d: geometry"] = lambda: cast_geometry(
+                scene, camera, pose, caster=scene.open3d_caster
+            )
+    return found
 
 
-def _timed(name: str, task: Callable[[], object], repetitions: int) -> Timing:
+def timed(name: str, task: Callable[[], object], repetitions: int) -> dict[str, Any]:
+    """Times [ms] of a task, after a first run that prepares what is prepared once."""
     task()
     times = []
     for _ in range(repetitions):
         begin = time.perf_counter()
         task()
         times.append(1000 * (time.perf_counter() - begin))
-    return Timing(name, float(np.median(times)), min(times), LIMITS.get(name))
+    median = float(np.median(times))
+    return {"task": name, "median": median, "smallest": min(times), "limit": LIMITS.get(name)}
 
 
 if __name__ == "__main__":

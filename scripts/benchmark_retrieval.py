@@ -1,9 +1,9 @@
-"""Measure retrieval: time of a query and memory, for real models and for 50,000 made ones.
+"""Measure retrieval: time of a query and memory, for real and for 50,000 synthetic models.
 
     python scripts/benchmark_retrieval.py KEYPOINTNET
 
-The made models are the real ones, their keypoints moved by 3 % of the extent. Times are the least
-of three calls with as many threads as there are cores, after warm-up.
+The synthetic models are the real ones with their keypoints moved by 3 % of the extent. Times are
+the least of three calls with as many threads as there are cores, after warm-up.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def jittered(models: Sequence[LibraryModel], count: int) -> Library:
 
 
 def measure(library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int) -> str:
-    """Times of queries for some of the models, in words."""
+    """Text on the times of queries for some of the models."""
     wall, busy, found = [], [], 0
     for model in models:
         try:
@@ -97,7 +97,7 @@ def main() -> None:
 
 
 def _first_query(models: Sequence[LibraryModel]) -> tuple:
-    """Something to warm up with."""
+    """A query to warm up with."""
     for model in models:
         try:
             seen = observe_model(model, RetrievalTask(*model.key, 1.0, KEYPOINTS), seed=1)

@@ -25,10 +25,9 @@ from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_lim
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
 from cadalign.fitting.noise import whitening_of
-from cadalign.solvers.constants import LINEAR, UNKNOWNS
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
-from cadalign.solvers.objective import Objective, evaluate_cost
+from cadalign.solvers.objective import evaluate_cost, keypoint_objective
 from cadalign.solvers.refine import refine
 
 ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))
@@ -193,27 +192,16 @@ def _accuracy_row(
 
 
 def _is_missed(problem: Problem, noise: float, est: cadalign.Alignment) -> bool:
-    """Whether a refinement from the truth ends at a better alignment."""
+    """True if a refinement from the truth ends at a better alignment."""
     rays = problem.camera.normalize(problem.points_2d)
-    objective = Objective(
-        problem.points_3d,
-        rays,
-        whitening_of(noise, rays, problem.camera),
-        LINEAR,
-        1.0,
-        0.0,
-        np.ones(UNKNOWNS),
-    )
-    cost, _, _ = refine(objective, 200, _pack(problem.alignment))
-    return bool(cost < evaluate_cost(objective, _pack(est)) * (1 - 1e-6) - 1e-9)
-
-
-def _pack(alignment: cadalign.Alignment) -> np.ndarray:
-    return np.concatenate([alignment.rotation.ravel(), alignment.translation, alignment.scale])
+    whitening = whitening_of(noise, rays, problem.camera)
+    objective = keypoint_objective(problem.points_3d, rays, whitening)
+    cost, _, _ = refine(objective, 200, problem.alignment.packed)
+    return bool(cost < evaluate_cost(objective, est.packed) * (1 - 1e-6) - 1e-9)
 
 
 def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
-    """How often the truth is among the minimal solver's solutions, and how many there are."""
+    """Rate of the truth among the minimal solver's solutions, and their number."""
     rng = np.random.default_rng(arguments.seed)
     found = solutions = 0
     for _ in range(arguments.problems):

@@ -55,6 +55,13 @@ def test_linked_files_exist(path: Path) -> None:
         assert (path.parent / link).exists(), link
 
 
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_named_modules_exist(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:[\w.]+/)+[\w.]*)`", text):
+        assert any((folder / path).exists() for folder in (ROOT, ROOT / "cadalign")), path
+
+
 def test_picture_of_the_architecture_shows_the_list_of_layers() -> None:
     picture = (ROOT / "docs" / "architecture.svg").read_text(encoding="utf-8")
     shown = re.findall(r'font-family="monospace">([a-z]+)<', picture)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.prediction import predicted_covariances, projection_jacobian
 from cadalign.arrays import FloatArray
+from cadalign.fitting.prediction import predicted_covariances, projection_jacobian
 from cadalign.fitting.uncertainty import unknown_axes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.prediction import predicted_covariances, projection_jacobian
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError
+from cadalign.fitting.prediction import predicted_covariances, projection_jacobian
 from cadalign.fitting.result import FitResult
 
 Rows = npt.NDArray[np.intp]

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cadalign.cli.evaluate import RunCommand, command_of
 from cadalign.cli.output import new_console
-from cadalign.cli.runs import NOTHING_WORKED, SUCCESS, RunCommand, command_of, conclude
+from cadalign.cli.runs import NOTHING_WORKED, SUCCESS, conclude
 from cadalign.evaluation.demo.options import DemoOptions
 
 

@@ -2,18 +2,110 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from functools import reduce
+from inspect import getdoc
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from cadalign.cli.runs import command_of, conclude
-from cadalign.errors import DataError
+from cadalign.cli.runs import conclude, run_progress
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.spec import Spec
 
 _COMMAND = "evaluate"
+_EXIT_CODES = (
+    "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
+    "all rows failed, 2 a wrong command line."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCommand(RunOptions):
+    """Command of an experiment; see `command_of`."""
+
+    options_type: ClassVar[type[ExperimentOptions]]
+
+    json: bool = False
+    """Print the summary as JSON."""
+
+    def __post_init__(self) -> None:
+        """Check nothing: options check themselves once the command runs, and refuse in one line."""
+
+    def run(self) -> int:
+        """Do the run and say what came out; returns the exit code."""
+        from cadalign.cli.report import write_run_report
+
+        spec, run = self.do_run()
+        code = conclude(spec, run, json=self.json)
+        write_run_report(run.folder)
+        return code
+
+    def do_run(self) -> tuple[Spec, Run]:
+        """Do the run, showing its progress; gives its specification and its tables.
+
+        Raises
+        ------
+        InputError
+            Which names options as flags, the way in which they were typed.
+        """
+        from cadalign.evaluation.registry import spec_named
+        from cadalign.evaluation.runs.folder import RunFolder
+        from cadalign.evaluation.runs.opened import Run
+        from cadalign.evaluation.runs.run import execute, workers_of
+
+        kind = self.options_type
+        spec = spec_named(kind.experiment)
+        try:
+            options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
+            count = options.default_workers if self.workers is None else self.workers
+            workers = workers_of(count, dask=self.dask)
+            out = self.out or Path("runs") / options.run_name
+            plan = spec.plan(options, RunFolder(out))
+        except InputError as error:
+            if error.where not in {field.name for field in fields(self)}:
+                raise
+            flag = f"--{error.where.replace('_', '-')}"
+            raise InputError(error.what, where=flag, fix=error.fix) from None
+        with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
+            execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
+        return spec, Run.open(out)
+
+
+def command_of(
+    options: type[ExperimentOptions],
+    base: type[RunCommand] = RunCommand,
+    *,
+    about: str | None = None,
+    **defaults: Any,
+) -> Any:
+    """The command of an experiment: its options, and those of every run.
+
+    Parameters
+    ----------
+    options : type
+        The experiment's options.
+    base : type
+        The command's own options, and what it does.
+    about : str, optional
+        Its help; by default that of the options.
+    **defaults
+        Options that it gives and that cannot be typed.
+    """
+    given = [
+        (name, Annotated[str, tyro.conf.Suppress], field(default=value))
+        for name, value in defaults.items()
+    ]
+    namespace = {"options_type": options, "__doc__": about or options.__doc__}
+    return make_dataclass(
+        options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +142,10 @@ def _commands() -> Any:
     from cadalign.evaluation.registry import known_options
 
     commands: list[Any] = [
-        Annotated[command_of(options), tyro.conf.subcommand(options.experiment)]
+        Annotated[
+            command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}"),
+            tyro.conf.subcommand(options.experiment),
+        ]
         for options in known_options()
         if options.command == _COMMAND
     ]

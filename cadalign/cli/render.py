@@ -35,7 +35,8 @@ class Render:
     background: str = "grey"
     """grey, white, black, #rrggbb, or transparent (PNG stills)."""
     keypoints: Path | None = None
-    """JSON file with keypoints to draw: a list of [x, y, z], or KeypointNet's annotations."""
+    """JSON file with keypoints to draw: a list of [x, y, z], a model's .keypoints.json, or
+    KeypointNet's annotations."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Stretch along the model's axes."""
     fov: float = 35.0
@@ -51,7 +52,7 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
-        from cadalign.render.drawing.job import RenderJob, draw_movie, draw_picture
+        from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
         with named_as_flags(self):

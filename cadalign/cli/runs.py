@@ -1,4 +1,4 @@
-"""Commands that do runs: their options, progress, exit codes, and the summary at the end."""
+"""Progress of runs, exit codes, and the summary at the end."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import tyro
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -24,8 +21,6 @@ from rich.progress import (
 from rich.text import Text
 
 from cadalign.cli.output import new_console
-from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions, RunOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,88 +38,6 @@ SOME_FAILED: Final = 3
 """The run is finished and its tables are written, but some rows say ``failed``."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunCommand(RunOptions):
-    """What the commands of experiments share; see `command_of`."""
-
-    options_type: ClassVar[type[ExperimentOptions]]
-
-    json: bool = False
-    """Print the summary as JSON."""
-
-    def __post_init__(self) -> None:
-        """Check nothing: options check themselves once the command runs, and refuse in one line."""
-
-    def run(self) -> int:
-        """Do the run and say what came out; returns the exit code."""
-        from cadalign.cli.report import write_run_report
-
-        spec, run = self.do_run()
-        code = conclude(spec, run, json=self.json)
-        write_run_report(run.folder)
-        return code
-
-    def do_run(self) -> tuple[Spec, Run]:
-        """Do the run, showing its progress; gives its specification and its tables.
-
-        Raises
-        ------
-        InputError
-            Which names options as flags, the way in which they were typed.
-        """
-        from cadalign.evaluation.registry import spec_named
-        from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.opened import Run
-        from cadalign.evaluation.runs.run import execute, workers_of
-
-        kind = self.options_type
-        spec = spec_named(kind.experiment)
-        try:
-            options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
-            count = options.default_workers if self.workers is None else self.workers
-            workers = workers_of(count, dask=self.dask)
-            out = self.out or Path("runs") / options.run_name
-            plan = spec.plan(options, RunFolder(out))
-        except InputError as error:
-            if error.where not in {field.name for field in fields(self)}:
-                raise
-            flag = f"--{error.where.replace('_', '-')}"
-            raise InputError(error.what, where=flag, fix=error.fix) from None
-        with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
-            execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
-        return spec, Run.open(out)
-
-
-def command_of(
-    options: type[ExperimentOptions],
-    base: type[RunCommand] = RunCommand,
-    *,
-    about: str | None = None,
-    **defaults: Any,
-) -> Any:
-    """The command of an experiment: its options, and those of every run.
-
-    Parameters
-    ----------
-    options : type
-        The experiment's options.
-    base : type
-        The command's own options, and what it does.
-    about : str, optional
-        Its help; by default that of the options.
-    **defaults
-        Options that it gives and that cannot be typed.
-    """
-    given = [
-        (name, Annotated[str, tyro.conf.Suppress], field(default=value))
-        for name, value in defaults.items()
-    ]
-    namespace = {"options_type": options, "__doc__": about or options.__doc__}
-    return make_dataclass(
-        options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
-    )
-
-
 def conclude(spec: Spec, run: Run, *, json: bool) -> int:
     """Write a finished run's summary and figures, and say what came out; returns the exit code."""
     summaries = spec.write(run)
@@ -136,7 +49,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
                 "rows": found.rows,
                 "failed": found.failed,
                 **found.counts,
-                "summary": [asdict(summary) for summary in summaries],
+                "summary": [summary.to_dict() for summary in summaries],
             }
         )
     else:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from cadalign.cli.runs import command_of
+from cadalign.cli.evaluate import command_of
 from cadalign.evaluation.simulation.options import SweepOptions
 
 _ABOUT = {

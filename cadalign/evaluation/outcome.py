@@ -17,7 +17,7 @@ FAILED = "failed"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method reached on one task.
+    """Result of one method on one task.
 
     Parameters
     ----------

@@ -78,11 +78,11 @@ class Plot:
     traces : list of Trace
     note : str
     caption : str
-        What is held, and the number of problems; for the figure.
+        Quantities that are held, and the number of problems; for the figure.
     figure : str
         Name of the figure; plots of the same name are drawn into one.
     variant : str
-        What sets it apart from others in the same figure.
+        Text that sets it apart from others in the same figure.
     title : str
         By default made of the axes' labels.
     """

@@ -13,18 +13,17 @@ from cadalign.evaluation.plots import Plot, draw_plots
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.summary import Conclusion, ConsoleTable, Line, summary_csv
+from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
-Summaries = Sequence[Any]
-"""Summaries of one experiment, each with a method ``cells()``."""
+Summaries = Sequence[Summary]
 
 
 @dataclass(frozen=True)
 class Reference:
     """Published numbers beside a headline table, and a note on them."""
 
-    lines: tuple[Line, ...] = ()
+    lines: tuple[Summary, ...] = ()
     note: str = ""
 
 
@@ -49,7 +48,7 @@ class Spec:
     summarize : callable
         Makes summaries of a run, finished or not; see `cadalign.evaluation.summary.medians`.
     lines : callable
-        Makes lines of the headline table from summaries; by default they are such lines.
+        Makes lines of the headline table from summaries; by default a line of each.
     table : callable, optional
         Makes the table for the console of a run and its summaries; by default the headline table.
     group : callable
@@ -80,7 +79,7 @@ class Spec:
     plan: Callable[[Any, RunFolder], Plan[Any]]
     columns: tuple[Metric, ...]
     summarize: Callable[[Run], Summaries]
-    lines: Callable[[Summaries], Sequence[Line]] = list
+    lines: Callable[[Summaries], Summaries] = list
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
     group: Callable[[Run], Metric] = lambda run: CATEGORY
     plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
@@ -110,14 +109,14 @@ class Spec:
             labels=(self.group(run).heading, "method"),
             heads=tuple(column.symbol for column in columns),
             rows=[
-                (line.group, line.method, *(c.text(line.values.get(c.key)) for c in columns))
+                (line.group, line.method, *(c.text(line.number(c.key)) for c in columns))
                 for line in lines
             ],
         )
 
-    def shown_columns(self, lines: Sequence[Line]) -> list[Metric]:
+    def shown_columns(self, lines: Summaries) -> list[Metric]:
         """The columns that some line has a value of."""
-        return [c for c in self.columns if any(c.key in line.values for line in lines)]
+        return [c for c in self.columns if any(line.number(c.key) is not None for line in lines)]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run.
@@ -128,7 +127,9 @@ class Spec:
             If the files cannot be written.
         """
         summaries = self.summarize(run)
-        write_text(run.folder.summary, summary_csv(summaries))
+        write_text(
+            run.folder.summary, summary_csv(summaries, rename={"value": self.group(run).key})
+        )
         plots = self.plots([run])
         if plots:
             draw_plots(run.folder.made_figures(), plots)

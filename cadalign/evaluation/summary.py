@@ -6,47 +6,74 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics import CATEGORY, Metric
+from cadalign.evaluation.metrics import CATEGORY, INSTANCES, Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
+from cadalign.evaluation.runs.tables import Row
 
 ALL = "all"
 """Name of the summary over all categories."""
 
 
 @dataclass(frozen=True)
-class Line:
-    """Numbers of one method on one group of tasks: a line of a headline table.
+class Summary:
+    """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
 
     Parameters
     ----------
     group : str
-        Name of the group.
-    method : str
+        Name of the group in tables.
+    names : dict
+        Columns that name the row, the method among them.
     values : dict
-        Numbers by the metric's key, in the metric's own unit.
+        Numbers and `Quartiles` by column, in the metrics' own units; NaN for what is unknown.
+    tasks : int, optional
+        Number of tasks, for the headline's column of that name; by default ``instances``.
     """
 
     group: str
-    method: str
-    values: Mapping[str, Any]
+    names: Row
+    values: Row
+    tasks: int | None = None
 
-    def cells(self) -> dict[str, Any]:
-        """All numbers by name, flat."""
-        return {"group": self.group, "method": self.method, **self.values}
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return str(self.names["method"])
 
+    def __getitem__(self, column: str) -> Any:
+        """A cell of the row."""
+        return self.names[column] if column in self.names else self.values[column]
 
-class Summary(Protocol):
-    """What a summary must tell of itself."""
+    def number(self, key: str) -> float | None:
+        """The number of a metric, the median where there are quartiles; None if there is none."""
+        if key == INSTANCES.key and self.tasks is not None:
+            return self.tasks
+        value = self.values.get(key)
+        return value.median if isinstance(value, Quartiles) else value
 
-    def cells(self) -> dict[str, Any]:
-        """All numbers by name, flat: a row of ``summary.csv``."""
+    def cells(self) -> Row:
+        """All cells, flat: quartiles are three."""
+        cells = dict(self.names)
+        for name, value in self.values.items():
+            if isinstance(value, Quartiles):
+                cells[f"{name}_lower_quartile"] = value.lower
+                cells[f"{name}_median"] = value.median
+                cells[f"{name}_upper_quartile"] = value.upper
+            else:
+                cells[name] = value
+        return cells
+
+    def to_dict(self) -> Row:
+        """All cells for JSON."""
+        quartiles = {name: vars(v) for name, v in self.values.items() if isinstance(v, Quartiles)}
+        return {**self.names, **self.values, **quartiles}
 
 
 @dataclass(frozen=True)
@@ -91,7 +118,7 @@ class Conclusion:
     counts : dict
         More numbers to be told.
     note : str
-        What is to be said of the failed rows.
+        Remark on the failed rows.
     """
 
     rows: int
@@ -142,31 +169,17 @@ class Quartiles:
         return cls(*np.percentile(values, [25, 50, 75]).tolist())
 
 
-def flat(summary: object) -> dict[str, Any]:
-    """The fields of a summary by name, quartiles as three cells."""
-    cells: dict[str, Any] = {}
-    for name, value in vars(summary).items():
-        if isinstance(value, Quartiles):
-            for quartile in ("lower", "median", "upper"):
-                suffix = "" if quartile == "median" else "_quartile"
-                cells[f"{name}_{quartile}{suffix}"] = getattr(value, quartile)
-        else:
-            cells[name] = value
-    return cells
-
-
-def summary_csv(summaries: Sequence[Summary]) -> str:
-    """The summaries as a CSV file; cells without a number are empty."""
+def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> str:
+    """The summaries as a CSV file, some columns by another name; unknown cells are empty."""
     rows = [summary.cells() for summary in summaries]
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({name: "" if value != value else value for name, value in row.items()})
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([rename.get(name, name) for name in rows[0]])
+    writer.writerows(["" if value != value else value for value in row.values()] for row in rows)
     return text.getvalue()
 
 
-def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Line]:
+def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Summary]:
     """Numbers of rows, of failures, and medians of the others, for every group and method.
 
     Parameters
@@ -179,15 +192,16 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
     """
     cells = run.cells
     metrics = [metric.key for metric in columns if metric.key in cells]
-    lines = []
+    summaries = []
     for value in sorted(set(cells[group.key].tolist())):
         for method in run.methods:
             chosen = (cells[group.key] == value) & (cells["method"] == method)
             solved = chosen & (cells["status"] == OK)
             counts = {"instances": int(chosen.sum()), "failed": int((chosen & ~solved).sum())}
             values = {name: median_of(cells[name][solved]) for name in metrics}
-            lines.append(Line(group_name(group, value), method, {**counts, **values}))
-    return lines
+            names = {group.key: value, "method": method}
+            summaries.append(Summary(group_name(group, value), names, {**counts, **values}))
+    return summaries
 
 
 def group_name(group: Metric, value: Any) -> str:

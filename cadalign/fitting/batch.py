@@ -1,4 +1,4 @@
-"""What a batch of fits returns."""
+"""Result of a batch of fits."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError
-from cadalign.fitting.estimation import Solutions
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.result import FitResult
+from cadalign.fitting.solutions import Solutions
 from cadalign.geometry.alignment import Alignment
+from cadalign.solvers.constants import POSE_SIZE
 
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
     """Alignments of B independent problems.
 
-    The rows of a problem without solution are NaN, and ``errors`` says why.
+    The rows of a problem without solution are NaN, ``errors`` has the reason.
 
     Parameters
     ----------
@@ -41,7 +42,7 @@ class BatchResult:
     offsets : (B + 1,) int
         Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of residuals and inliers.
     errors : mapping of int to CadalignError
-        By problem.
+        Reasons why problems have no solution, by problem.
     """
 
     rotation: FloatArray
@@ -60,7 +61,7 @@ class BatchResult:
 
     @property
     def solved(self) -> npt.NDArray[np.bool_]:
-        """Which problems have a solution, (B,) bool."""
+        """Marks the problems that have a solution, (B,) bool."""
         solved = np.ones(len(self), dtype=bool)
         solved[list(self.errors)] = False
         return solved
@@ -71,7 +72,7 @@ class BatchResult:
         Raises
         ------
         CadalignError
-            Why the problem has none.
+            The reason why the problem has none.
         """
         if problem in self.errors:
             raise self.errors[problem]
@@ -79,35 +80,33 @@ class BatchResult:
 
     @classmethod
     def of_solutions(cls, problems: Problems, solutions: Solutions) -> BatchResult:
-        """Arrange what a solver found."""
-        errors = dict(solutions.errors)
-        focals = np.broadcast_to(problems.calibrations[:, 0], len(problems)).copy()
+        """Arrange the solutions of a solver."""
+        failed = np.zeros(len(problems), dtype=bool)
+        failed[list(solutions.errors)] = True
+        focals = np.broadcast_to(problems.calibrations[:, 0], len(problems))
         if solutions.focals is not None:
-            focals = solutions.focals[:, 0].copy()
-        focals[list(errors)] = np.nan
+            focals = solutions.focals[:, 0]
+        poses, residuals = solutions.poses[:, 0].copy(), solutions.residuals
         covariance = solutions.covariances
-        poses = solutions.poses[:, 0].copy()
-        residuals = solutions.residuals
-        for b in errors:
-            poses[b] = np.nan
-            residuals[problems.rows(b)] = np.nan
+        inliers = np.repeat(~failed, problems.counts)
+        if failed.any():
+            poses = np.where(failed[:, None], np.nan, poses)
+            residuals = np.where(inliers[:, None], residuals, np.nan)
             if covariance is not None:
-                covariance[b] = np.nan
-        counts = np.maximum(np.diff(problems.offsets), 1)
+                covariance = np.where(failed[:, None, None], np.nan, covariance)
         squares = np.append((residuals**2).sum(axis=1), 0.0)
-        rms = np.sqrt(np.add.reduceat(squares, problems.offsets[:-1]) / counts)
-        rms[list(errors)] = np.nan
+        means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
         return cls(
             rotation=poses[:, :9].reshape(-1, 3, 3),
             translation=poses[:, 9:12],
             scale=poses[:, 12:],
-            rms=rms,
+            rms=np.where(failed, np.nan, np.sqrt(means)),
             covariance=covariance,
-            focal_length=focals,
+            focal_length=np.where(failed, np.nan, focals),
             residuals=residuals,
-            inliers=np.repeat(~np.isnan(rms), problems.counts),
+            inliers=inliers,
             offsets=problems.offsets,
-            errors=errors,
+            errors=dict(solutions.errors),
         )
 
     @classmethod
@@ -117,30 +116,33 @@ class BatchResult:
         """Arrange single results, or the errors in their place."""
         count, total = len(problems), len(problems.points_3d)
         unknowns = 9 if focal == "estimate" else 8
-        batch = cls(
-            rotation=np.full((count, 3, 3), np.nan),
-            translation=np.full((count, 3), np.nan),
-            scale=np.full((count, 3), np.nan),
-            rms=np.full(count, np.nan),
-            covariance=np.full((count, unknowns, unknowns), np.nan),
-            focal_length=np.full(count, np.nan),
-            residuals=np.full((total, 2), np.nan),
-            inliers=np.zeros(total, dtype=bool),
+        poses = np.full((count, POSE_SIZE), np.nan)
+        rms = np.full(count, np.nan)
+        focals = np.full(count, np.nan)
+        covariance = np.full((count, unknowns, unknowns), np.nan)
+        residuals = np.full((total, 2), np.nan)
+        inliers = np.zeros(total, dtype=bool)
+        for b, fit in enumerate(fits):
+            if isinstance(fit, FitResult):
+                poses[b] = fit.alignment.packed
+                rms[b] = fit.rms
+                focals[b] = fit.camera.fx
+                residuals[problems.rows(b)] = fit.residuals
+                inliers[problems.rows(b)] = fit.inliers
+                if fit.covariance is not None:
+                    covariance[b] = fit.covariance
+        return cls(
+            rotation=poses[:, :9].reshape(-1, 3, 3),
+            translation=poses[:, 9:12],
+            scale=poses[:, 12:],
+            rms=rms,
+            covariance=covariance,
+            focal_length=focals,
+            residuals=residuals,
+            inliers=inliers,
             offsets=problems.offsets,
             errors={b: fit for b, fit in enumerate(fits) if isinstance(fit, CadalignError)},
         )
-        for b, fit in enumerate(fits):
-            if isinstance(fit, FitResult):
-                batch.rotation[b] = fit.alignment.rotation
-                batch.translation[b] = fit.alignment.translation
-                batch.scale[b] = fit.alignment.scale
-                batch.rms[b] = fit.rms
-                batch.focal_length[b] = fit.camera.fx
-                batch.residuals[problems.rows(b)] = fit.residuals
-                batch.inliers[problems.rows(b)] = fit.inliers
-                if fit.covariance is not None and batch.covariance is not None:
-                    batch.covariance[b] = fit.covariance
-        return batch
 
     @classmethod
     def joined(cls, parts: Sequence[BatchResult]) -> BatchResult:

@@ -1,4 +1,4 @@
-"""The errors that solvers' statuses stand for, in words."""
+"""Conversion of solver status codes to exceptions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from cadalign.solvers.linear import describe_plane
 def solver_error(
     status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
 ) -> DegenerateError:
-    """The error that a solver's status stands for.
+    """Convert a solver's status to an exception.
 
     Parameters
     ----------
     status : int
         See `cadalign.solvers.constants`.
     undetermined : int
-        Which of the solvers' unknowns is not determined, or -1.
+        Number of an unknown of the solvers that is not determined, or -1.
     points_3d : (n, 3) float
     options : FitOptions
     """

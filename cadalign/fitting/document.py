@@ -64,7 +64,8 @@ def read_result(data: Mapping[str, Any]) -> FitResult:
         If a field is missing or invalid.
     """
     try:
-        return _result(convert(data, _Result))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _result(convert(data, _Result))
     except CadalignError as error:
         place = f"fit result: {error.where}" if error.where else "fit result"
         raise InputError(error.what, where=place, fix=error.fix) from None

@@ -12,16 +12,22 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.batch import BatchResult
-from cadalign.fitting.estimation import solve
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 from cadalign.fitting.problems import Problems, pack_many, pack_one
-from cadalign.fitting.result import FitResult
-from cadalign.fitting.single import fit_all, fit_robustly
+from cadalign.fitting.result import Alternative, FitResult, FitStats
+from cadalign.fitting.robust import find_consensus, residuals_of
+from cadalign.fitting.solutions import Solutions
+from cadalign.fitting.solve import solve
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+
+LEAST_LIKELIHOOD = 1e-3
+"""Relative likelihood above which another minimum is reported as an alternative."""
+_INLIER_ROUNDS = 5
 
 
 def fit(
@@ -41,7 +47,7 @@ def fit(
     ransac: RansacOptions | None = None,
     confidences: npt.ArrayLike | None = None,
 ) -> FitResult:
-    """Find rotation, translation and stretch of a model from its keypoints in one image.
+    """Estimate rotation, translation and stretch of a model from its keypoints in one image.
 
     Parameters
     ----------
@@ -64,9 +70,9 @@ def fit(
         estimates it from the residuals: the choice for a model that is only similar to the object,
         where shapes differ by more than the pixels' noise.
     loss : {"linear", "huber", "cauchy"}
-        How the length of a residual counts: squared, or less once it exceeds ``loss_scale``.
+        Loss on the length of a residual: its square, or less once it exceeds ``loss_scale``.
     loss_scale : float
-        Where a robust loss begins to bend [sigma].
+        Length at which a robust loss begins to bend [sigma].
     stretch : str, optional
         The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
         or ``"none"``. The others keep the scale 1.
@@ -76,17 +82,16 @@ def fit(
     known_axis : {"x", "y", "z"}
         The model's axis whose length is right. One image alone does not tell size from distance.
     focal : {"known", "estimate"}
-        Whether the camera's focal length is right, or is estimated too: a ninth unknown, for which
+        Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
         5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
         pixels are the camera's.
     focal_prior : FocalPrior, optional
-        What is known of the focal length to be estimated, from EXIF for example:
-        `FocalPrior.from_exif`.
+        Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`.
     ransac : RansacOptions, optional
-        Search for the alignment that the most keypoints support, and fit to these: for keypoints of
-        which some are wrong. ``result.inliers`` tells which were kept.
+        Search for the alignment with the most inliers, and fit to these: for keypoints with
+        outliers. ``result.inliers`` marks the inliers.
     confidences : (n,) float, optional
-        How much each keypoint is trusted, for ``ransac``: samples are drawn from the highest first.
+        Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
 
     Returns
     -------
@@ -133,8 +138,8 @@ def fit(
     problems = pack_one(points_3d, points_2d, camera)
     if ransac is None:
         _refuse_confidences(confidences)
-        return fit_all(problems, options, start)
-    return fit_robustly(problems, options, ransac, confidences, start)
+        return _fit_all(problems, options, start)
+    return _fit_robustly(problems, options, ransac, confidences, start)
 
 
 def fit_batch(
@@ -172,7 +177,7 @@ def fit_batch(
     confidences : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
     workers : int
-        How many threads share the problems; -1 for as many as there are cores.
+        Number of threads that share the problems; -1 for all cores.
 
     Returns
     -------
@@ -224,7 +229,7 @@ def fit_batch(
     if workers == -1:
         workers = os.cpu_count() or 1
     if workers < 1:
-        raise InputError(f"{workers} is not a number of threads", where="workers", fix="or -1")
+        raise InputError(f"must be >= 1, or -1 for all cores, not {workers}", where="workers")
     bounds = np.linspace(0, len(problems), workers + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
@@ -268,9 +273,125 @@ def _fits(
         one = problems.part(b, b + 1)
         try:
             if ransac is None:
-                fits.append(fit_all(one, own, start))
+                fits.append(_fit_all(one, own, start))
             else:
-                fits.append(fit_robustly(one, own, ransac, trusted, start))
+                fits.append(_fit_robustly(one, own, ransac, trusted, start))
         except CadalignError as error:
             fits.append(error)
     return fits
+
+
+def _fit_robustly(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions,
+    confidences: npt.ArrayLike | None,
+    start: float,
+) -> FitResult:
+    """Fit the only problem to the keypoints that support its best alignment."""
+    if options.method != "optimal":
+        raise InputError(
+            f"the method {options.method!r} does not go with ransac",
+            where="method",
+            fix="leave it at 'optimal'; RansacOptions(minimal=...) names the minimal solver",
+        )
+    consensus = find_consensus(problems, options, ransac, confidences)
+    if not ransac.refine:
+        return replace(
+            consensus,
+            points_3d=problems.points_3d.copy(),
+            stats=replace(consensus.stats, seconds=time.perf_counter() - start),
+        )
+    inliers = consensus.inliers
+    result = _fit_inliers(problems, options, inliers, start)
+    for _ in range(_INLIER_ROUNDS):
+        residuals = residuals_of(problems, result.alignment, result.camera)
+        kept = np.linalg.norm(residuals, axis=1) < ransac.max_reproj_error
+        if (kept == inliers).all() or kept.sum() < inliers.sum():
+            break
+        inliers = kept
+        result = _fit_inliers(problems, options, inliers, start)
+    return replace(
+        result,
+        points_3d=problems.points_3d.copy(),
+        residuals=residuals_of(problems, result.alignment, result.camera),
+        inliers=inliers,
+        method="ransac-optimal",
+        stats=replace(
+            consensus.stats,
+            seconds=time.perf_counter() - start,
+            inlier_ratio=float(inliers.mean()),
+        ),
+    )
+
+
+def _fit_inliers(
+    problems: Problems, options: FitOptions, inliers: BoolArray, start: float
+) -> FitResult:
+    """The optimum for some of the only problem's keypoints."""
+    sigma = options.sigma
+    if sigma is not None and np.ndim(sigma) > 0:
+        sigma = np.asarray(sigma)[inliers]
+    some = Problems(
+        problems.points_3d[inliers],
+        problems.points_2d[inliers],
+        np.array([0, int(inliers.sum())]),
+        problems.cameras,
+    )
+    return _fit_all(some, replace(options, sigma=sigma), start)
+
+
+def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult:
+    """Fit the only problem to all its keypoints."""
+    solutions = solve(problems, options)
+    if solutions.errors:
+        raise solutions.errors[0]
+    alignment = Alignment.from_packed(solutions.poses[0, 0])
+    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
+    sigma = None
+    if solutions.sigmas is not None:
+        sigma = float(solutions.sigmas[0])
+    elif options.method == "optimal" and isinstance(options.sigma, int | float):
+        sigma = float(options.sigma)
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
+        residuals=solutions.residuals,
+        inliers=np.ones(len(problems.points_3d), dtype=bool),
+        method=options.method,
+        camera=_camera(problems, solutions, 0),
+        sigma=sigma,
+        covariance=None if solutions.covariances is None else solutions.covariances[0],
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+        focal=options.focal,
+        focal_prior=options.focal_prior,
+        alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
+        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
+    )
+
+
+def _camera(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
+    """The camera that goes with a minimum of the only problem."""
+    camera = problems.cameras[0]
+    return camera if solutions.focals is None else camera.with_focal(solutions.focals[0, minimum])
+
+
+def _alternatives(
+    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
+) -> tuple[Alternative, ...]:
+    """The other minima that are likely enough."""
+    costs = solutions.costs[0, :minima]
+    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
+        ratios = (max(costs[0], 1e-300) / np.maximum(costs, 1e-300)) ** len(problems.points_3d)
+    else:
+        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    return tuple(
+        Alternative(
+            Alignment.from_packed(solutions.poses[0, k]),
+            float(ratios[k]),
+            _camera(problems, solutions, k),
+        )
+        for k in range(1, minima)
+        if ratios[k] >= LEAST_LIKELIHOOD
+    )

@@ -5,7 +5,7 @@ The command line nests these dataclasses, and shows the text below each field as
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNO
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
 FOCALS = ("known", "estimate")
+AXES = ("x", "y", "z")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 
@@ -58,17 +59,23 @@ class FitOptions:
     """Prior on a focal length to be estimated, from EXIF data for example."""
 
     def __post_init__(self) -> None:
-        _check_choice("method", self.method, METHODS)
-        _check_choice("loss", self.loss, tuple(LOSSES))
-        _check_choice("known_axis", self.known_axis, ("x", "y", "z"))
-        _check_choice("focal", self.focal, FOCALS)
+        if self.method not in METHODS:
+            raise _unknown("method", self.method, METHODS)
+        if self.loss not in LOSSES:
+            raise _unknown("loss", self.loss, LOSSES)
+        if self.known_axis not in AXES:
+            raise _unknown("known_axis", self.known_axis, AXES)
+        if self.focal not in FOCALS:
+            raise _unknown("focal", self.focal, FOCALS)
         if not isinstance(self.loss_scale, int | float) or not 0 < self.loss_scale < np.inf:
             raise InputError(f"{self.loss_scale} is not positive", where="loss_scale")
         prior = self.scale_prior_sigma
         if prior is not None and not 0 < prior < np.inf:
             raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
-        self._check_stretch()
-        self._check_focal()
+        if self.stretch is not None:
+            self._check_stretch(self.stretch)
+        if self.focal == "estimate" or self.focal_prior is not None:
+            self._check_focal()
         if self.method != "optimal" and (
             self.loss != "linear"
             or prior is not None
@@ -80,12 +87,12 @@ class FitOptions:
                 fix="use the method 'optimal', or leave these options at their defaults",
             )
 
-    def _check_stretch(self) -> None:
+    def _check_stretch(self, stretch: str) -> None:
         axes = [axis for axis in "xyz" if axis != self.known_axis]
         allowed = ("".join(axes), axes[0], axes[1], "none")
-        if self.stretch is not None and self.stretch not in allowed:
+        if stretch not in allowed:
             raise InputError(
-                f"{self.stretch!r} are not axes that can stretch where {self.known_axis} is known",
+                f"{stretch!r} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",
                 fix=f"give one of {', '.join(allowed)}",
             )
@@ -124,6 +131,11 @@ class FitOptions:
         first = "xyz".index(self.known_axis)
         return [first, (first + 1) % 3, (first + 2) % 3]
 
+    def in_model_axes(self, poses: FloatArray) -> FloatArray:
+        """Packed poses (..., 15) of the reordered axes as poses of the model's own axes."""
+        place = np.argsort(self.axis_order)
+        return poses[..., np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])]
+
     @property
     def free(self) -> FloatArray:
         """1 for each of the solvers' 8 unknowns that is estimated, 0 for the others."""
@@ -136,12 +148,6 @@ class FitOptions:
     def prior_weight(self) -> float:
         """Inverse variance of the prior on the log scales; 0 for none."""
         return 0.0 if self.scale_prior_sigma is None else self.scale_prior_sigma**-2
-
-    @property
-    def log_focal_prior(self) -> tuple[float, float]:
-        """Mean and inverse variance of the prior on the log focal length; (0, 0) for none."""
-        prior = self.focal_prior
-        return (0.0, 0.0) if prior is None else (math.log(prior.focal), prior.relative_sigma**-2)
 
     @property
     def estimates_in_rounds(self) -> bool:
@@ -204,15 +210,8 @@ class RansacOptions:
         if not 0 < self.success_prob < 1:
             raise InputError(f"{self.success_prob} is not between 0 and 1", where="success_prob")
         if self.minimal not in MINIMAL_SOLVERS:
-            raise InputError(
-                f"unknown minimal solver {self.minimal!r}",
-                where="minimal",
-                fix=f"known are {', '.join(MINIMAL_SOLVERS)}",
-            )
+            raise _unknown("minimal", self.minimal, MINIMAL_SOLVERS)
 
 
-def _check_choice(name: str, value: object, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise InputError(
-            f"unknown {name} {value!r}", where=name, fix=f"known are {', '.join(known)}"
-        )
+def _unknown(name: str, value: object, known: Iterable[str]) -> InputError:
+    return InputError(f"unknown {name} {value!r}", where=name, fix=f"known are {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""Checked and packed correspondences: what the solvers get."""
+"""Checked and packed correspondences, the input of the solvers."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Problems:
 
     @property
     def counts(self) -> IntArray:
-        """How many points each problem has, (B,) int."""
+        """Number of points of each problem, (B,) int."""
         return self.offsets[1:] - self.offsets[:-1]
 
     def each_camera(self) -> Sequence[Camera]:
@@ -178,7 +178,7 @@ def _check_pair(
         )
     except (TypeError, ValueError):
         valid = False
-    if not valid:  # take the slow road, which says what is wrong
+    if not valid:  # take the slow checks, whose errors say what is wrong
         model = as_points(points_3d, name=name_3d, dimension=3)
         image = as_points(points_2d, name=name_2d, dimension=2)
     if len(model) != len(image):

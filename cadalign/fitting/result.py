@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_doubt
-from cadalign.fitting.uncertainty import Deviation, deviation_of, warnings_of
+from cadalign.fitting.uncertainty import Uncertainty, uncertainty_of, warnings_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -63,7 +63,7 @@ class FitStats:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """An alignment, how well it explains the keypoints, and how well they determine it.
+    """An alignment with its residuals and its uncertainty.
 
     Parameters
     ----------
@@ -92,9 +92,9 @@ class FitResult:
     stretched_axes : str
         The axes whose scale was estimated.
     focal : {"known", "estimate"}
-        Whether the focal length was estimated.
+        The camera's focal length was taken as right, or estimated.
     focal_prior : FocalPrior, optional
-        What was known of it beforehand.
+        Prior on the estimated focal length.
     alternatives : tuple of Alternative
         Other alignments that explain the keypoints as well: with 4 points all other exact
         solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
@@ -123,15 +123,15 @@ class FitResult:
         return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
 
     @property
-    def std(self) -> Deviation | None:
-        """The covariance in readable terms; None for methods that have none."""
+    def std(self) -> Uncertainty | None:
+        """Standard deviations from the covariance; None for methods that have none."""
         if self.covariance is None:
             return None
-        return deviation_of(self.covariance, self.known_axis)
+        return uncertainty_of(self.covariance, self.known_axis)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """Statements on what the keypoints do not determine; empty where all is well."""
+        """Warnings about parts of the alignment that the keypoints do not determine."""
         std = self.std
         if std is None:
             return ()

@@ -1,27 +1,27 @@
-"""Robust fitting: RANSAC over the minimal solver, for keypoints of which some are wrong."""
+"""Robust search: the alignment with the most inliers, by LO-RANSAC over the minimal solver."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats
+from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.fitting.estimation import unpack
-from cadalign.fitting.focal.grid import focal_views, log_limits
+from cadalign.fitting.focal.grid import FocalViews, focal_views, log_focal_prior
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.fitting.problems import Problems
+from cadalign.fitting.result import FitResult, FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.constants import LINEAR, SAMPLE_SIZES
-from cadalign.solvers.focal_ransac import ransac_focal_kernel
+from cadalign.geometry.projection import perspective
+from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
+from cadalign.solvers.evidence import Keypoints, ScalePrior
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective
-from cadalign.solvers.ransac import ransac_kernel
+from cadalign.solvers.ransac import Settings, Views, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.1  # expected number of models with as much support by chance
@@ -29,51 +29,34 @@ _FLAT = 1e-6  # thickness over extent of what counts as a plane
 _LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
 
 
-@dataclass(frozen=True, eq=False)
-class Consensus:
-    """What the search found for one problem.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    camera : Camera
-        With the focal length that goes with it, where that was unknown.
-    inliers : (n,) bool
-    score : float
-        Sum of squared errors, each at most the threshold's square [px^2].
-    iterations, hypotheses : int
-    """
-
-    alignment: Alignment
-    camera: Camera
-    inliers: BoolArray
-    score: float
-    iterations: int
-    hypotheses: int
-
-
 def find_consensus(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions,
     confidences: npt.ArrayLike | None = None,
-) -> Consensus:
-    """Search for the alignment of the only problem that the most keypoints support.
+) -> FitResult:
+    """Estimate one alignment by LO-RANSAC.
 
     Parameters
     ----------
     problems : Problems
+        One problem.
     options : FitOptions
-        Known axis, stretch, and whether the focal length is known.
+        Known axis, stretch, scale prior and focal length.
     ransac : RansacOptions
     confidences : (n,) float, optional
-        How much each keypoint is trusted; samples are drawn from the highest first.
+        Confidences of the keypoints; samples are drawn from the highest first.
+
+    Returns
+    -------
+    FitResult
+        The best hypothesis as the search left it, with its inliers.
 
     Raises
     ------
     InputError
-        If there are too few keypoints, a confidence is negative or NaN, or the minimal solver wants
-        a focal length that is unknown.
+        If there are too few keypoints, a confidence is negative or NaN, or the minimal solver needs
+        a known focal length.
     DegenerateError
         If all keypoints lie in one plane.
     NoConsensusError
@@ -81,9 +64,9 @@ def find_consensus(
     """
     camera = problems.cameras[0]
     points = problems.points_3d[:, options.axis_order]
-    points_2d = problems.points_2d
     count = len(points)
-    size = SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
+    minimal = MINIMAL_SOLVERS[ransac.minimal]
+    size = SAMPLE_SIZES[minimal]
     if count < size:
         raise InputError(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
@@ -94,72 +77,53 @@ def find_consensus(
             where="minimal",
             fix="leave it at 'ap4p'",
         )
-    order = _by_confidence(confidences, count)
-    guided = order is not None
-    if order is None:
-        order = np.arange(count)
-    ordered_3d, ordered_2d = np.ascontiguousarray(points[order]), points_2d[order].copy()
+    by_confidence = _by_confidence(confidences, count)
+    order = np.arange(count) if by_confidence is None else by_confidence
+    views = _views(problems.points_2d[order], camera, options)
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
-    pose = np.zeros(15)
+    pose = np.zeros(POSE_SIZE)
     inliers = np.zeros(count, dtype=bool)
-    max_iterations = _MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations)
-    min_iterations = _MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations)
-    threshold = float(ransac.max_reproj_error)
-    if options.focal == "known":
-        camera.require_focal()
-        rays = rays_of(ordered_2d, camera)
-        weights = whitening_of(1.0, rays, camera)
-        objective = _objective(ordered_3d, rays, weights, options)
-        score, iterations, hypotheses = ransac_kernel(
-            objective,
-            threshold,
-            MINIMAL_SOLVERS[ransac.minimal],
-            max_iterations,
-            min_iterations,
-            float(ransac.success_prob),
-            int(ransac.seed),
-            exhaustive,
-            guided,
-            ransac.refine,
-            pose,
-            inliers,
-        )
-    else:
-        views = focal_views(ordered_2d, camera, options.focal_prior)
-        objective = _objective(ordered_3d, views.rays[0], views.whitening[0], options)
-        score, log_focal, iterations, hypotheses = ransac_focal_kernel(
-            objective,
-            views.rays,
-            views.whitening,
-            np.log(views.focals),
-            *log_limits(camera, options.focal_prior),
-            *options.log_focal_prior,
-            threshold,
-            max_iterations,
-            min_iterations,
-            float(ransac.success_prob),
-            int(ransac.seed),
-            exhaustive,
-            guided,
-            ransac.refine,
-            pose,
-            inliers,
-        )
-        camera = camera.with_focal(math.exp(log_focal))
+    score, log_focal, iterations, hypotheses = ransac_kernel(
+        Objective(
+            options.free,
+            Keypoints(
+                np.ascontiguousarray(points[order]), views.rays[0], views.whitening[0], LINEAR, 1.0
+            ),
+            ScalePrior(options.prior_weight),
+        ),
+        Views(views.rays, views.whitening, np.log(views.focals)),
+        log_focal_prior(camera, options),
+        Settings(
+            threshold=float(ransac.max_reproj_error),
+            minimal=minimal,
+            size=size,
+            max_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations),
+            min_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations),
+            success_prob=float(ransac.success_prob),
+            seed=int(ransac.seed),
+            exhaustive=exhaustive,
+            guided=by_confidence is not None,
+            optimize=ransac.refine,
+            estimate_focal=options.focal == "estimate",
+        ),
+        pose,
+        inliers,
+    )
     if not hypotheses and _are_in_one_plane(points):
         raise DegenerateError(
             "all keypoints lie in one plane, where the samples of ransac determine nothing",
             where="points_3d",
             fix="leave ransac away: use loss='cauchy', with stretch= or scale_prior_sigma=",
         )
-    rotation, translation, scale = unpack(pose)
-    place = np.argsort(options.axis_order)
-    alignment = Alignment.from_solver(rotation[:, place], translation, scale[place])
+    if options.focal == "estimate":
+        camera = camera.with_focal(math.exp(log_focal))
+    alignment = Alignment.from_packed(options.in_model_axes(pose))
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     support = int(kept.sum())
-    errors = np.linalg.norm(residuals_of(problems, alignment, camera)[kept], axis=1)
-    extent = np.ptp(points_2d, axis=0) + 2 * ransac.max_reproj_error
+    residuals = residuals_of(problems, alignment, camera)
+    errors = np.linalg.norm(residuals[kept], axis=1)
+    extent = np.ptp(problems.points_2d, axis=0) + 2 * ransac.max_reproj_error
     area = min(float(np.prod(extent)), float(camera.width * camera.height))
     size += options.focal == "estimate"  # which half a keypoint determines
     if not np.isfinite(score) or _expected_by_chance(errors, count, size, area) > _CHANCE:
@@ -172,17 +136,32 @@ def find_consensus(
             score=float(score),
             inliers=support,
         )
-    return Consensus(alignment, camera, kept, float(score), int(iterations), int(hypotheses))
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d,
+        residuals=residuals,
+        inliers=kept,
+        method=f"ransac-{ransac.minimal}",
+        camera=camera,
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+        focal=options.focal,
+        focal_prior=options.focal_prior,
+        stats=FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score)),
+    )
 
 
-def _objective(
-    points: FloatArray, rays: FloatArray, whitening: FloatArray, options: FitOptions
-) -> Objective:
-    return Objective(points, rays, whitening, LINEAR, 1.0, options.prior_weight, options.free)
+def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> FocalViews:
+    """Rays and weights, in pixels, at the camera's focal length or at those to be tried."""
+    if options.focal == "estimate":
+        return focal_views(points_2d, camera, options.focal_prior)
+    camera.require_focal()
+    rays = rays_of(points_2d, camera)
+    return FocalViews(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
 
 
 def _are_in_one_plane(points: FloatArray) -> bool:
-    """Whether points that do not all coincide lie in a plane or on a line."""
+    """True for points that do not all coincide and lie in a plane or on a line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[0] > 0 and spread[2] <= _FLAT * spread[0])
 
@@ -202,7 +181,7 @@ def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray
 
 
 def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) -> float:
-    """How many models as well supported are expected among keypoints scattered at random.
+    """The expected number of models as well supported among keypoints scattered at random.
 
     Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
     estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
@@ -215,11 +194,11 @@ def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) 
     errors : (k,) float
         Lengths of the supporting keypoints' residuals [px].
     count : int
-        How many keypoints there are in all.
+        Number of keypoints in all.
     size : int
-        How many determine a model.
+        Number of keypoints that determine a model.
     area : float
-        Over which wrong keypoints are scattered [px^2].
+        Area over which outliers are scattered [px^2].
     """
     if len(errors) <= size:
         return math.inf
@@ -243,7 +222,6 @@ def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> Fl
     in_camera = alignment.apply(problems.points_3d)
     ahead = in_camera[:, 2] > 0
     residuals = np.full((len(in_camera), 2), np.inf)
-    rays = in_camera[ahead, :2] / in_camera[ahead, 2:]
-    projected = camera.pixels_from_normalized(rays)
+    projected = camera.pixels_from_normalized(perspective(in_camera[ahead]))
     residuals[ahead] = projected - problems.points_2d[ahead]
     return residuals

@@ -1,4 +1,4 @@
-"""How well an alignment is determined: standard deviations, and warnings in words."""
+"""Uncertainty of an alignment: standard deviations, and warnings about weak ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _END_ON_DEG = 15.0
 
 
 @dataclass(frozen=True)
-class Deviation:
+class Uncertainty:
     """Predicted standard deviations of an alignment.
 
     Parameters
@@ -40,14 +40,14 @@ class Deviation:
     focal: float = 0.0
 
 
-def deviation_of(covariance: FloatArray, known_axis: str) -> Deviation:
-    """Standard deviations in readable terms from a covariance (8, 8) or (9, 9)."""
+def uncertainty_of(covariance: FloatArray, known_axis: str) -> Uncertainty:
+    """Standard deviations from a covariance (8, 8) or (9, 9)."""
     variance = np.maximum(covariance.diagonal(), 0.0)
     scale = [0.0, 0.0, 0.0]
     for place, axis in enumerate(unknown_axes(known_axis)):
         scale[axis] = float(np.sqrt(variance[6 + place]))
     x, y, z = np.sqrt(variance[3:6]).tolist()
-    return Deviation(
+    return Uncertainty(
         rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
         translation=(x, y, z),
         scale=(scale[0], scale[1], scale[2]),
@@ -64,24 +64,24 @@ def unknown_axes(known_axis: str) -> tuple[int, int]:
 def warnings_of(
     points_3d: FloatArray,
     alignment: Alignment,
-    deviation: Deviation,
+    std: Uncertainty,
     *,
     redundancy: int,
     doubt: str | None = None,
 ) -> tuple[str, ...]:
-    """Which stretch or motion the keypoints leave uncertain, and why.
+    """Warn about stretch and motion that the keypoints leave uncertain, with the reason.
 
     Parameters
     ----------
     points_3d : (n, 3) float
         The keypoints that the alignment was fitted to.
     alignment : Alignment
-    deviation : Deviation
+    std : Uncertainty
         Its predicted standard deviations.
     redundancy : int
         Equations minus unknowns.
     doubt : str, optional
-        Why the estimated focal length is doubtful, however well determined it looks.
+        Warning about an estimated focal length that looks well determined but is doubtful.
 
     Returns
     -------
@@ -94,29 +94,29 @@ def warnings_of(
             f"{len(points_3d)} keypoints fit exactly whatever they are: "
             "the residuals say nothing about the quality of the fit"
         )
-    if deviation.focal > _WEAK_FOCAL:
+    if std.focal > _WEAK_FOCAL:
         warnings.append(
-            f"the focal length is known only to +-{_percent(deviation.focal)}: "
+            f"the focal length is known only to +-{_percent(std.focal)}: "
             f"{_why_focal_is_weak(points_3d, alignment)}"
         )
     if doubt is not None:
         warnings.append(doubt)
-    for axis, relative in enumerate(deviation.scale):
+    for axis, relative in enumerate(std.scale):
         if relative > _WEAK_SCALE:
             warnings.append(
                 f"s_{'xyz'[axis]} is known only to +-{_percent(relative)}: "
                 f"{_why_scale_is_weak(points_3d, alignment, axis)}"
             )
-    if deviation.rotation_deg > _WEAK_ROTATION_DEG:
-        warnings.append(f"the rotation is known only to +-{deviation.rotation_deg:.2g} deg")
+    if std.rotation_deg > _WEAK_ROTATION_DEG:
+        warnings.append(f"the rotation is known only to +-{std.rotation_deg:.2g} deg")
     distance = float(np.linalg.norm(alignment.translation))
-    spread = float(np.linalg.norm(deviation.translation))
+    spread = float(np.linalg.norm(std.translation))
     if spread > _WEAK_DISTANCE * distance:
-        direction = "xyz"[int(np.argmax(deviation.translation))]
+        direction = "xyz"[int(np.argmax(std.translation))]
         share = f" ({_percent(spread / distance)} of the distance)" if distance > 0 else ""
         warnings.append(
             f"the translation along the camera's {direction} is known only to "
-            f"+-{max(deviation.translation):.2g} model units{share}"
+            f"+-{max(std.translation):.2g} model units{share}"
         )
     return tuple(warnings)
 

@@ -1,9 +1,9 @@
-"""The alignment of a CAD model: rotation, translation and stretch."""
+"""Alignment of a CAD model: rotation, translation and stretch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, InitVar, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ _ORTHONORMAL_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where a model is and how it is stretched.
+    """Pose and stretch of a model.
 
     ``x_cam = rotation @ diag(scale) @ x + translation``: the stretch acts along the model's own
     axes, before the rotation. Estimated alignments have ``scale[0] == 1``: one image alone does not
@@ -32,6 +32,8 @@ class Alignment:
         The model's origin in the camera frame [model units].
     scale : (3,) float
         Stretch along the model's x, y and z, positive.
+    is_valid : bool
+        The arrays are known to be valid: take them over unchecked, and make them read-only.
 
     Raises
     ------
@@ -48,8 +50,14 @@ class Alignment:
     rotation: FloatArray
     translation: FloatArray
     scale: FloatArray
+    _: KW_ONLY
+    is_valid: InitVar[bool] = False
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, is_valid: bool) -> None:
+        if is_valid:
+            for array in (self.rotation, self.translation, self.scale):
+                array.flags.writeable = False
+            return
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         translation = as_floats(self.translation, name="translation", shape=(3,))
         scale = as_floats(self.scale, name="scale", shape=(3,))
@@ -66,26 +74,15 @@ class Alignment:
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
-    def from_solver(
-        cls, rotation: FloatArray, translation: FloatArray, scale: FloatArray
-    ) -> Alignment:
-        """Wrap arrays that a solver guarantees to be valid, without checking or copying them."""
-        alignment = object.__new__(cls)
-        for name, value in (("rotation", rotation), ("translation", translation), ("scale", scale)):
-            value.flags.writeable = False
-            object.__setattr__(alignment, name, value)
-        return alignment
-
-    @classmethod
     def from_packed(cls, pose: FloatArray) -> Alignment:
-        """Take over a solver's packed pose (15,): rotation row by row, translation, scale."""
+        """Copy a solver's packed pose (15,): rotation row by row, translation, scale."""
         pose = pose.copy()
-        pose.flags.writeable = False
-        alignment = object.__new__(cls)
-        object.__setattr__(alignment, "rotation", pose[:9].reshape(3, 3))
-        object.__setattr__(alignment, "translation", pose[9:12])
-        object.__setattr__(alignment, "scale", pose[12:])
-        return alignment
+        return cls(pose[:9].reshape(3, 3), pose[9:12], pose[12:], is_valid=True)
+
+    @property
+    def packed(self) -> FloatArray:
+        """The pose as `from_packed` reads it, (15,) float."""
+        return np.concatenate([self.rotation.ravel(), self.translation, self.scale])
 
     @classmethod
     def identity(cls) -> Alignment:

@@ -14,6 +14,7 @@ from cadalign.arrays import FloatArray, as_points
 from cadalign.errors import InputError, quote
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.distortion import distort, undistort
+from cadalign.geometry.projection import perspective
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
 COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
@@ -228,7 +229,7 @@ class Camera:
                 where="points_cam",
                 fix="only points with z > 0 have a projection",
             )
-        return self.pixels_from_normalized(points[:, :2] / points[:, 2:])
+        return self.pixels_from_normalized(perspective(points))
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Turn pixels into normalised image coordinates, the lens distortion removed.

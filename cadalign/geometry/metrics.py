@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth.
+"""Errors between an estimate and the truth.
 
 All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
 """

@@ -10,6 +10,7 @@ are ignored. What the types cannot express is checked in ``__post_init__``, whic
 from __future__ import annotations
 
 import json
+import operator
 import os
 import re
 import sys
@@ -19,9 +20,11 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.io.files import reading
 
 _MAX = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
@@ -69,12 +72,8 @@ def read_json(path: Path) -> Any:
     DataError
         If it is missing, cannot be read or is not JSON; names the line.
     """
-    try:
+    with reading(path):
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
-    except (OSError, ValueError) as error:  # not UTF-8, or a NUL in the path
-        raise DataError(f"cannot be read ({error})", where=str(path)) from None
     with in_file(path):
         return parse_json(text)
 
@@ -120,6 +119,9 @@ def convert(
     try:
         return msgspec.convert(data, kind, strict=strict)
     except msgspec.ValidationError as error:
+        plain = _plain(data)
+        if plain is not data:
+            return convert(plain, kind, where=where, strict=strict)
         raise _located(error, data, kind, where or "") from None
 
 
@@ -181,6 +183,22 @@ _WORDS = {
 _PATTERN_WORDS = {repr(_PATH): "a path", repr(_FILE_NAME): "an id"}
 
 
+def _plain(value: Any) -> Any:
+    """The value with NumPy's arrays and numbers as Python's; itself where it holds none."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    try:
+        if isinstance(value, dict):
+            fields = {name: _plain(each) for name, each in value.items()}
+            return fields if any(fields[name] is not value[name] for name in value) else value
+        if isinstance(value, list | tuple):
+            items = [_plain(each) for each in value]
+            return items if any(map(operator.is_not, items, value)) else value
+    except RecursionError:  # nested deeper than any declared type
+        pass
+    return value
+
+
 def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -> DataError:
     """The library's error as ours: the value and its problem, its path, the remedy."""
     found = _MESSAGE.fullmatch(str(error))
@@ -197,11 +215,11 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
     if field:
-        known = sorted(each.encode_name for each in _type_at(kind, path).fields)
+        known = sorted(each.encode_name for each in getattr(_type_at(kind, path), "fields", ()))
         return DataError(
             f"unknown field {quote(field[2])}",
             where=where or "top level",
-            fix=f"known are {', '.join(known)}",
+            fix=f"known are {', '.join(known)}" if known else None,
         )
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _type_at(kind, path).values))
@@ -236,14 +254,15 @@ def _wanted(text: str) -> str:
 
 
 def _type_at(kind: Any, path: str | None) -> Any:
-    """The declared type at a path."""
+    """The declared type at a path; None if the path is a part of a hostile field name."""
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer((path or "$")[1:]):
         kind = _without_none(kind)
         if isinstance(kind, msgspec.inspect.StructType):
-            kind = next(each.type for each in kind.fields if each.encode_name == step["name"])
+            types = {each.encode_name: each.type for each in kind.fields}
+            kind = types.get(step["name"])
         else:
-            kind = kind.value_type if step["row"] == "..." else kind.item_type
+            kind = getattr(kind, "value_type" if step["row"] == "..." else "item_type", None)
     return _without_none(kind)
 
 

@@ -74,10 +74,22 @@ def _finite(value: Any) -> Any:
 
 
 @contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Convert errors of the file system, and of text that is not UTF-8, to `DataError`."""
+    _refuse_nul(path)
+    try:
+        yield
+    except FileNotFoundError:
+        raise DataError("no such file", where=str(path)) from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"cannot be read ({reason})", where=str(path)) from None
+
+
+@contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Convert errors of the file system to `DataError`."""
-    if "\0" in str(path):
-        raise DataError("the path holds a NUL character", where=repr(str(path))[:200])
+    _refuse_nul(path)
     try:
         yield
     except OSError as error:
@@ -86,3 +98,9 @@ def writing(path: Path) -> Iterator[None]:
             where=str(path),
             fix="make room or choose another folder; what was written before is kept",
         ) from None
+
+
+def _refuse_nul(path: Path) -> None:
+    # The file system's functions raise a ValueError, which says nothing of a path.
+    if "\0" in str(path):
+        raise DataError("the path holds a NUL character", where=repr(str(path))[:200])

@@ -37,14 +37,14 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     from PIL import Image, UnidentifiedImageError
 
     path = Path(path)
+    if not path.exists():
+        raise DataError("no such file", where=str(path))
     try:
         # Waiting for the other end of a pipe could take for ever, and images need random access.
-        if path.exists() and not path.is_file():
+        if not path.is_file():
             raise OSError("not a regular file")
         with Image.open(path) as image:
             yield image
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
     except (
         OSError,
         ValueError,  # a NUL in the path

@@ -12,7 +12,7 @@ from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
-from cadalign.evaluation.summary import Line, group_name
+from cadalign.evaluation.summary import Summary, group_name
 
 _MOST_REASONS = 200
 OTHER_REASONS = "other reasons"
@@ -42,9 +42,9 @@ class HeadlineRow:
     best: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, run: int, line: Line, columns: Sequence[Metric]) -> HeadlineRow:
+    def of(cls, run: int, line: Summary, columns: Sequence[Metric]) -> HeadlineRow:
         """A row of a line's values, in the columns' units."""
-        cells = {column.key: column.shown(line.values.get(column.key)) for column in columns}
+        cells = {column.key: column.shown(line.number(column.key)) for column in columns}
         return cls(run, line.group, line.method, cells)
 
 

@@ -13,11 +13,13 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
-from cadalign.solvers.constants import POSE_SIZE
+from cadalign.solvers.constants import OK, POSE_SIZE
+from cadalign.solvers.evidence import Keypoints, ScalePrior
+from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
-from cadalign.solvers.starts import choose_subsets, linear_start, minimal_starts, rotation_starts
+from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
 
 LEAST_SHARED = 4
 """Least number of shared keypoints that determine an alignment."""
@@ -41,7 +43,7 @@ class Query(NamedTuple):
     rays : (n, 2) float
         Normalised image coordinates.
     whitening : (1 or n, 3) float
-        See `cadalign.solvers.objective.Objective`, as the rest.
+        See `cadalign.solvers.evidence.Keypoints`, as the rest.
     loss : int
     loss_scale, prior_weight : float
     free : (8,) float
@@ -155,9 +157,8 @@ def _centred_objective(
         rays[i] = query.rays[seen[i]]
         if each:
             whitening[i] = query.whitening[seen[i]]
-    return Objective(
-        centred, rays, whitening, query.loss, query.loss_scale, query.prior_weight, query.free
-    )
+    keypoints = Keypoints(centred, rays, whitening, query.loss, query.loss_scale)
+    return Objective(query.free, keypoints, ScalePrior(query.prior_weight))
 
 
 @kernel
@@ -200,7 +201,9 @@ def _search(
     probed = np.empty((refined, POSE_SIZE))
     costs = _probe(objective, starts[:count], probed)
     if not costs.min() < np.inf:  # all starts have points behind the camera
-        count = rotation_starts(objective.points, objective.rays, starts[:_GRID_ROTATIONS])
+        count = rotation_starts(
+            objective.keypoints.points, objective.keypoints.rays, starts[:_GRID_ROTATIONS]
+        )
         costs = _probe(objective, starts[:count], probed)
     least = np.inf
     for _ in range(probed.shape[0]):
@@ -237,15 +240,7 @@ def _within_limits(
                 beyond = True
         if not beyond:
             break
-        limited = Objective(
-            objective.points,
-            objective.rays,
-            objective.whitening,
-            objective.loss,
-            objective.loss_scale,
-            objective.prior_weight,
-            free,
-        )
+        limited = Objective(free, objective.keypoints, objective.scale_prior)
         cost, _, _ = refine(limited, iterations, pose)
     return cost
 
@@ -253,10 +248,10 @@ def _within_limits(
 @kernel
 def _propose(objective: Objective, subsets: int, starts: FloatArray) -> int:
     """Write starting poses of the refinement; returns their number."""
-    points, rays, free = objective.points, objective.rays, objective.free
+    points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
     chosen = np.empty((subsets, 4), dtype=np.int64)
     count = minimal_starts(points, rays, chosen, choose_subsets(points, chosen), starts)
-    if linear_start(points, rays, starts[count]):
+    if aepnp_kernel(points, rays, starts[count]) == OK:
         count += 1
     # Other starts are for coplanar points, and for fixed scales.
     if count == 0 or free[6] == 0.0 or free[7] == 0.0:

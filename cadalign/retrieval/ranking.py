@@ -25,6 +25,7 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.fitting.fit import fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.projection import perspective
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.kernels import Candidates, Query, search_all
 from cadalign.retrieval.match import Match
@@ -211,7 +212,7 @@ def _search_unstretched(
     for m in np.flatnonzero(batch.solved).tolist():
         poses[m] = np.concatenate([batch.rotation[m].ravel(), batch.translation[m], batch.scale[m]])
         inside = points[m] @ batch.rotation[m].T + batch.translation[m]
-        errors = inside[:, :2] / inside[:, 2:] - observed.query.rays[seen[m]]
+        errors = perspective(inside) - observed.query.rays[seen[m]]
         a, b, c = observed.query.whitening[seen[m] if each else [0]].T
         across, down = errors.T
         costs[m] = ((a * across + b * down) ** 2 + (c * down) ** 2).sum()

@@ -1,6 +1,6 @@
 """The solvers behind `cadalign.fit`, without its checks: points and rays in, alignments out.
 
-`aepnp` is linear, `ap4p` minimal; `aepnp_paper` and `epnp` are yardsticks. All take ``points_3d``
+`aepnp` is linear, `ap4p` minimal; `aepnp_paper` and `epnp` are baselines. All take ``points_3d``
 (n, 3) and ``rays`` (n, 2), the normalised image coordinates that `cadalign.Camera.normalize` gives.
 """
 

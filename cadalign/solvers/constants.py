@@ -7,6 +7,9 @@ UNKNOWNS: Final = 8
 POSE_SIZE: Final = 15
 """Length of a packed alignment: rotation row by row (9), translation (3), scale (3)."""
 
+UNOBSERVABLE: Final = 1e-11
+"""Share of an unknown's information that the others must leave for it to count as determined."""
+
 LINEAR: Final = 0
 HUBER: Final = 1
 CAUCHY: Final = 2

@@ -13,12 +13,20 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import OK, UNKNOWNS
+from cadalign.solvers.constants import OK, UNKNOWNS, UNOBSERVABLE
+from cadalign.solvers.evidence import (
+    BLOCK,
+    Keypoints,
+    LogFocalPrior,
+    focal_prior_cost,
+    keypoint_rows,
+)
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.linear import MIN_POINTS, affine_rows, moments
-from cadalign.solvers.objective import BLOCK, Objective, evaluate, jacobian_rows
-from cadalign.solvers.optimal import covariance_of
-from cadalign.solvers.refine import move_pose, refine
+from cadalign.solvers.objective import Objective, evaluate, with_keypoints
+from cadalign.solvers.projection import project_point, scalars_of
+from cadalign.solvers.refine import refine
+from cadalign.solvers.unknowns import move_pose
 
 _ROUNDS = 60
 _POSE_ITERATIONS = 100
@@ -28,12 +36,11 @@ _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
 _HALVINGS = 12
 _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
-_UNOBSERVABLE = 1e-11  # share of the focal length's information that the other unknowns leave
 
 
 @kernel
 def linear_focal(points: FloatArray, rays: FloatArray) -> float:
-    """Estimate the focal length linearly, as a multiple of that which the rays were made with.
+    """Estimate the focal length linearly, as a multiple of that of the rays.
 
     The 3 x 3 block of the linear solution is diag(1, 1, 1 / ratio) R diag(scale) up to a factor, so
     for two of its columns m and n, (m_x n_x + m_y n_y) / ratio^2 + m_z n_z = 0; the least-squares
@@ -61,24 +68,18 @@ def linear_focal(points: FloatArray, rays: FloatArray) -> float:
 
 @kernel
 def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Objective:
-    """The objective at exp(log_ratio) times the focal length that its rays were made with.
+    """The objective at exp(log_ratio) times the focal length of its rays.
 
-    ``slopes`` (n, 2), or (0, 2) for a lens without distortion, says by how much the undistorted
-    pixels, over the reference focal length, change with the logarithm of the focal length.
+    ``slopes`` (n, 2), or (0, 2) for a lens without distortion, holds the change of the undistorted
+    pixels, over the reference focal length, per unit of the logarithm of the focal length.
     """
     ratio = np.exp(log_ratio)
-    rays = objective.rays / ratio
+    old = objective.keypoints
+    rays = old.rays / ratio
     if slopes.shape[0] > 0:
         rays += slopes * (log_ratio / ratio)
-    return Objective(
-        objective.points,
-        rays,
-        objective.whitening * ratio,
-        objective.loss,
-        objective.loss_scale,
-        objective.prior_weight,
-        objective.free,
-    )
+    keypoints = Keypoints(old.points, rays, old.whitening * ratio, old.loss, old.loss_scale)
+    return with_keypoints(objective, keypoints)
 
 
 @kernel
@@ -111,21 +112,19 @@ def focal_system(
     evaluate(here, pose, rows, hessian[:UNKNOWNS], gradient)
     hessian[UNKNOWNS] = 0.0
     information = slope = 0.0
-    each = here.whitening.shape[0] > 1
-    for start in range(0, here.points.shape[0], BLOCK):
-        size = min(BLOCK, here.points.shape[0] - start)
-        jacobian_rows(here, pose, start, size, rows)
+    points, whitening = here.keypoints.points, here.keypoints.whitening
+    scalars = scalars_of(pose)
+    for start in range(0, points.shape[0], BLOCK):
+        size = min(BLOCK, points.shape[0] - start)
+        keypoint_rows(here.keypoints, pose, start, size, rows)
         for b in range(size):
             i = start + b
-            depth = pose[11]
-            for j in range(3):
-                depth += pose[6 + j] * pose[12 + j] * here.points[i, j]
+            _, _, depth = project_point(scalars, (points[i, 0], points[i, 1], points[i, 2]))
             # A longer focal length moves a point's image as a smaller depth does.
             across = -rows[5, b] * depth
             down = -rows[5, size + b] * depth
             if slopes.shape[0] > 0:
-                w = i if each else 0
-                weighted = here.whitening[w]
+                weighted = whitening[i if whitening.shape[0] > 1 else 0]
                 root = rows[3, b] * depth / weighted[0]  # of the loss's weight
                 dx, dy = root * slopes[i, 0] / ratio, root * slopes[i, 1] / ratio
                 across -= weighted[0] * dx + weighted[1] * dy
@@ -142,10 +141,7 @@ def focal_system(
 def refine_focal(
     objective: Objective,
     slopes: FloatArray,
-    prior_center: float,
-    prior_weight: float,
-    low: float,
-    high: float,
+    prior: LogFocalPrior,
     max_rounds: int,
     pose: FloatArray,
     log_ratio: float,
@@ -156,15 +152,13 @@ def refine_focal(
     ----------
     objective, slopes
         As for `at_focal`.
-    prior_center, prior_weight : float
-        Mean and inverse variance of the prior on log_ratio; the weight 0 for none.
-    low, high : float
-        Bounds on log_ratio.
+    prior : LogFocalPrior
+        Bounds and prior of log_ratio.
     max_rounds : int
-        Most steps of the focal length.
+        Largest number of steps of the focal length.
     pose : (15,) float
     log_ratio : float
-        Where to start.
+        The start.
 
     Returns
     -------
@@ -178,13 +172,13 @@ def refine_focal(
     trial = np.empty(pose.shape[0])
     here = at_focal(objective, slopes, log_ratio)
     cost, iterations, _ = refine(here, _POSE_ITERATIONS, pose)
-    cost += prior_weight * (log_ratio - prior_center) ** 2
+    cost += focal_prior_cost(prior, log_ratio)
     if not cost < np.inf:
         return np.inf, log_ratio, iterations
     for _ in range(min(max_rounds, _ROUNDS)):
         own, slope = focal_system(here, slopes, np.exp(log_ratio), pose, hessian, gradient)
-        slope += prior_weight * (log_ratio - prior_center)
-        curvature = own + prior_weight
+        slope += prior.weight * (log_ratio - prior.center)
+        curvature = own + prior.weight
         whole = curvature
         # The pose follows the focal length by shift, which lessens both slope and curvature.
         if not _factor(hessian[:UNKNOWNS]):
@@ -194,12 +188,12 @@ def refine_focal(
         for k in range(UNKNOWNS):
             curvature += hessian[UNKNOWNS, k] * shift[k]
             slope += gradient[k] * shift[k]
-        if curvature > _UNOBSERVABLE * whole:
+        if curvature > UNOBSERVABLE * whole:
             step = -slope / curvature
         else:
             step = -np.sign(slope) * _LARGEST_STEP
         step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
-        step = min(max(step, low - log_ratio), high - log_ratio)
+        step = min(max(step, prior.low - log_ratio), prior.high - log_ratio)
         improved = False
         for _ in range(_HALVINGS):
             if abs(step) < _CONVERGED_STEP:
@@ -208,7 +202,7 @@ def refine_focal(
             there = at_focal(objective, slopes, log_ratio + step)
             moved_cost, used, _ = refine(there, _POSE_ITERATIONS, trial)
             iterations += used
-            moved_cost += prior_weight * (log_ratio + step - prior_center) ** 2
+            moved_cost += focal_prior_cost(prior, log_ratio + step)
             if moved_cost <= cost:
                 improved = True
                 break
@@ -227,47 +221,10 @@ def refine_focal(
 
 @kernel
 def _factor(hessian: FloatArray) -> bool:
-    """Factor an 8 x 8 system in place; unknowns that the points tell nothing about are held."""
+    """Factor an 8 x 8 system in place; unknowns without evidence are held."""
     floor = 1e-300
     for k in range(UNKNOWNS):
         floor = max(floor, _LEAST_INFORMATION * hessian[k, k])
     for k in range(UNKNOWNS):
         hessian[k, k] += floor
     return cholesky(hessian, UNKNOWNS, 0.0)
-
-
-@kernel
-def focal_covariance(
-    objective: Objective,
-    slopes: FloatArray,
-    prior_weight: float,
-    pose: FloatArray,
-    covariance: FloatArray,
-) -> int:
-    """Write the inverse information of all 9 unknowns, at log_ratio 0, into (9, 9).
-
-    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
-    number of an unknown that the points do not determine.
-    """
-    given = np.empty((UNKNOWNS, UNKNOWNS))
-    covariance[:] = 0.0
-    undetermined = covariance_of(objective, pose, given)
-    if undetermined >= 0:
-        return undetermined
-    hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    own, _ = focal_system(objective, slopes, 1.0, pose, hessian, gradient)
-    shift = np.zeros(UNKNOWNS)
-    information = own + prior_weight
-    for k in range(UNKNOWNS):
-        for m in range(UNKNOWNS):
-            shift[k] -= given[k, m] * hessian[UNKNOWNS, m]
-        information += hessian[UNKNOWNS, k] * shift[k]
-    # Where nothing is left, the deviation is as large as rounding errors let it be known.
-    variance = 1.0 / max(information, _UNOBSERVABLE * (own + prior_weight))
-    covariance[UNKNOWNS, UNKNOWNS] = variance
-    for k in range(UNKNOWNS):
-        covariance[k, UNKNOWNS] = covariance[UNKNOWNS, k] = variance * shift[k]
-        for m in range(UNKNOWNS):
-            covariance[k, m] = given[k, m] + variance * shift[k] * shift[m]
-    return -1

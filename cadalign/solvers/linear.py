@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.errors import DegenerateError
-from cadalign.solvers.constants import DEGENERATE, OK
+from cadalign.solvers.constants import DEGENERATE, OK, POSE_SIZE, TOO_FEW
 from cadalign.solvers.linalg import (
     cholesky,
     eigenvectors_4,
@@ -17,6 +17,7 @@ from cadalign.solvers.linalg import (
     rotation_from_quaternion,
     solve_cholesky,
 )
+from cadalign.solvers.unknowns import pack_pose
 
 MIN_POINTS = 6
 _CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error
@@ -59,10 +60,10 @@ def aepnp(
     """
     points = np.ascontiguousarray(points_3d, dtype=np.float64)
     directions = np.ascontiguousarray(rays, dtype=np.float64)
-    rotation, translation, scale, status = aepnp_kernel(points, directions)
-    if status != OK:
+    pose = np.empty(POSE_SIZE)
+    if aepnp_kernel(points, directions, pose) != OK:
         raise aepnp_error(points)
-    return rotation, translation, scale
+    return pose[:9].reshape(3, 3), pose[9:12], pose[12:]
 
 
 def aepnp_error(points_3d: FloatArray) -> DegenerateError:
@@ -81,7 +82,7 @@ def aepnp_error(points_3d: FloatArray) -> DegenerateError:
 
 
 def describe_plane(points_3d: FloatArray) -> str | None:
-    """Say in words how the points fail to span a volume; None where they span one."""
+    """Describe how the points fail to span a volume; None if they span one."""
     mean = points_3d.mean(axis=0)
     rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
     _, spread, axes = np.linalg.svd(rows, full_matrices=False)
@@ -233,43 +234,46 @@ def _split_scale(linear: FloatArray, spread: FloatArray, rotation: FloatArray) -
 
 
 @kernel
-def aepnp_kernel(
-    points: FloatArray, rays: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-    """Compiled `aepnp`: rotation, translation, scale and a status."""
-    rotation = np.empty((3, 3))
-    translation = np.empty(3)
-    scale = np.empty(3)
-    if points.shape[0] < MIN_POINTS:
-        return rotation, translation, scale, DEGENERATE
-    mean = np.empty(5)
-    products = np.empty((10, 4))
-    moments(points, rays, mean, products)
-    status = aepnp_from_moments(mean, products, rotation, translation, scale)
-    return rotation, translation, scale, status
+def aepnp_batch(
+    points: FloatArray, rays: FloatArray, offsets: IntArray
+) -> tuple[FloatArray, IntArray]:
+    """Solve every problem, with the rows ``offsets[b]`` to ``offsets[b + 1]``.
+
+    Returns packed poses (B, 1, 15) and statuses (B,).
+    """
+    count = offsets.shape[0] - 1
+    poses = np.empty((count, 1, POSE_SIZE))
+    statuses = np.empty(count, dtype=np.int64)
+    for b in range(count):
+        start, end = offsets[b], offsets[b + 1]
+        statuses[b] = aepnp_kernel(points[start:end], rays[start:end], poses[b, 0])
+    return poses, statuses
 
 
 @kernel
-def aepnp_from_moments(
-    mean: FloatArray,
-    products: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
-    scale: FloatArray,
-) -> int:
-    """Solve from the sums alone; fills the last three arguments and returns a status."""
+def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
+    """Compiled `aepnp`: writes the packed pose (15,), returns a status."""
+    if points.shape[0] < MIN_POINTS:
+        return TOO_FEW
+    mean = np.empty(5)
+    products = np.empty((10, 4))
+    moments(points, rays, mean, products)
     spread = np.empty(3)
     rows = np.empty((3, 4))
     status = affine_rows(mean, products, spread, rows)
     if status != OK:
         return status
+    rotation = np.empty((3, 3))
     lengths = _split_scale(rows[:, 1:], spread, rotation)
+    translation = np.empty(3)
+    scale = np.empty(3)
     for j in range(3):
         scale[j] = lengths[j] / lengths[0]
     for i in range(3):
         translation[i] = rows[i, 0] / lengths[0]
         for j in range(3):
             translation[i] -= rotation[i, j] * scale[j] * mean[j]
+    pack_pose(rotation, translation, scale, pose)
     return OK
 
 

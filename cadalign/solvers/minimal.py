@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.linalg import polish_rotation
@@ -15,7 +15,10 @@ MAX_SOLUTIONS = 8
 
 _TOUCHING = 1e-7
 _POLISH_STEPS = 5
-_EXACT = 1e-7  # largest cosine between axes of a solution that counts as one
+_EXACT = 1e-7  # largest value of a quadric, over its summands, at an intersection
+# Largest cosine between columns of a rotation. Columns that nearly cancel can be far from
+# orthogonal where the quadrics, which are relative to their summands, look exact.
+_ORTHOGONAL = 1e-4
 _SAME = 1e-6  # relative difference of depths below which two solutions are one
 
 
@@ -81,6 +84,22 @@ def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> 
 
 
 @kernel
+def solve_subset(
+    points: FloatArray, rays: FloatArray, chosen: IntArray, solutions: FloatArray
+) -> int:
+    """Solve from the points with the 4 numbers ``chosen``; see `ap4p_kernel`."""
+    some = np.empty((4, 3))
+    directions = np.empty((4, 3))
+    for i in range(4):
+        for c in range(3):
+            some[i, c] = points[chosen[i], c]
+        directions[i, 0] = rays[chosen[i], 0]
+        directions[i, 1] = rays[chosen[i], 1]
+        directions[i, 2] = 1.0
+    return ap4p_kernel(some, directions, solutions)
+
+
+@kernel
 def _column_weights(points: FloatArray, weights: FloatArray) -> bool:
     """Find the weights by which the camera-frame points add up to the columns of R diag(s).
 
@@ -117,7 +136,7 @@ def _column_weights(points: FloatArray, weights: FloatArray) -> bool:
 
 @kernel
 def _orthogonality_quadrics(weights: FloatArray, rays: FloatArray, quadrics: FloatArray) -> None:
-    """Write the quadrics that say that two columns are orthogonal.
+    """Write the quadrics that vanish where two columns are orthogonal.
 
     Their variables are not the depths d but e = H d / 2 with the Hadamard matrix H: e_0 is the
     common depth, the others are differences. Depths of an object are alike, so polynomials in
@@ -166,7 +185,7 @@ def _hadamard(vector: FloatArray) -> None:
 
 @kernel
 def _entry(i: int, j: int) -> int:
-    """Where the coefficient of d_i d_j stands in a row of quadrics."""
+    """Position of the coefficient of d_i d_j in a row of quadrics."""
     low, high = min(i, j), max(i, j)
     return low * 4 - low * (low - 1) // 2 + high - low
 
@@ -393,7 +412,7 @@ def _polish(quadrics: FloatArray, point: FloatArray) -> bool:
 
 @kernel
 def _listed(depths: FloatArray, last: int) -> bool:
-    """Say whether row ``last`` repeats an earlier row."""
+    """True if row ``last`` repeats an earlier row."""
     for k in range(last):
         difference = 0.0
         for i in range(4):
@@ -411,7 +430,7 @@ def _pose_from_depths(
     depths: FloatArray,
     pose: FloatArray,
 ) -> bool:
-    """Pack rotation, translation and scale; False for a mirrored solution."""
+    """Pack rotation, translation and scale; False for a mirrored or inexact solution."""
     columns = np.zeros((3, 3))
     for j in range(3):
         for i in range(4):
@@ -424,6 +443,12 @@ def _pose_from_depths(
         lengths[j] = np.sqrt(columns[0, j] ** 2 + columns[1, j] ** 2 + columns[2, j] ** 2)
         for c in range(3):
             columns[c, j] /= lengths[j]
+    for j in range(3):
+        cosine = 0.0
+        for c in range(3):
+            cosine += columns[c, j] * columns[c, (j + 1) % 3]
+        if not abs(cosine) < _ORTHOGONAL:
+            return False
     rotation = np.empty((3, 3))
     polish_rotation(columns, rotation)
     for j in range(3):

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS
-from cadalign.solvers.linalg import cholesky, polish_rotation, solve_cholesky
-from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.objective import BLOCK, Objective, evaluate, evaluate_cost
-from cadalign.solvers.refine import refine
-from cadalign.solvers.starts import (
-    choose_subsets,
-    linear_start,
-    minimal_starts,
-    rotation_starts,
+from cadalign.solvers.constants import (
+    DEGENERATE,
+    NOT_FOUND,
+    OK,
+    POSE_SIZE,
+    TOO_FEW,
+    UNKNOWNS,
 )
+from cadalign.solvers.covariance import center_and_unit, covariance_of
+from cadalign.solvers.evidence import Keypoints, ScalePrior, take_keypoints
+from cadalign.solvers.linear import aepnp_kernel
+from cadalign.solvers.minimal import MAX_SOLUTIONS
+from cadalign.solvers.objective import Objective, evaluate_cost, with_keypoints, with_points
+from cadalign.solvers.refine import refine
+from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
+from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
 
 MAX_MINIMA = 12
 _COARSE_POINTS = 48  # that many tell the minima apart; all points then refine them
@@ -25,9 +30,55 @@ _GRID_REFINED = 20
 _PROBE_ITERATIONS = 6
 _MAX_ITERATIONS = 200
 _SAME_CHORD = 1e-3
-_LARGEST_STRETCH = 1e3
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
-_UNOBSERVABLE = 1e-11  # share of an unknown's information that the other unknowns leave
+
+
+@kernel
+def optimal_batch(
+    points: FloatArray,
+    rays: FloatArray,
+    whitening: FloatArray,
+    offsets: IntArray,
+    loss: int,
+    loss_scale: FloatArray,
+    prior_weight: FloatArray,
+    free: FloatArray,
+    min_points: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
+    """Find the optimum of every problem; a single fit is a batch of one.
+
+    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``. ``loss_scale`` and ``prior_weight``
+    (B,) are in units of the whitening's sigma. Returns the minima's poses (B, MAX_MINIMA, 15) and
+    costs (B, MAX_MINIMA), the covariance of the best (B, 8, 8), statuses (B,), and (B, 4) the
+    number of minima, iterations, hypotheses, and the number of an undetermined unknown or -1.
+    """
+    count = offsets.shape[0] - 1
+    poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))
+    costs = np.full((count, MAX_MINIMA), np.inf)
+    covariances = np.zeros((count, UNKNOWNS, UNKNOWNS))
+    info = np.zeros((count, 4), dtype=np.int64)
+    statuses = np.zeros(count, dtype=np.int64)
+    for b in range(count):
+        start, end = offsets[b], offsets[b + 1]
+        if end - start < min_points:
+            statuses[b] = TOO_FEW
+            continue
+        keypoints = Keypoints(
+            points[start:end],
+            rays[start:end],
+            whitening[start:end] if whitening.shape[0] > 1 else whitening,
+            loss,
+            loss_scale[b],
+        )
+        objective = Objective(free, keypoints, ScalePrior(prior_weight[b]))
+        info[b, 0], info[b, 1], info[b, 2], info[b, 3] = optimal_kernel(
+            objective, poses[b], costs[b], covariances[b]
+        )
+        if info[b, 3] >= 0:
+            statuses[b] = DEGENERATE
+        elif info[b, 0] == 0:
+            statuses[b] = NOT_FOUND
+    return poses, costs, covariances, statuses, info
 
 
 @kernel
@@ -51,10 +102,11 @@ def optimal_kernel(
     undetermined : int
         -1, or the number of an unknown that the points do not determine.
     """
-    center, unit = _center_and_unit(objective.points)
+    points = objective.keypoints.points
+    center, unit = center_and_unit(points)
     if not unit > 0:
         return 0, 0, 0, 0
-    local = _with_points(objective, (objective.points - center) / unit)
+    local = with_points(objective, (points - center) / unit)
     minima, iterations, hypotheses = _search(local, poses, costs)
     if minima == 0:
         return 0, iterations, hypotheses, -1
@@ -65,78 +117,6 @@ def optimal_kernel(
 
 
 @kernel
-def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write (J' W J)^-1 at a pose (15,) into (8, 8), with zeros for fixed unknowns.
-
-    Returns -1, or the number of an unknown that the points do not determine.
-    """
-    center, unit = _center_and_unit(objective.points)
-    local = _with_points(objective, (objective.points - center) / unit)
-    centered = pose.copy()
-    uncenter(centered, -center, 1.0)
-    for c in range(3):
-        centered[9 + c] /= unit
-    undetermined = _invert_information(local, centered, covariance)
-    _uncenter_covariance(pose, center, unit, covariance)
-    return undetermined
-
-
-@kernel
-def _center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
-    """The points' mean, and their root mean square distance from it."""
-    n = points.shape[0]
-    center = np.zeros(3)
-    for i in range(n):
-        center += points[i]
-    center /= n
-    spread = 0.0
-    for i in range(n):
-        for c in range(3):
-            spread += (points[i, c] - center[c]) ** 2
-    return center, np.sqrt(spread / n)
-
-
-@kernel
-def _with_points(objective: Objective, points: FloatArray) -> Objective:
-    """The same objective for other model points."""
-    return Objective(
-        points,
-        objective.rays,
-        objective.whitening,
-        objective.loss,
-        objective.loss_scale,
-        objective.prior_weight,
-        objective.free,
-    )
-
-
-@kernel
-def _some_points(objective: Objective, count: int) -> Objective:
-    """The objective of ``count`` of the points, evenly spread over their order."""
-    n = objective.points.shape[0]
-    each = objective.whitening.shape[0] > 1
-    points = np.empty((count, 3))
-    rays = np.empty((count, 2))
-    whitening = np.empty((count if each else 1, 3))
-    whitening[0] = objective.whitening[0]
-    for k in range(count):
-        i = k * n // count
-        points[k] = objective.points[i]
-        rays[k] = objective.rays[i]
-        if each:
-            whitening[k] = objective.whitening[i]
-    return Objective(
-        points,
-        rays,
-        whitening,
-        objective.loss,
-        objective.loss_scale,
-        objective.prior_weight,
-        objective.free,
-    )
-
-
-@kernel
 def _search(objective: Objective, poses: FloatArray, costs: FloatArray) -> tuple[int, int, int]:
     """Find the minima; returns how many, and the iterations and hypotheses it took.
 
@@ -144,9 +124,14 @@ def _search(objective: Objective, poses: FloatArray, costs: FloatArray) -> tuple
     all.
     """
     linear = np.empty(POSE_SIZE)
-    is_solved = linear_start(objective.points, objective.rays, linear)
-    few = objective.points.shape[0] <= _COARSE_POINTS
-    coarse = objective if few else _some_points(objective, _COARSE_POINTS)
+    keypoints = objective.keypoints
+    is_solved = aepnp_kernel(keypoints.points, keypoints.rays, linear) == OK
+    n = keypoints.points.shape[0]
+    few = n <= _COARSE_POINTS
+    coarse = objective
+    if not few:  # evenly spread over their order
+        chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS
+        coarse = with_keypoints(objective, take_keypoints(keypoints, chosen))
     found, iterations, hypotheses = _search_from_all_starts(coarse, linear, is_solved, poses, costs)
     if few:
         return found, iterations, hypotheses
@@ -178,7 +163,7 @@ def _search_from_all_starts(
 
     ``linear`` is the linear solver's pose, where it has one.
     """
-    points, rays, free = objective.points, objective.rays, objective.free
+    points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
     subset_count, refined = _effort(points.shape[0])
     starts = np.empty((subset_count * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = 0
@@ -190,7 +175,7 @@ def _search_from_all_starts(
         starts[count] = linear
         count += 1
     # Other starts serve coplanar points, and where the unstretched model is a better guess.
-    needs_grid = free[6] == 0.0 or free[7] == 0.0 or objective.prior_weight > 0.0
+    needs_grid = free[6] == 0.0 or free[7] == 0.0 or objective.scale_prior.weight > 0.0
     minima = 0
     iterations = 0
     for attempt in range(2):
@@ -206,7 +191,7 @@ def _search_from_all_starts(
 
 @kernel
 def _effort(points: int) -> tuple[int, int]:
-    """How many 4-subsets to solve and how many starts to refine.
+    """Numbers of 4-subsets to solve and of starts to refine.
 
     Measured on random problems: the optimum is missed in less than 0.1 % of them.
     """
@@ -286,18 +271,6 @@ def _descend(
 
 
 @kernel
-def has_collapsed(pose: FloatArray) -> bool:
-    """Say whether the refinement ran off to a model without thickness, or without end.
-
-    With few points the likelihood may rise forever as a scale goes to zero. No real object is
-    there, and the other minima are what the user needs.
-    """
-    low = min(pose[13], pose[14])
-    high = max(pose[13], pose[14])
-    return not (low > 1.0 / _LARGEST_STRETCH and high < _LARGEST_STRETCH)
-
-
-@kernel
 def _find(pose: FloatArray, poses: FloatArray, minima: int) -> int:
     """The row of the minimum that a pose coincides with, or -1."""
     for k in range(minima):
@@ -309,87 +282,3 @@ def _find(pose: FloatArray, poses: FloatArray, minima: int) -> int:
         if square < _SAME_CHORD * _SAME_CHORD:
             return k
     return -1
-
-
-@kernel
-def orthonormalize(pose: FloatArray) -> None:
-    """Take the rounding errors of the steps out of the rotation."""
-    rotation = np.empty((3, 3))
-    polish_rotation(pose[:9].reshape(3, 3), rotation)
-    for i in range(3):
-        for j in range(3):
-            pose[3 * i + j] = rotation[i, j]
-
-
-@kernel
-def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
-    """Turn the pose of points (x - center) / unit into the pose of points x."""
-    for c in range(3):
-        pose[9 + c] *= unit
-        for j in range(3):
-            pose[9 + c] -= pose[3 * c + j] * pose[12 + j] * center[j]
-
-
-@kernel
-def _invert_information(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write (J' W J)^-1 for centred points; see `covariance_of`.
-
-    Returns -1, or the number of the first unknown that the others leave undetermined.
-    """
-    information = np.empty((UNKNOWNS, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
-    evaluate(objective, pose, rows, information, gradient)
-    diagonal = np.diag(information).copy()
-    covariance[:] = 0.0
-    if not cholesky(information, UNKNOWNS, _UNOBSERVABLE):
-        for k in range(UNKNOWNS):
-            total = diagonal[k]
-            for m in range(k):
-                total -= information[k, m] ** 2
-            if not total > _UNOBSERVABLE * diagonal[k]:
-                return k
-        return UNKNOWNS - 1
-    column = np.empty(UNKNOWNS)
-    for k in range(UNKNOWNS):
-        if objective.free[k] == 0.0:
-            continue
-        column[:] = 0.0
-        column[k] = 1.0
-        solve_cholesky(information, UNKNOWNS, column)
-        for m in range(UNKNOWNS):
-            covariance[m, k] = column[m]
-    return -1
-
-
-@kernel
-def _uncenter_covariance(
-    pose: FloatArray, center: FloatArray, unit: float, covariance: FloatArray
-) -> None:
-    """Carry the covariance from points (x - center) / unit to points x, at the pose of x.
-
-    With t = unit t' - R S center, an infinitesimal change of the unknowns changes t by
-    unit dt' + [R S center]x d(rotation) - sum_k R_k s_k center_k d(log s_k).
-    """
-    jacobian = np.eye(UNKNOWNS)
-    shift = np.zeros(3)
-    for c in range(3):
-        for j in range(3):
-            shift[c] += pose[3 * c + j] * pose[12 + j] * center[j]
-        for k in range(2):
-            jacobian[3 + c, 6 + k] = -pose[3 * c + k + 1] * pose[13 + k] * center[k + 1]
-        jacobian[3 + c, 3 + c] = unit
-    jacobian[3, 1], jacobian[3, 2] = -shift[2], shift[1]
-    jacobian[4, 0], jacobian[4, 2] = shift[2], -shift[0]
-    jacobian[5, 0], jacobian[5, 1] = -shift[1], shift[0]
-    product = np.zeros((UNKNOWNS, UNKNOWNS))
-    for i in range(UNKNOWNS):
-        for j in range(UNKNOWNS):
-            for k in range(UNKNOWNS):
-                product[i, j] += jacobian[i, k] * covariance[k, j]
-    for i in range(UNKNOWNS):
-        for j in range(UNKNOWNS):
-            total = 0.0
-            for k in range(UNKNOWNS):
-                total += product[i, k] * jacobian[j, k]
-            covariance[i, j] = total

@@ -1,4 +1,4 @@
-"""The solver of the AEPnP paper, as published: the yardstick for the others."""
+"""The solver of the AEPnP paper, as published: the baseline for the others."""
 
 from __future__ import annotations
 

@@ -1,25 +1,36 @@
-"""Robust search: LO-RANSAC over the minimal solver.
+"""Robust search: LO-RANSAC over the minimal solver, for known and unknown focal length.
 
-Truncated squared errors (MSAC) rank the hypotheses; a sequential probability ratio test gives up
-on bad ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio
+Truncated squared errors (MSAC) rank the hypotheses; a sequential probability ratio test rejects
+bad ones after a few points (Matas, Chum, "Randomized RANSAC with sequential probability ratio
 test", 2005); a new best one is optimised locally (Chum, Matas, Kittler, "Locally optimized RANSAC",
-2003).
+2003). Where the focal length is unknown, every sample is solved at each focal length of a grid, and
+the local optimisation refines it, so the grid need not be fine.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
+from cadalign.solvers.evidence import (
+    Keypoints,
+    LogFocalPrior,
+    relative_to,
+    squared_error,
+    take_keypoints,
+)
+from cadalign.solvers.focal import at_focal, refine_focal
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
-from cadalign.solvers.objective import Objective
+from cadalign.solvers.minimal import MAX_SOLUTIONS, solve_subset
+from cadalign.solvers.objective import Objective, with_keypoints
+from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.refine import refine
 from cadalign.solvers.sampling import (
-    StateArray,
-    draw_subset,
+    draw_sample,
     grow_pool,
     next_subset,
     seed_state,
@@ -29,48 +40,84 @@ from cadalign.solvers.sampling import (
 
 _FEW_POINTS = 24  # so few are always all looked at
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
-_REJECTION = 200.0  # likelihood ratio at which a hypothesis is given up
-_LOCAL_ROUNDS = 3
+_REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
-_WIDE = 2.0  # the first local round takes points within so many thresholds
+_LOCAL_FOCAL_STEPS = 8
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 
 
-@kernel
-def ransac_kernel(
-    objective: Objective,
-    threshold: float,
-    minimal: int,
-    max_iterations: int,
-    min_iterations: int,
-    success_prob: float,
-    seed: int,
-    exhaustive: bool,
-    guided: bool,
-    optimize: bool,
-    pose: FloatArray,
-    inliers: BoolArray,
-) -> tuple[float, int, int]:
-    """Find the pose with the lowest truncated score.
+class Views(NamedTuple):
+    """The keypoints' images at each focal length that is tried.
 
     Parameters
     ----------
-    objective : Objective
-        The points, by falling confidence where ``guided``; its whitening turns errors into pixels.
+    rays, whitening : (k, n, 2), (k, 1 or n, 3) float
+        Normalised image coordinates, and the weights that turn their errors into pixels.
+    log_focals : (k,) float
+        Logarithms of the focal lengths; one of any value where it is known.
+    """
+
+    rays: FloatArray
+    whitening: FloatArray
+    log_focals: FloatArray
+
+
+class Settings(NamedTuple):
+    """Options of the search; see `cadalign.RansacOptions`.
+
+    Parameters
+    ----------
     threshold : float
         Largest reprojection error of an inlier [px].
-    minimal : int
-        AP4P or AEPNP.
+    minimal, size : int
+        Minimal solver, AP4P or AEPNP, and its number of points.
     max_iterations, min_iterations, success_prob, seed
-        See `cadalign.RansacOptions`.
     exhaustive : bool
         Try every subset once, in order, instead of drawing.
     guided : bool
         Draw from the first points first.
     optimize : bool
-        Optimise new best hypotheses locally, and the last one on all its inliers.
+        Optimise new best hypotheses locally, and, at a known focal length, the last one on all its
+        inliers.
+    estimate_focal : bool
+        The focal length is unknown.
+    """
+
+    threshold: float
+    minimal: int
+    size: int
+    max_iterations: int
+    min_iterations: int
+    success_prob: float
+    seed: int
+    exhaustive: bool
+    guided: bool
+    optimize: bool
+    estimate_focal: bool
+
+
+@kernel
+def ransac_kernel(
+    objective: Objective,
+    views: Views,
+    focal_prior: LogFocalPrior,
+    settings: Settings,
+    pose: FloatArray,
+    inliers: BoolArray,
+) -> tuple[float, float, int, int]:
+    """Find the pose, and the focal length where it is unknown, with the lowest truncated score.
+
+    Parameters
+    ----------
+    objective : Objective
+        The model points, by falling confidence where the search is guided, loss and scale prior;
+        the rays and weights are those of the views.
+    views : Views
+    focal_prior : LogFocalPrior
+        Bounds and prior of the log focal length.
+    settings : Settings
     pose, inliers : (15,) float, (n,) bool
         Receive the result.
 
@@ -78,13 +125,15 @@ def ransac_kernel(
     -------
     score : float
         Sum of squared errors, each at most the threshold's square [px^2].
+    log_focal : float
     iterations, hypotheses : int
     """
-    n = objective.points.shape[0]
-    size = 4 if minimal == AP4P else 6
-    limit = threshold * threshold
+    n = objective.keypoints.points.shape[0]
+    size = settings.size
+    guided = settings.guided
+    limit = settings.threshold * settings.threshold
     state = np.empty(1, dtype=np.uint64)
-    seed_state(seed, state)
+    seed_state(settings.seed, state)
     order = np.arange(n)
     shuffle(state, order)
     chosen = np.arange(size)
@@ -95,11 +144,15 @@ def ransac_kernel(
     random_support = _RANDOM_SUPPORT
     best = np.inf
     best_support = 0
+    best_focal = views.log_focals[0]
+    best_view = _view(objective, views, 0)
     iterations = 0
     hypotheses = 0
-    needed = float(max_iterations)
-    while iterations < max_iterations and (iterations < min_iterations or iterations < needed):
-        if exhaustive:
+    needed = float(settings.max_iterations)
+    while iterations < settings.max_iterations and (
+        iterations < settings.min_iterations or iterations < needed
+    ):
+        if settings.exhaustive:
             if iterations > 0 and not next_subset(chosen, n):
                 break
         else:
@@ -109,101 +162,83 @@ def ransac_kernel(
                 grow_pool(growth, size, n, iterations // 2)
             draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
-        found = solve_sample(objective, minimal, chosen, candidates)
-        hypotheses += found
-        for k in range(found):
-            score, support, seen = score_pose(
-                objective, order, candidates[k], limit, best, best_support / n, random_support
-            )
-            if seen < n and seen > 0:  # given up: learn how much support a wrong one finds
-                random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
-            if not score < best:
-                continue
-            best = score
-            best_support = support
-            pose[:] = candidates[k]
-            if optimize:
-                trial[:] = candidates[k]
-                score, support = _optimize_locally(objective, order, threshold, trial)
-                if score < best:
-                    best = score
-                    best_support = support
-                    pose[:] = trial
-            ratio = best_support / n
-            good = ratio**size
-            if good >= 1.0:
-                needed = 1.0
-            elif good > 0.0:
-                # A rejection test that errs once in _REJECTION costs that many more samples.
-                good *= 1.0 - 1.0 / _REJECTION
-                needed = np.log(1.0 - success_prob) / np.log1p(-good) * (2.0 if guided else 1.0)
-    if best < np.inf and optimize:
-        best = _finish(objective, threshold, order, best, pose)
-    find_inliers(objective, threshold, pose, inliers)
-    return best, iterations, hypotheses
+        for f in range(views.log_focals.shape[0]):
+            view = _view(objective, views, f)
+            found = _solve_sample(view.keypoints, settings.minimal, chosen, candidates)
+            hypotheses += found
+            for k in range(found):
+                score, support, seen = _score_pose(
+                    view.keypoints,
+                    order,
+                    candidates[k],
+                    limit,
+                    best,
+                    best_support / n,
+                    random_support,
+                )
+                if seen < n and seen > 0:  # rejected: learn how much support a wrong one finds
+                    random_support = 0.98 * random_support + 0.02 * max(support / seen, 0.002)
+                if not score < best:
+                    continue
+                best, best_support, best_view = score, support, view
+                best_focal = views.log_focals[f]
+                pose[:] = candidates[k]
+                if settings.optimize:
+                    trial[:] = candidates[k]
+                    there, moved = _optimize_locally(
+                        view, order, settings, relative_to(focal_prior, best_focal), trial
+                    )
+                    score, support, _ = _score_pose(
+                        there.keypoints, order, trial, limit, np.inf, 0.0, 1.0
+                    )
+                    if score < best:
+                        best, best_support, best_view = score, support, there
+                        best_focal += moved
+                        pose[:] = trial
+                if best_support > 0:
+                    needed = _needed_samples(best_support / n, settings)
+    if best < np.inf and settings.optimize and not settings.estimate_focal:
+        best = _finish(best_view, settings.threshold, order, best, pose)
+    scalars = scalars_of(pose)
+    for i in range(n):
+        inliers[i] = squared_error(best_view.keypoints, scalars, i) < limit
+    return best, best_focal, iterations, hypotheses
 
 
 @kernel
-def draw_sample(
-    state: StateArray, growth: FloatArray, guided: bool, count: int, chosen: IntArray
-) -> None:
-    """Draw a sample: of the pool's points, with its newest one, or of all."""
-    pool = int(growth[0]) if guided else count
-    if pool >= count:
-        draw_subset(state, count, chosen)
-    elif pool == chosen.shape[0]:
-        for k in range(pool):
-            chosen[k] = k
-    else:
-        draw_subset(state, pool - 1, chosen[1:])
-        chosen[0] = pool - 1
+def _view(objective: Objective, views: Views, f: int) -> Objective:
+    """The objective with the rays and weights of one focal length."""
+    old = objective.keypoints
+    keypoints = Keypoints(old.points, views.rays[f], views.whitening[f], old.loss, old.loss_scale)
+    return with_keypoints(objective, keypoints)
 
 
 @kernel
-def solve_sample(
-    objective: Objective, minimal: int, chosen: IntArray, candidates: FloatArray
+def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
+    """The number of samples after which one without outliers was drawn, by the given chance."""
+    good = inlier_ratio**settings.size
+    if good >= 1.0:
+        return 1.0
+    # A rejection test that errs once in _REJECTION costs that many more samples.
+    good *= 1.0 - 1.0 / _REJECTION
+    samples = np.log(1.0 - settings.success_prob) / np.log1p(-good)
+    return float(samples * (2.0 if settings.guided else 1.0))
+
+
+@kernel
+def _solve_sample(
+    keypoints: Keypoints, minimal: int, chosen: IntArray, candidates: FloatArray
 ) -> int:
     """Solve a minimal set; returns the number of hypotheses."""
-    size = chosen.shape[0]
-    points = np.empty((size, 3))
-    rays = np.ones((size, 3))
-    for k in range(size):
-        for c in range(3):
-            points[k, c] = objective.points[chosen[k], c]
-        rays[k, 0] = objective.rays[chosen[k], 0]
-        rays[k, 1] = objective.rays[chosen[k], 1]
     if minimal == AP4P:
-        return ap4p_kernel(points, rays, candidates)
-    rotation, translation, scale, status = aepnp_kernel(points, rays)
-    if status != OK:
-        return 0
-    candidates[0, :9] = rotation.ravel()
-    candidates[0, 9:12] = translation
-    candidates[0, 12:] = scale
-    return 1
+        return solve_subset(keypoints.points, keypoints.rays, chosen, candidates)
+    some = take_keypoints(keypoints, chosen)
+    return 1 if aepnp_kernel(some.points, some.rays, candidates[0]) == OK else 0
 
 
 @kernel
-def squared_error(objective: Objective, pose: FloatArray, i: int) -> float:
-    """Squared reprojection error of a point in units of the whitening; infinite behind."""
-    x = objective.points[i, 0] * pose[12]
-    y = objective.points[i, 1] * pose[13]
-    z = objective.points[i, 2] * pose[14]
-    depth = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
-    if not depth > 0:
-        return np.inf
-    inverse = 1.0 / depth
-    du = (pose[0] * x + pose[1] * y + pose[2] * z + pose[9]) * inverse - objective.rays[i, 0]
-    dv = (pose[3] * x + pose[4] * y + pose[5] * z + pose[10]) * inverse - objective.rays[i, 1]
-    w = i if objective.whitening.shape[0] > 1 else 0
-    ru = objective.whitening[w, 0] * du + objective.whitening[w, 1] * dv
-    rv = objective.whitening[w, 2] * dv
-    return float(ru * ru + rv * rv)
-
-
-@kernel
-def score_pose(
-    objective: Objective,
+def _score_pose(
+    keypoints: Keypoints,
     order: IntArray,
     pose: FloatArray,
     limit: float,
@@ -220,11 +255,12 @@ def score_pose(
     few = n <= _FEW_POINTS or inlier_ratio <= 1.5 * random_support
     miss = 1.0 if few else (1.0 - random_support) / (1.0 - min(inlier_ratio, 0.99))
     hit = 1.0 if few else random_support / inlier_ratio
+    scalars = scalars_of(pose)
     score = 0.0
     support = 0
     ratio = 1.0
     for k in range(n):
-        square = squared_error(objective, pose, order[k])
+        square = squared_error(keypoints, scalars, order[k])
         if square < limit:
             score += square
             support += 1
@@ -239,50 +275,58 @@ def score_pose(
 
 @kernel
 def _optimize_locally(
-    objective: Objective, order: IntArray, threshold: float, pose: FloatArray
-) -> tuple[float, int]:
-    """Refine a pose on its inliers, first the wider ones; returns its score and support."""
-    for r in range(_LOCAL_ROUNDS):
-        factor = _WIDE + (1.0 - _WIDE) * r / (_LOCAL_ROUNDS - 1)
-        some = inliers_of(objective, order, factor * threshold, pose, _LOCAL_POINTS)
-        if some.points.shape[0] < 5:
+    view: Objective,
+    order: IntArray,
+    settings: Settings,
+    focal_prior: LogFocalPrior,
+    pose: FloatArray,
+) -> tuple[Objective, float]:
+    """Refine a pose on its inliers, first the wider ones, and the focal length where it is unknown.
+
+    Returns the view at the refined focal length, and the logarithm of that over the view's.
+    """
+    # The first round takes points within ``wide`` thresholds.
+    rounds, wide, least_points = (4, 3.0, 6) if settings.estimate_focal else (3, 2.0, 5)
+    without_lens = np.empty((0, 2))
+    here = view
+    log_ratio = 0.0
+    for r in range(rounds):
+        factor = wide + (1.0 - wide) * r / (rounds - 1)
+        some = _inliers_of(here, order, factor * settings.threshold, pose, _LOCAL_POINTS)
+        if some.keypoints.points.shape[0] < least_points:
             break
-        refine(some, _LOCAL_ITERATIONS, pose)
-    limit = threshold * threshold
-    score, support, _ = score_pose(objective, order, pose, limit, np.inf, 0.0, 1.0)
-    return score, support
+        if settings.estimate_focal:
+            _, moved, _ = refine_focal(
+                some,
+                without_lens,
+                relative_to(focal_prior, log_ratio),
+                _LOCAL_FOCAL_STEPS,
+                pose,
+                0.0,
+            )
+            log_ratio += moved
+            here = at_focal(view, without_lens, log_ratio)
+        else:
+            refine(some, _LOCAL_ITERATIONS, pose)
+    return here, log_ratio
 
 
 @kernel
-def inliers_of(
+def _inliers_of(
     objective: Objective, order: IntArray, threshold: float, pose: FloatArray, most: int
 ) -> Objective:
     """The objective of the first ``most`` points that lie within a threshold."""
     limit = threshold * threshold
-    each = objective.whitening.shape[0] > 1
-    room = min(most, order.shape[0])
-    points = np.empty((room, 3))
-    rays = np.empty((room, 2))
-    whitening = np.empty((room if each else 1, 3))
-    whitening[0] = objective.whitening[0]
+    scalars = scalars_of(pose)
+    chosen = np.empty(min(most, order.shape[0]), dtype=np.int64)
     count = 0
     for k in range(order.shape[0]):
-        i = order[k]
-        if count < room and squared_error(objective, pose, i) < limit:
-            points[count] = objective.points[i]
-            rays[count] = objective.rays[i]
-            if each:
-                whitening[count] = objective.whitening[i]
+        if count == chosen.shape[0]:
+            break
+        if squared_error(objective.keypoints, scalars, order[k]) < limit:
+            chosen[count] = order[k]
             count += 1
-    return Objective(
-        points[:count],
-        rays[:count],
-        whitening[:count] if each else whitening,
-        objective.loss,
-        objective.loss_scale,
-        objective.prior_weight,
-        objective.free,
-    )
+    return with_keypoints(objective, take_keypoints(objective.keypoints, chosen[:count]))
 
 
 @kernel
@@ -294,11 +338,11 @@ def _finish(
     support = -1
     limit = threshold * threshold
     for _ in range(_FINAL_ROUNDS):
-        some = inliers_of(objective, order, threshold, trial, order.shape[0])
-        if some.points.shape[0] < 4:
+        some = _inliers_of(objective, order, threshold, trial, order.shape[0])
+        if some.keypoints.points.shape[0] < 4:
             return best
         refine(some, _FINAL_ITERATIONS, trial)
-        score, inside, _ = score_pose(objective, order, trial, limit, np.inf, 0.0, 1.0)
+        score, inside, _ = _score_pose(objective.keypoints, order, trial, limit, np.inf, 0.0, 1.0)
         if score > best * (1.0 + 1e-9):
             return best
         pose[:] = trial
@@ -307,13 +351,3 @@ def _finish(
         best = min(best, score)
         support = inside
     return best
-
-
-@kernel
-def find_inliers(
-    objective: Objective, threshold: float, pose: FloatArray, inliers: BoolArray
-) -> None:
-    """Say which points lie within the threshold."""
-    limit = threshold * threshold
-    for i in range(inliers.shape[0]):
-        inliers[i] = squared_error(objective, pose, i) < limit

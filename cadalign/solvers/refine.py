@@ -7,40 +7,16 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.evidence import BLOCK
 from cadalign.solvers.linalg import cholesky, solve_cholesky
-from cadalign.solvers.objective import BLOCK, Objective, evaluate
+from cadalign.solvers.objective import Objective, evaluate
+from cadalign.solvers.unknowns import move_pose
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e12
 _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
-
-
-@kernel
-def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
-    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
-    angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
-    angle = np.sqrt(angle2)
-    if angle > 1e-4:
-        a = np.sin(angle) / angle
-        b = (1.0 - np.cos(angle)) / angle2
-    else:
-        a = 1.0 - angle2 / 6.0
-        b = 0.5 - angle2 / 24.0
-    x, y, z = step[0], step[1], step[2]
-    for c in range(3):
-        p, q, r = pose[c], pose[3 + c], pose[6 + c]
-        # Rodrigues: v + a (w x v) + b (w x (w x v))
-        dot = x * p + y * q + z * r
-        moved[c] = p + a * (y * r - z * q) + b * (x * dot - p * angle2)
-        moved[3 + c] = q + a * (z * p - x * r) + b * (y * dot - q * angle2)
-        moved[6 + c] = r + a * (x * q - y * p) + b * (z * dot - r * angle2)
-    for c in range(3):
-        moved[9 + c] = pose[9 + c] + step[3 + c]
-    moved[12] = pose[12]
-    moved[13] = pose[13] * np.exp(min(max(step[6], -2.0), 2.0))
-    moved[14] = pose[14] * np.exp(min(max(step[7], -2.0), 2.0))
 
 
 @kernel
@@ -86,7 +62,7 @@ def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple
             growth *= 2.0
         if not cost < np.inf or done or iterations >= max_iterations:
             return cost, iterations, done
-        # Holds unknowns that the points tell nothing about where they are.
+        # Holds unknowns without evidence where they are.
         floor = 1e-300
         for k in range(UNKNOWNS):
             floor = max(floor, _LEAST_INFORMATION * hessian[k, k])

@@ -91,3 +91,19 @@ def start_pool(growth: FloatArray, size: int, count: int, budget: float) -> None
     for i in range(size):
         average *= (size - i) / (count - i)
     growth[0], growth[1], growth[2] = size, average, 1.0
+
+
+@kernel
+def draw_sample(
+    state: StateArray, growth: FloatArray, guided: bool, count: int, chosen: IntArray
+) -> None:
+    """Draw a sample: of the pool's points, with its newest one, or of all."""
+    pool = int(growth[0]) if guided else count
+    if pool >= count:
+        draw_subset(state, count, chosen)
+    elif pool == chosen.shape[0]:
+        for k in range(pool):
+            chosen[k] = k
+    else:
+        draw_subset(state, pool - 1, chosen[1:])
+        chosen[0] = pool - 1

@@ -1,4 +1,4 @@
-"""Where refinement starts: every alignment that some of the keypoints suggest."""
+"""Starts of the refinement: alignments that some of the keypoints suggest."""
 
 from __future__ import annotations
 
@@ -6,26 +6,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import OK
 from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
-from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, ap4p_kernel
+from cadalign.solvers.minimal import MAX_SOLUTIONS, solve_subset
+from cadalign.solvers.unknowns import pack_pose
 
 _DRAWS_PER_SUBSET = 4
-
-
-@kernel
-def linear_start(points: FloatArray, rays: FloatArray, pose: FloatArray) -> bool:
-    """Write the linear solver's pose; False where it has none."""
-    rotation, translation, scale, status = aepnp_kernel(points, rays)
-    if status != OK:
-        return False
-    for c in range(3):
-        pose[9 + c] = translation[c]
-        pose[12 + c] = scale[c]
-        for j in range(3):
-            pose[3 * c + j] = rotation[c, j]
-    return True
 
 
 @kernel
@@ -36,17 +21,9 @@ def minimal_starts(
 
     ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
     """
-    chosen = np.empty((4, 3))
-    directions = np.ones((4, 3))
     found = 0
     for s in range(count):
-        for i in range(4):
-            k = subsets[s, i]
-            for c in range(3):
-                chosen[i, c] = points[k, c]
-            directions[i, 0] = rays[k, 0]
-            directions[i, 1] = rays[k, 1]
-        found += ap4p_kernel(chosen, directions, poses[found : found + MAX_SOLUTIONS])
+        found += solve_subset(points, rays, subsets[s], poses[found : found + MAX_SOLUTIONS])
     return found
 
 
@@ -134,6 +111,7 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
     rotation = np.empty((3, 3))
     matrix = np.empty((3, 3))
     right = np.empty(3)
+    unstretched = np.ones(3)
     found = 0
     for k in range(wanted):
         s = (k + 0.5) / wanted
@@ -169,10 +147,6 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
         if not cholesky(matrix, 3, 1e-12):
             continue
         solve_cholesky(matrix, 3, right)
-        for c in range(3):
-            poses[found, 9 + c] = right[c]
-            poses[found, 12 + c] = 1.0
-            for j in range(3):
-                poses[found, 3 * c + j] = rotation[c, j]
+        pack_pose(rotation, right, unstretched, poses[found])
         found += 1
     return found

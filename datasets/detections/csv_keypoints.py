@@ -37,6 +37,7 @@ from msgspec import UNSET, UnsetType
 from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Document, Finite, Text, convert, in_file
+from cadalign.io.files import reading
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _VISIBILITY_SCORES = (0.0, OCCLUDED_SCORE, 1.0)
@@ -67,16 +68,14 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
     """Read a CSV file, one object for each image."""
     by_image: dict[str | None, list[_Row]] = {}
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with reading(path), path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file, strict=True)
             header = _header(next(lines, []), f"{path}, line 1")
             for line in lines:
                 row = _row(header, line, f"{path}, line {lines.line_num}")
                 if row is not None:
                     by_image.setdefault(row.image or None, []).append(row)
-    except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
-    except (OSError, ValueError, csv.Error) as error:  # not UTF-8, or a NUL in the path
+    except csv.Error as error:
         raise DataError(f"cannot be read ({error})", where=str(path)) from None
     if not by_image:
         raise DataError("there are no keypoints", where=str(path))

@@ -150,7 +150,7 @@ def read_entries(path: Path) -> list[Any]:
 def entry_id(entry: Any, position: int) -> str:
     """An entry's model id, or ``#position`` where it has none."""
     model_id = entry.get("model_id") if isinstance(entry, dict) else None
-    return model_id[:200] if isinstance(model_id, str) and model_id else f"#{position}"
+    return model_id if isinstance(model_id, str) and model_id else f"#{position}"
 
 
 def parse_entry(entry: Any, *, where: str) -> Annotation:
@@ -208,6 +208,7 @@ def _symmetries(read: _Symmetries) -> Symmetries:
 
 def _circle(read: _Circle) -> Circle:
     normal = np.array(read.normal)
+    normal /= np.abs(normal).max()  # whose square is finite
     return Circle(
         center=_frozen(read.center, float),
         radius=read.radius,

@@ -70,11 +70,8 @@ def _front(p: CarShape) -> list[Solid]:
 def _rear(p: CarShape) -> list[Solid]:
     z, half = p.length / 2, p.width / 2
     tall = 0.34 if p.kind in ("van", "suv") else 0.16
-    center, size = (
-        (0.76 * half, p.tail_lamp - 0.5 * tall + 0.06, z - 0.03),
-        (0.3 * half, tall, 0.16),
-    )
-    lamp = make.rounded_box(center, size, _TAIL_LAMP, radius=0.03)
+    center = (0.76 * half, p.tail_lamp - 0.5 * tall + 0.06, z - 0.03)
+    lamp = make.rounded_box(center, (0.3 * half, tall, 0.16), _TAIL_LAMP, radius=0.03)
     plate = make.box((0, p.tail - 0.24, z + 0.002), (0.52, 0.11, 0.02), _PLATE)
     return [*make.both_sides(lamp), _bumper(p, 1.0, 0.42), plate]
 
@@ -109,16 +106,11 @@ def _sides(p: CarShape) -> list[Solid]:
     front, rear = p.z_axles[0] + 1.4 * p.wheel_radius, p.z_axles[1] - 1.4 * p.wheel_radius
     low = p.sill + 0.45 * (shoulder - p.sill)
     for z in (front + 0.12, *(z for z in p.pillars if z < rear)):
-        center, size = (
-            (p.half_width(z) - 0.004, (low + shoulder) / 2, z),
-            (0.016, shoulder - low, 0.014),
-        )
-        solids.append(make.box(center, size, _DARK))
+        center = (p.half_width(z) - 0.004, (low + shoulder) / 2, z)
+        solids.append(make.box(center, (0.016, shoulder - low, 0.014), _DARK))
     for z in (z for z in p.pillars if z < rear + 0.1):
         handle = (p.half_width(z), shoulder - 0.04, z - 0.16)
         solids.append(make.rounded_box(handle, (0.04, 0.03, 0.17), _TRIM, radius=0.01, steps=1))
-    skirt, size = (
-        (half - 0.03, p.sill + 0.03, (front + rear) / 2),
-        (0.08, 0.07, rear - front + 0.06),
-    )
+    skirt = (half - 0.03, p.sill + 0.03, (front + rear) / 2)
+    size = (0.08, 0.07, rear - front + 0.06)
     return make.both_sides(*solids, make.rounded_box(skirt, size, _TRIM, radius=0.02, steps=1))

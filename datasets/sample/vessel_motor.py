@@ -28,10 +28,8 @@ def tug(p: VesselShape) -> Superstructure:
     """A tug: wheelhouse forward, one or two funnels, tyres along the side, a low open stern."""
     deck, house, front, rear = p.hull.deck(0.05), 0.62 * p.hull.beam, -0.24, 0.14
     tall = 0.1 * p.tall
-    main, size = (
-        (0.0, deck + tall / 2 - 0.02, (front + rear) / 2),
-        (house, tall + 0.04, rear - front),
-    )
+    main = (0.0, deck + tall / 2 - 0.02, (front + rear) / 2)
+    size = (house, tall + 0.04, rear - front)
     y, wide = deck + tall, (0.78, 0.66, 0.86)[p.variant] * house
     sill, lintel, top = y + 0.045, y + 0.1, y + 0.125
     z_front, z_rear = front + 0.03, front + 0.2
@@ -130,9 +128,8 @@ def _storey(
 def _towing_gear(p: VesselShape) -> list[Solid]:
     """A winch and bollard on the stern, a fender at the bow, and tyres along the sides."""
     hull, deck = p.hull, p.hull.deck(0.25)
-    drum, cheek = (
-        [(0, 0), (r, 0), (r, end), (0, end)] for r, end in ((0.035, 0.12), (0.052, 0.012))
-    )
+    drum = [(0, 0), (0.035, 0), (0.035, 0.12), (0, 0.12)]
+    cheek = [(0, 0), (0.052, 0), (0.052, 0.012), (0, 0.012)]
     solids = [
         make.wheel((-0.06, deck + 0.04, 0.24), drum, STEEL),
         *make.both_sides(make.wheel((0.05, deck + 0.04, 0.24), cheek, p.accent)),
@@ -155,11 +152,8 @@ def _towing_gear(p: VesselShape) -> list[Solid]:
 def _radar_arch(y: float, wide: float, rear: float) -> tuple[list[Solid], Point]:
     """An arch with a radar bar and an aerial, and the aerial's tip."""
     top, z = y + 0.06, rear - 0.02
-    foot, bend, tip = (
-        (0.42 * wide, y - 0.01, z + 0.06),
-        (0.36 * wide, top, z),
-        (0.0, top + 0.13, z + 0.015),
-    )
+    foot, bend = (0.42 * wide, y - 0.01, z + 0.06), (0.36 * wide, top, z)
+    tip = (0.0, top + 0.13, z + 0.015)
     drum = [(0, 0), (0.01, 0), (0.01, 0.02), (0, 0.02)]
     solids = [
         *make.both_sides(make.beam(foot, bend, (0.05, 0.014), WHITE, side=(0, 0, 1))),

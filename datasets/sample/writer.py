@@ -5,7 +5,6 @@ from __future__ import annotations
 import colorsys
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, f
 from cadalign.datasets.sample.vessel import vessel
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import writing
 
 MAKERS: dict[str, Callable[[np.random.Generator, int], Draft]] = {
     "chair": chair,
@@ -109,28 +109,18 @@ def write_sample_dataset(
     target = Path(root)
     names = _check_arguments(per_category, categories, seed)
     _check_replaceable(target)
-    try:
+    with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         # Not a plain folder name beside it: two runs at once must not share one.
-        partial = Path(
-            tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent)
-        )
-        try:
-            partial.chmod(0o755)
-            data = partial / "data"
+        with tempfile.TemporaryDirectory(
+            prefix=f".{target.name}.", suffix=".partial", dir=target.parent
+        ) as folder:
+            data = Path(folder, "data")
             data.mkdir()
             _write(data, names, per_category, seed)
             if target.exists():
-                target.rename(partial / "replaced")
+                target.rename(Path(folder, "replaced"))
             data.rename(target)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        raise DataError(
-            f"cannot be written ({error})",
-            where=str(target),
-            fix="give a folder with room to write",
-        ) from error
     return target
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sfm.bundler_file import read_bundler
@@ -20,6 +19,7 @@ from cadalign.datasets.sfm.correspondences import Correspondences, Correspondenc
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.io.images import open_photo
 
 ImageSize = tuple[int, int]
 """Width and height [px]."""
@@ -170,13 +170,8 @@ def _listed_photos(listing: Path, file: Path, count: int) -> _Photos:
 
 
 def _photo_size(path: Path) -> ImageSize:
-    try:
-        with Image.open(path) as photo:
-            return photo.size
-    except (OSError, Image.DecompressionBombError) as error:
-        raise DataError(
-            f"the photo cannot be read ({error})", where=str(path), fix="or give sizes"
-        ) from None
+    with open_photo(path) as photo:  # not turned upright: Bundler does not either
+        return photo.size
 
 
 def _as_sizes(

@@ -10,6 +10,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError
+from cadalign.io.files import reading
 
 _HEADER = "# Bundle file v0.3"
 _CAMERA_VALUES = 15
@@ -112,10 +113,8 @@ def _read_points(
 
 
 def _read_values(path: Path) -> FloatArray:
-    try:
+    with reading(path):
         text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=str(path)) from None
     header, _, body = text.partition("\n")
     if header.strip() != _HEADER:
         raise DataError(
@@ -145,6 +144,6 @@ def _not_a_number(body: str, path: Path) -> DataError:
 
 
 def _as_count(value: float, path: Path, where: str) -> int:
-    if not (value >= 0 and value % 1 == 0 and np.isfinite(value)):
+    if not (0 <= value < np.inf and value % 1 == 0):
         raise DataError(f"{value:g} is not a number of things", where=f"{path}, {where}", fix=_CUT)
     return int(value)

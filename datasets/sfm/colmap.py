@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import IntArray
 from cadalign.datasets.sfm.colmap_binary import (
     read_cameras_binary,
     read_images_binary,
@@ -23,6 +23,7 @@ from cadalign.datasets.sfm.correspondences import Correspondences, Correspondenc
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
 
 _STEMS = ("cameras", "images", "points3D")
 # COLMAP itself prefers the binary files where both are there.
@@ -64,16 +65,10 @@ class Colmap(CorrespondenceSet):
         binary = suffix == ".bin"
         files = {stem: folder / f"{stem}{suffix}" for stem in _STEMS}
         self._camera_file, self._point_file = files["cameras"], files["points3D"]
-        try:
-            read_cameras = read_cameras_binary if binary else read_cameras_text
-            self._cameras = read_cameras(self._camera_file)
-            points = (read_points_binary if binary else read_points_text)(self._point_file)
-            images = (read_images_binary if binary else read_images_text)(files["images"])
-        except OSError as error:
-            raise DataError(
-                f"cannot be read ({error.strerror or error})", where=str(error.filename or folder)
-            ) from None
-        ids, xyz = points
+        read_cameras = read_cameras_binary if binary else read_cameras_text
+        self._cameras = read_cameras(self._camera_file)
+        ids, xyz = (read_points_binary if binary else read_points_text)(self._point_file)
+        images = (read_images_binary if binary else read_images_text)(files["images"])
         order = np.argsort(ids, kind="stable")
         self._point_ids, self._points = ids[order], xyz[order]
         twice = self._point_ids[1:][self._point_ids[1:] == self._point_ids[:-1]]
@@ -123,27 +118,6 @@ class Colmap(CorrespondenceSet):
             raise DataError(
                 error.what, where=f"{self._camera_file}, camera {camera_id}", fix=error.fix
             ) from None
-
-
-def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
-    """Rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
-
-    Raises
-    ------
-    InputError
-        If it is zero or not finite.
-
-    Examples
-    --------
-    >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    from scipy.spatial.transform import Rotation
-
-    length = np.linalg.norm(quat_wxyz)
-    if not 0 < length < np.inf:
-        raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
-    return np.asarray(Rotation.from_quat(quat_wxyz[[1, 2, 3, 0]] / length).as_matrix())
 
 
 def _find_model(root: Path) -> tuple[Path, str]:

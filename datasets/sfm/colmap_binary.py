@@ -16,6 +16,7 @@ import numpy.typing as npt
 from cadalign.datasets.sfm.colmap_model import CameraTable, ColmapImage, ColmapPoints, ColmapView
 from cadalign.errors import DataError
 from cadalign.geometry.camera import COLMAP_PARAMS
+from cadalign.io.files import reading
 
 # COLMAP's camera models in the order of their numbers, and how many parameters those have that
 # `Camera` doesn't know: a camera nobody asks for must not keep the others from being read.
@@ -93,7 +94,7 @@ def read_images_binary(path: Path) -> list[ColmapImage]:
         fields = cursor.unpack(_IMAGE, "an image")
         name = cursor.name()
         observations = cursor.array(
-            _OBSERVATION, cursor.count("observations"), f"the observations of image {name}"
+            _OBSERVATION, cursor.count("observations"), f"the observations of image {name[:200]}"
         )
         images.append((name, partial(_read_view, fields, observations)))
     cursor.finish()
@@ -115,7 +116,8 @@ class _Cursor:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._data = path.read_bytes()
+        with reading(path):
+            self._data = path.read_bytes()
         self.offset = 0
 
     def count(self, what: str) -> int:

@@ -13,6 +13,7 @@ import numpy as np
 
 from cadalign.datasets.sfm.colmap_model import CameraTable, ColmapImage, ColmapPoints, ColmapView
 from cadalign.errors import DataError, quote
+from cadalign.io.files import reading
 
 # Before an image's name: its number, wxyz, translation, and its camera's number.
 _POSE_FIELDS = 9
@@ -111,7 +112,8 @@ def _entries(path: Path) -> Iterator[tuple[int, str]]:
 
 def _lines(path: Path) -> list[str]:
     # Not splitlines, which would also split names at exotic separators.
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    with reading(path):
+        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     return lines[:-1] if lines[-1] == "" else lines
 
 

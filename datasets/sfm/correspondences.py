@@ -235,7 +235,7 @@ class CorrespondenceSet(ABC):
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._read(position)
         except InputError as error:
-            where = f"{self.source}, image {self.ids[position]}"
+            where = f"{self.source}, image {self.ids[position][:200]}"
             if error.where is not None:
                 where = f"{where}, {error.where}"
             raise DataError(error.what, where=where, fix=error.fix) from None

@@ -12,6 +12,7 @@ from cadalign.datasets.sfm.bundler import Bundler
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
+from cadalign.io.files import reading
 
 AUTO = "auto"
 """Recognise the format by the names of the files."""
@@ -144,8 +145,5 @@ def _recognize(root: Path) -> _Format:
 
 
 def _begins_with(file: Path, header: bytes) -> bool:
-    try:
-        with file.open("rb") as stream:
-            return stream.read(len(header)) == header
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=str(file)) from None
+    with reading(file), file.open("rb") as stream:
+        return stream.read(len(header)) == header

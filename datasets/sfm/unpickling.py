@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError, quote
+from cadalign.io.files import reading
 
 # Numbers, text and objects; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
@@ -59,10 +60,8 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
         asked for.
     """
     where = str(path)
-    try:
+    with reading(Path(path)):
         data = Path(path).read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=where) from None
     try:
         _check_program(data)
         value = _PlainUnpickler(io.BytesIO(data), where).load()

@@ -12,6 +12,7 @@ from cadalign.arrays import FloatArray, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
 from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.model_layer import TRANSLUCENT, check_model_style, draw_lines, veil
@@ -202,7 +203,7 @@ def _strokes(ends: FloatArray, color: Color, camera: Camera, near_plane: float) 
     count = _BENT_LINE_POINTS if camera.distortion else 2
     share = np.linspace(0, 1, count)[:, None]
     points = clipped[0] + share * (clipped[1] - clipped[0])
-    normalized = points[:, :2] / points[:, 2:]
+    normalized = perspective(points)
     kept = within_lens_field(camera, normalized)
     pixels = camera.pixels_from_normalized(normalized)
     runs = np.split(np.arange(count), np.flatnonzero(np.diff(kept)) + 1)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
 from cadalign.render.drawing.color import LinearArray
 from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.shading import Studio
@@ -209,7 +210,7 @@ def object_rectangle(
     whole = Rectangle(0, 0, camera.width, camera.height)
     if nearest <= 0:
         return whole
-    normalized = points[:, :2] / points[:, 2:]
+    normalized = perspective(points)
     if not np.isfinite(normalized).all():
         return whole
     low, high = normalized.min(axis=0), normalized.max(axis=0)

@@ -27,6 +27,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
 from cadalign.io.files import write_json, write_text, writing
 
@@ -118,7 +119,7 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     if path.is_dir():
         return _read_colmap(path)
     data = read_json(path)
-    with in_file(path):
+    with in_file(path), np.errstate(over="ignore", invalid="ignore"):
         return _views_of(data)
 
 
@@ -186,7 +187,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     for number, view in enumerate(views, start=1):
         camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
         pose = _rigid(view, number - 1)
-        values = [*_quat_wxyz(pose.rotation), *pose.translation]
+        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
         text = " ".join(f"{value:.17g}" for value in values)
         images.append(f"{number} {text} {camera_id} {view.name}\n\n")
     cameras = []
@@ -338,14 +339,6 @@ def _read_colmap(folder: Path) -> list[CameraView]:
     model = Colmap(folder)
     images = (model[name] for name in model.ids)
     return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]
-
-
-def _quat_wxyz(rotation: FloatArray) -> FloatArray:
-    """The quaternion of a rotation matrix, scalar first and not negative."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])
 
 
 # All of them

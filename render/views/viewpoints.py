@@ -12,6 +12,7 @@ from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
 from cadalign.render.scene import Scene
 from cadalign.render.views.lens_field import within_lens_field
 from cadalign.render.views.visibility import visible_keypoints
@@ -231,7 +232,7 @@ def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
     """Share of the way to the image's border that the farthest corner reaches."""
     if corners[:, 2].min() <= 0:
         return np.inf
-    normalized = corners[:, :2] / corners[:, 2:]
+    normalized = perspective(corners)
     if not within_lens_field(camera, normalized).all():
         return np.inf
     offset = np.abs(camera.pixels_from_normalized(normalized) - middle)

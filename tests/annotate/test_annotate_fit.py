@@ -14,10 +14,10 @@ from cadalign import Alignment, Camera, fit
 from cadalign.annotate.alignment import Intrinsics, LiveAlignment, align
 from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.next_best import NextBest, find_next_best, unknown_name, updated_variances
-from cadalign.annotate.prediction import projection_jacobian
 from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation.problems import Problem
+from cadalign.fitting.prediction import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
 UNKNOWN = FocalChoice(known=False)

@@ -458,5 +458,5 @@ def test_a_pickle_cut_anywhere_is_refused(tmp_path):
 
 
 def test_a_pickle_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"a.pkl: cannot be read \(No such file"):
+    with pytest.raises(DataError, match=r"a.pkl: no such file"):
         load_pickle(tmp_path / "a.pkl")

@@ -165,7 +165,7 @@ def test_a_photo_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "images" / "b.png").write_bytes(b"no picture")
     file = Model().write(tmp_path)
     assert list(Bundler(file).problems) == ["b.png"]
-    with pytest.raises(DataError, match=r"b.png: the photo cannot be read"):
+    with pytest.raises(DataError, match=r"b.png: not an image that can be read"):
         Bundler(file)[1]
     assert not Bundler(file, sizes=(WIDTH, HEIGHT)).problems
 

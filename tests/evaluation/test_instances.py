@@ -9,7 +9,7 @@ from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, check_methods, fit_with, method_names
+from cadalign.evaluation.accuracy.methods import LIMIT, check_methods, fit_options, method_names
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, make_hull_instance
 from cadalign.evaluation.simulation.problems import simulate_problem
@@ -150,7 +150,7 @@ def test_every_method_solves_an_easy_problem(name: str) -> None:
     problem = simulate_problem(
         np.random.default_rng(4), points=30, noise_px=0.0, stretch=(1.0, 1.0)
     )
-    result = fit_with(name, problem.points_3d, problem.points_2d, problem.camera)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera, **fit_options(name))
     assert rotation_error(est=result.alignment, gt=problem.alignment) < 1e-3
 
 

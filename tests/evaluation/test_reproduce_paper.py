@@ -35,7 +35,7 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
         return lambda progress: None
 
     report = reproduce_paper(
-        PaperPlan(tmp_path, quick=True, workers=0), announce=announce
+        PaperPlan(out=tmp_path, quick=True, workers=0), announce=announce
     ).read_text()
     assert said == ["keypoints: sample", "simulation: noise", "simulation: points"]
     assert "fractions" in report

@@ -300,24 +300,26 @@ class TestSummaries:
         for summary in summaries:
             rows = rows_of(
                 finished,
-                protocol=summary.protocol,
+                protocol=summary["protocol"],
                 method=summary.method,
-                keypoints=summary.keypoints,
+                keypoints=summary["keypoints"],
             )
-            assert (summary.queries, summary.failed) == (30, 0)
+            assert (summary["queries"], summary["failed"]) == (30, 0)
             ious = [row["box_iou"] for row in rows]
-            assert summary.box_iou == pytest.approx(np.median(ious))
-            assert summary.mean_box_iou == pytest.approx(np.mean(ious))
-            assert summary.score == pytest.approx(np.mean([row["score"] for row in rows]))
+            assert summary["box_iou"] == pytest.approx(np.median(ious))
+            assert summary["mean_box_iou"] == pytest.approx(np.mean(ious))
+            assert summary["score"] == pytest.approx(np.mean([row["score"] for row in rows]))
             ranks = [row["rank"] for row in rows]
-            if summary.protocol == "leave-out":
-                assert np.isnan([summary.rank_1, summary.rank_5, summary.reciprocal_rank]).all()
+            if summary["protocol"] == "leave-out":
+                assert np.isnan(
+                    [summary["rank_1"], summary["rank_5"], summary["reciprocal_rank"]]
+                ).all()
                 continue
-            assert summary.rank_1 == pytest.approx(np.mean([rank == 1 for rank in ranks]))
-            assert summary.rank_5 == pytest.approx(
+            assert summary["rank_1"] == pytest.approx(np.mean([rank == 1 for rank in ranks]))
+            assert summary["rank_5"] == pytest.approx(
                 np.mean([rank is not None and rank <= 5 for rank in ranks])
             )
-            assert summary.reciprocal_rank == pytest.approx(
+            assert summary["reciprocal_rank"] == pytest.approx(
                 np.mean([0.0 if rank is None else 1 / rank for rank in ranks])
             )
 
@@ -326,7 +328,7 @@ class TestSummaries:
         with finished.summary.open() as file:
             lines = list(csv.DictReader(file))
         assert len(lines) == len(summaries)
-        assert float(lines[0]["rank_1"]) == summaries[0].rank_1
+        assert float(lines[0]["rank_1"]) == summaries[0]["rank_1"]
         assert [line["rank_1"] for line in lines if line["protocol"] == "leave-out"] == [""] * 4
         names = {
             "leave_in_rank_1",
@@ -381,12 +383,12 @@ def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path:
     )
     folder = RunFolder(tmp_path / "run")
     run(options, folder)
-    found = {(s.protocol, s.method): s for s in summarize(Run.open(folder.path))}
-    assert found["leave-in", "optimal"].rank_1 > 0.93
-    assert found["leave-in", "epnp"].rank_1 < 0.4
+    found = {(s["protocol"], s.method): s for s in summarize(Run.open(folder.path))}
+    assert found["leave-in", "optimal"]["rank_1"] > 0.93
+    assert found["leave-in", "epnp"]["rank_1"] < 0.4
     stretched, rigid = found["leave-out", "optimal"], found["leave-out", "epnp"]
-    assert stretched.mean_box_iou > rigid.mean_box_iou + 0.05
-    assert stretched.shape_distance < rigid.shape_distance
+    assert stretched["mean_box_iou"] > rigid["mean_box_iou"] + 0.05
+    assert stretched["shape_distance"] < rigid["shape_distance"]
 
 
 def test_distances_of_mirrored_and_flat_models_are_numbers() -> None:

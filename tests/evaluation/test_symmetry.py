@@ -11,9 +11,10 @@ from cadalign import Alignment
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
-from cadalign.evaluation.instances.symmetry import SymmetryGroup, rotation_about, symmetry_group
+from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import rotation_error, translation_error
+from cadalign.geometry.rotations import rotation_from_vector
 
 Y = np.array([0.0, 1.0, 0.0])
 SQUARE = np.array([[1.0, 0, 1], [1, 0, -1], [-1, 0, -1], [-1, 0, 1]])
@@ -60,7 +61,7 @@ def test_a_bottle_turned_about_its_axis_is_no_error(degrees: float) -> None:
     group = symmetry_group(*bottle())
     assert str(group) == "circle"
     gt = some_truth()
-    est = turned(gt, group, rotation_about(Y, np.radians(degrees)))
+    est = turned(gt, group, rotation_from_vector(Y * np.radians(degrees)))
     assert errors(group, est, gt) == pytest.approx((0.0, 0.0), abs=1e-6)
     assert rotation_error(est=est, gt=gt) == pytest.approx(abs(degrees), abs=1e-6)
 
@@ -69,7 +70,7 @@ def test_a_turned_bottle_looks_the_same() -> None:
     xyz, symmetries = bottle()
     group = symmetry_group(xyz, symmetries)
     gt = some_truth()
-    est = turned(gt, group, rotation_about(Y, np.pi / 2))
+    est = turned(gt, group, rotation_from_vector(Y * np.pi / 2))
     # A quarter turn moves each ring's keypoints to their neighbours; the object is gt.scale * x.
     order = [3, 0, 1, 2, 7, 4, 5, 6, 8]
     moved = (xyz @ est.rotation.T + est.translation)[order]
@@ -79,8 +80,8 @@ def test_a_turned_bottle_looks_the_same() -> None:
 def test_a_tilted_bottle_keeps_the_error_of_its_tilt() -> None:
     group = symmetry_group(*bottle())
     gt = some_truth()
-    tilt = rotation_about(np.array([1.0, 0.0, 0.0]), np.radians(12.0))
-    est = turned(gt, group, tilt @ rotation_about(Y, np.radians(75.0)))
+    tilt = rotation_from_vector(np.array([np.radians(12.0), 0.0, 0.0]))
+    est = turned(gt, group, tilt @ rotation_from_vector(Y * np.radians(75.0)))
     assert errors(group, est, gt)[0] == pytest.approx(12.0, abs=1e-6)
 
 
@@ -91,7 +92,7 @@ def test_the_nearest_angle_is_the_best_of_all() -> None:
         est = Alignment(random_rotation(np.random.default_rng(seed + 99)), [0, 0, 4], [1, 1, 1])
         best, _ = errors(group, est, gt)
         searched = min(
-            rotation_error(est=est, gt=turned(gt, group, rotation_about(Y, angle)))
+            rotation_error(est=est, gt=turned(gt, group, rotation_from_vector(Y * angle)))
             for angle in np.linspace(0, 2 * np.pi, 721)
         )
         assert best <= searched + 1e-9
@@ -116,10 +117,10 @@ def test_two_mirrors_make_a_half_turn() -> None:
     group = symmetry_group(*table())
     assert len(group.rotations) == 2
     gt = some_truth()
-    assert errors(group, turned(gt, group, rotation_about(Y, np.pi)), gt) == pytest.approx(
+    assert errors(group, turned(gt, group, rotation_from_vector(Y * np.pi)), gt) == pytest.approx(
         (0.0, 0.0), abs=1e-6
     )
-    quarter = turned(gt, group, rotation_about(Y, np.pi / 2))
+    quarter = turned(gt, group, rotation_from_vector(Y * np.pi / 2))
     assert errors(group, quarter, gt)[0] == pytest.approx(90.0, abs=1e-6)
 
 

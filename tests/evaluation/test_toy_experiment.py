@@ -215,7 +215,7 @@ def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert (shown["rows"], shown["failed"], len(shown["summary"])) == (36, 12, 6)
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert rows[0]["group"] == "bad"
+    assert rows[0]["category"] == "bad"
     assert rows[0][ERROR.key] == ""
-    assert float(rows[2][ERROR.key]) == shown["summary"][2]["values"][ERROR.key]
+    assert float(rows[2][ERROR.key]) == shown["summary"][2][ERROR.key]
     assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}

@@ -242,8 +242,8 @@ def first_with(row: int, value: float) -> list[np.ndarray]:
         ({"camera": [LENS] * 5}, "camera: 6 problems but 5 cameras"),
         ({"camera": [LENS] * 5 + [None]}, "camera: expected a cadalign.Camera, got NoneType"),
         ({"sigma": [1.0] * 5}, "sigma: 6 problems but 5 values"),
-        ({"workers": 0}, "workers: 0 is not a number of threads; or -1"),
-        ({"workers": -2}, "workers: -2 is not a number of threads; or -1"),
+        ({"workers": 0}, "workers: must be >= 1, or -1 for all cores, not 0"),
+        ({"workers": -2}, "workers: must be >= 1, or -1 for all cores, not -2"),
         (
             {"method": "best"},
             "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp",

@@ -194,7 +194,7 @@ def test_confidences_without_ransac_are_refused() -> None:
         ({"min_iterations": -1}, "min_iterations: -1 is not a number of at least 0"),
         ({"seed": 1.5}, "seed: 1.5 is not a number of at least 0"),
         ({"success_prob": 1.0}, "success_prob: 1.0 is not between 0 and 1"),
-        ({"minimal": "p3p"}, "minimal: unknown minimal solver 'p3p'; known are ap4p, aepnp"),
+        ({"minimal": "p3p"}, "minimal: unknown minimal 'p3p'; known are ap4p, aepnp"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:

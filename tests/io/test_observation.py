@@ -47,6 +47,20 @@ def test_fields_arrive() -> None:
     assert observation.model == Path("models/chair.obj")
 
 
+def test_numbers_and_arrays_of_numpy_are_read() -> None:
+    keypoints = [
+        {"xyz": np.array(k["xyz"]), "uv": [*map(np.float64, k["uv"])], "sigma": np.float32(1.5)}
+        for k in DATA["keypoints"]
+    ]
+    observation = Observation.from_dict({"camera": DATA["camera"], "keypoints": keypoints})
+    assert observation.points_2d.tolist() == [k["uv"] for k in DATA["keypoints"]]
+    assert observation.sigma is not None
+    assert observation.sigma.tolist() == [1.5] * 6
+    keypoints[2]["uv"] = [np.float64("nan"), 2]
+    with pytest.raises(DataError, match=r"keypoints\[2\]\.uv\[0\]: nan is not a finite number"):
+        Observation.from_dict({"camera": DATA["camera"], "keypoints": keypoints})
+
+
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     observation = Observation.load(write_json(tmp_path / "chair.json", DATA))
     assert observation.image == tmp_path / "photo.png"
@@ -89,6 +103,10 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             DATA | {"cameras": 3},
             "{path}: top level: unknown field 'cameras'; known are camera, image, keypoints, model",
+        ),
+        (
+            DATA | {"x` - at `$.y": 3},
+            "{path}: y: unknown field 'x'",
         ),
         (changed("keypoints.2", 7), "{path}: keypoints[2]: 7 is not an object"),
         (changed("keypoints.2.xyz", ...), "{path}: keypoints[2].xyz: missing"),

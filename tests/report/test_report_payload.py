@@ -17,10 +17,10 @@ import pytest
 from PIL import Image
 from support.pages import embedded_payload
 
-from cadalign import Alignment, Box, Camera, Library
+from cadalign import Alignment, Box, Camera, Library, fit
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.accuracy.methods import fit_with
+from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.instances.record import record_stem
@@ -198,7 +198,7 @@ def test_estimates_say_what_the_fit_says(payload: dict[str, Any]) -> None:
     for exhibit in payload["exhibits"].values():
         camera = Camera(**exhibit["camera"])
         # The pixels are stored to 1e-4.
-        fitted = fit_with("optimal", exhibit["points_3d"], exhibit["points_2d"], camera)
+        fitted = fit(exhibit["points_3d"], exhibit["points_2d"], camera, **fit_options("optimal"))
         estimate = exhibit["estimates"][0]
         assert estimate["sigma"] == fitted.sigma == 1.0
         assert fitted.std is not None

@@ -72,8 +72,7 @@ def test_truth_is_among_the_solutions() -> None:
 
 def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     """No exact alignment that a local search from many starts finds is left out."""
-    from cadalign.solvers.constants import LINEAR
-    from cadalign.solvers.objective import Objective
+    from cadalign.solvers.objective import keypoint_objective
     from cadalign.solvers.refine import refine
 
     rng = np.random.default_rng(0)
@@ -81,15 +80,8 @@ def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     for seed in range(25):
         problem = problem_of(seed, points=4, noise_px=0.0)
         rays = problem.camera.normalize(problem.points_2d)
-        objective = Objective(
-            problem.points_3d,
-            rays,
-            np.array([[150.0, 0.0, 150.0]]),
-            LINEAR,
-            1.0,
-            0.0,
-            np.ones(8),
-        )
+        whitening = np.array([[150.0, 0.0, 150.0]])
+        objective = keypoint_objective(problem.points_3d, rays, whitening)
         solutions = solve(problem)
         for rotation in Rotation.random(60, random_state=seed).as_matrix():
             scale = [1.0, *np.exp(rng.uniform(-1, 1, 2))]

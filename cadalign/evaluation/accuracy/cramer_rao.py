@@ -1,4 +1,4 @@
-"""The physical limit of accuracy: the Cramer-Rao bound of a problem with a known answer."""
+"""Cramer-Rao bound: the least covariance of an unbiased estimate, for a known true alignment."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.instances.symmetry import rotation_about
 from cadalign.fitting.focal.grid import focal_slopes
 from cadalign.fitting.noise import whitening_of
 from cadalign.fitting.options import Sigma
+from cadalign.fitting.prediction import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.constants import LINEAR, UNKNOWNS
-from cadalign.solvers.focal import focal_covariance
-from cadalign.solvers.objective import Objective
-from cadalign.solvers.optimal import covariance_of
+from cadalign.geometry.projection import perspective
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.covariance import covariance_of, focal_covariance
+from cadalign.solvers.objective import keypoint_objective
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
@@ -44,7 +45,7 @@ def cramer_rao_bound(
     sigma : float, (n,) float or (n, 2, 2) float
         The keypoints' noise, as for `cadalign.fit` [px].
     focal : {"known", "estimate"}
-        Whether the focal length is known to the estimator; the camera's is the truth.
+        Known to the estimator or not; the camera's is the truth.
 
     Returns
     -------
@@ -58,24 +59,15 @@ def cramer_rao_bound(
         If the points do not determine the alignment.
     """
     in_camera = gt.apply(points_3d)
-    rays = in_camera[:, :2] / in_camera[:, 2:]
-    objective = Objective(
-        np.require(points_3d, np.float64, ["C", "W"]),
-        rays,
-        whitening_of(sigma, rays, camera),
-        LINEAR,
-        1.0,
-        0.0,
-        np.ones(UNKNOWNS),
-    )
-    pose = np.concatenate([gt.rotation.ravel(), gt.translation, gt.scale])
+    rays = perspective(in_camera)
+    objective = keypoint_objective(points_3d, rays, whitening_of(sigma, rays, camera))
     unknowns = UNKNOWNS + (focal == "estimate")
     covariance = np.zeros((unknowns, unknowns))
     if focal == "known":
-        undetermined = covariance_of(objective, pose, covariance)
+        undetermined = covariance_of(objective, gt.packed, covariance)
     else:
         slopes = focal_slopes(camera.project(in_camera), camera, rays)
-        undetermined = focal_covariance(objective, slopes, 0.0, pose, covariance)
+        undetermined = focal_covariance(objective, slopes, 0.0, gt.packed, covariance)
     if undetermined >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
     return covariance
@@ -111,11 +103,11 @@ def limit_estimate(
     *,
     sigma: float = 1.0,
 ) -> Alignment:
-    """What an ideal estimator would make of this very noise, to first order.
+    """Estimate of an ideal estimator from these observations, to first order.
 
     The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
-    the noise its errors have exactly the Cramer-Rao bound as their covariance; that it takes the
-    noise which the methods get keeps comparisons with them free of chance.
+    the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
+    the compared methods, so that no chance enters the comparison.
 
     Parameters
     ----------
@@ -140,26 +132,7 @@ def limit_estimate(
     DegenerateError
         If the points do not determine the alignment.
     """
-    stretched = (points_3d * gt.scale) @ gt.rotation.T
-    x, y, z = (stretched + gt.translation).T
-    zero = np.zeros_like(z)
-    # Derivatives of the pixels by the camera-frame point, (n, 2, 3).
-    by_point = np.stack(
-        [
-            np.stack([camera.fx / z, zero, -camera.fx * x / z**2], axis=1),
-            np.stack([zero, camera.fy / z, -camera.fy * y / z**2], axis=1),
-        ],
-        axis=1,
-    )
-    # Derivatives of that point by the unknowns, (n, 3, 8): w x X, dt, ds along the stretched axes.
-    by_unknowns = np.zeros((len(points_3d), 3, UNKNOWNS))
-    for k, axis in enumerate(np.eye(3)):
-        by_unknowns[:, :, k] = np.cross(axis, stretched)
-        by_unknowns[:, k, 3 + k] = 1.0
-    for k in (1, 2):
-        along = points_3d[:, k] * gt.scale[k]
-        by_unknowns[:, :, 5 + k] = along[:, None] * gt.rotation[:, k]
-    jacobian = (by_point @ by_unknowns).reshape(-1, UNKNOWNS) / sigma
+    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS) / sigma
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel() / sigma
     norms = np.linalg.norm(jacobian, axis=0)
     if len(noise) < UNKNOWNS or not (norms > 0).all():
@@ -169,10 +142,10 @@ def limit_estimate(
     if np.linalg.eigvalsh(information)[0] < _LEAST_INFORMATION:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
     step = np.linalg.solve(information, scaled.T @ noise) / norms
-    angle = float(np.linalg.norm(step[:3]))
-    turn = rotation_about(step[:3] / angle, angle) if angle > 0 else np.eye(3)
     # The exponential of a weakly determined scale would overflow.
     factors = np.exp(np.clip(step[6:], -_LARGEST_LOG, _LARGEST_LOG))
     return Alignment(
-        turn @ gt.rotation, gt.translation + step[3:6], gt.scale * np.append(1.0, factors)
+        rotation_from_vector(step[:3]) @ gt.rotation,
+        gt.translation + step[3:6],
+        gt.scale * np.append(1.0, factors),
     )

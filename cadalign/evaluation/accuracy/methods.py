@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-import numpy.typing as npt
-
 from cadalign.errors import InputError
-from cadalign.fitting.batch import BatchResult
-from cadalign.fitting.fit import fit, fit_batch
 from cadalign.fitting.options import METHODS, RansacOptions
-from cadalign.fitting.result import FitResult
-from cadalign.geometry.camera import Camera
 
 LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cramer_rao.limit_estimate`."""
@@ -76,40 +70,23 @@ def check_methods(names: Iterable[str]) -> tuple[str, ...]:
     return unique
 
 
-def fit_with(
-    name: str,
-    points_3d: npt.ArrayLike,
-    points_2d: npt.ArrayLike,
-    camera: Camera,
-    *,
-    sigma: float = 1.0,
-    ransac: RansacOptions | None = None,
-) -> FitResult:
-    """Fit one problem with a method by its name in `method_names`; see `cadalign.fit`.
+def fit_options(
+    name: str, *, sigma: float = 1.0, ransac: RansacOptions | None = None
+) -> dict[str, Any]:
+    """The options of `cadalign.fit` and `cadalign.fit_batch` that make it a method.
 
-    ``sigma`` is the standard deviation of the keypoints' noise [px]; robust methods take what lies
-    within 3.5 of it for an inlier. ``ransac`` gives them another threshold, other bounds and
-    another seed; the minimal solver and the refinement are the method's own. Methods that are not
-    robust ignore it.
+    Parameters
+    ----------
+    name : str
+        In `method_names`.
+    sigma : float
+        Standard deviation of the keypoints' noise [px]; robust methods take what lies within 3.5 of
+        it for an inlier.
+    ransac : RansacOptions, optional
+        Another threshold, other bounds and another seed for robust methods; the minimal solver and
+        the refinement are the method's own.
     """
-    return fit(points_3d, points_2d, camera, sigma=sigma, **_options(name, sigma, ransac))
-
-
-def fit_batch_with(
-    name: str,
-    points_3d: Sequence[npt.ArrayLike],
-    points_2d: Sequence[npt.ArrayLike],
-    camera: Camera | Sequence[Camera],
-    *,
-    sigma: float = 1.0,
-) -> BatchResult:
-    """Fit many problems with a method by its name; see `fit_with` and `cadalign.fit_batch`."""
-    return fit_batch(points_3d, points_2d, camera, sigma=sigma, **_options(name, sigma))
-
-
-def _options(name: str, sigma: float, ransac: RansacOptions | None = None) -> dict[str, Any]:
-    """The options of `cadalign.fit` that a name stands for."""
     if name in _RANSAC:
         common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)
-        return {"ransac": replace(common, **_RANSAC[name])}
-    return _VARIANTS.get(name, {"method": name})
+        return {"sigma": sigma, "ransac": replace(common, **_RANSAC[name])}
+    return {"sigma": sigma, **_VARIANTS.get(name, {"method": name})}

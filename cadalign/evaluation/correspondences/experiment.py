@@ -36,13 +36,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
-from cadalign.evaluation.accuracy.methods import fit_with, is_robust
+from cadalign.evaluation.accuracy.methods import fit_options, is_robust
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
 from cadalign.evaluation.outcome import Outcome, alignment_errors, reason_of
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.fitting.fit import fit
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -113,9 +114,8 @@ class CorrespondenceExperiment:
         for method in self.options.methods:
             start = time.perf_counter()
             try:
-                result = fit_with(
-                    method, truth.points_3d, truth.points_2d, truth.camera, ransac=ransac
-                )
+                how = fit_options(method, ransac=ransac)
+                result = fit(truth.points_3d, truth.points_2d, truth.camera, **how)
                 seconds = time.perf_counter() - start
                 outcome = Outcome(task.names(method), errors_of(result, truth, method=method))
             except Exception as error:

@@ -24,9 +24,6 @@ class CorrespondenceOptions(ExperimentOptions):
     get the same input. The run's folder gets results.parquet with a row per input and method,
     summary.csv, figures and report.html. Killed, it goes on where it was when the same command is
     started again. Times are best measured with --workers 1.
-
-    Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or all
-    rows failed, 2 a wrong command line.
     """
 
     experiment: ClassVar[str] = "correspondences"

@@ -13,7 +13,6 @@ from cadalign.evaluation.correspondences.summary import (
     HEADLINE,
     conclude,
     console_table,
-    lines,
     plots,
     summarize,
 )
@@ -54,7 +53,6 @@ SPEC = Spec(
     plan=plan,
     columns=HEADLINE,
     summarize=summarize,
-    lines=lines,
     table=console_table,
     group=lambda run: metrics.OUTLIERS,
     plots=plots,

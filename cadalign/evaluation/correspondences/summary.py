@@ -1,10 +1,18 @@
-"""Success rates and quartiles of methods for every share of outliers."""
+"""Success rates and quartiles of methods for every share of outliers.
+
+Cells of a summary: ``inputs``, the number that the method was given; ``failed``, of those for which
+it found nothing; ``unreadable``, of inputs that there would be besides if all images could be read;
+``success``, the share with a rotation error of less than 0.5 degrees and at most 1 % on either
+scale, NaN where there are none; quartiles of the errors over all inputs, a failure counting as an
+error beyond all others, the translation's over the distance from the camera to the mean of the
+points; ``inlier_precision`` and ``inlier_recall``, medians over what it found, NaN for methods that
+do not search for inliers; ``milliseconds``, quartiles of the time of one call, failed ones too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,9 +24,8 @@ from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (
     Conclusion,
     ConsoleTable,
-    Line,
     Quartiles,
-    flat,
+    Summary,
     group_name,
     median_of,
 )
@@ -31,55 +38,7 @@ HEADLINE = (
 SUCCESS_NOTE = "success: rotation within 0.5 deg and both scales within 1 %"
 
 
-@dataclass(frozen=True)
-class CorrespondenceSummary:
-    """Numbers of one method at one share of outliers.
-
-    Quartiles are over all inputs, a failure counting as an error beyond all others.
-
-    Parameters
-    ----------
-    outliers : float
-        Share of the image points that were moved.
-    method : str
-    inputs : int
-        Number of inputs that it was given.
-    failed : int
-        Number of those for which it found nothing.
-    unreadable : int
-        Number of inputs that there would be besides if all images could be read.
-    success : float
-        Share of the inputs with a rotation error of less than 0.5 degrees and at most 1 % on either
-        scale; NaN where there are none.
-    rotation_error_deg, translation_error, scale_y_error, scale_z_error : Quartiles
-        [degrees] and fractions; the translation's of the distance from the camera to the mean of
-        the points.
-    inlier_precision, inlier_recall : float
-        Medians over what it found; NaN for methods that do not search for inliers.
-    milliseconds : Quartiles
-        Time of one call, failed ones too.
-    """
-
-    outliers: float
-    method: str
-    inputs: int
-    failed: int
-    unreadable: int
-    success: float
-    rotation_error_deg: Quartiles
-    translation_error: Quartiles
-    scale_y_error: Quartiles
-    scale_z_error: Quartiles
-    inlier_precision: float
-    inlier_recall: float
-    milliseconds: Quartiles
-
-    def cells(self) -> dict[str, Any]:
-        """All numbers by name, flat."""
-        return flat(self)
-
-
-def summarize(run: Run) -> list[CorrespondenceSummary]:
+def summarize(run: Run) -> list[Summary]:
     """A summary for every share of outliers and method, in the order of the run."""
     cells = run.cells
     return [
@@ -89,22 +48,7 @@ def summarize(run: Run) -> list[CorrespondenceSummary]:
     ]
 
 
-def lines(summaries: Sequence[CorrespondenceSummary]) -> list[Line]:
-    """Lines of the headline table."""
-    return [
-        Line(
-            group_name(metrics.OUTLIERS, s.outliers),
-            s.method,
-            {
-                name: value.median if isinstance(value, Quartiles) else value
-                for name, value in {**vars(s), "instances": s.inputs}.items()
-            },
-        )
-        for s in summaries
-    ]
-
-
-def console_table(run: Run, summaries: Sequence[CorrespondenceSummary]) -> ConsoleTable:
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """Quartiles of the errors, and medians, for the console."""
     failed = replace(metrics.FAILED, symbol="fail")
     shown = (failed, metrics.SUCCESS, *ERRORS, metrics.INLIER_RECALL)
@@ -114,19 +58,19 @@ def console_table(run: Run, summaries: Sequence[CorrespondenceSummary]) -> Conso
         heads=(*(metric.symbol for metric in shown), metrics.MILLISECONDS.symbol),
         rows=[
             (
-                f"{100 * s.outliers:g} %",
+                f"{100 * s['outliers']:g} %",
                 s.method,
-                failed.text(s.failed),
-                metrics.SUCCESS.text(s.success),
-                *(_three(getattr(s, metric.key), metric) for metric in ERRORS),
-                _number(100 * s.inlier_recall, digits=1),
-                _number(s.milliseconds.median, digits=1),
+                failed.text(s["failed"]),
+                metrics.SUCCESS.text(s["success"]),
+                *(_three(s[metric.key], metric) for metric in ERRORS),
+                _number(100 * s["inlier_recall"], digits=1),
+                _number(s["milliseconds"].median, digits=1),
             )
             for s in summaries
         ],
         note=(
-            f"{max(summary.inputs for summary in summaries)} inputs each; a failure counts as an "
-            "error beyond all others (-).\n"
+            f"{max(s['inputs'] for s in summaries)} inputs each; a failure counts as an error "
+            "beyond all others (-).\n"
             "succ: R < 0.5 deg and both scales within 1 %; t: % of the camera's distance from the "
             "mean of the points;\nfound: share of the inliers that were kept (median); ms: median."
         ),
@@ -134,11 +78,11 @@ def console_table(run: Run, summaries: Sequence[CorrespondenceSummary]) -> Conso
     )
 
 
-def conclude(run: Run, summaries: Sequence[CorrespondenceSummary]) -> Conclusion:
+def conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
     """Numbers of rows, of failures, and of inputs whose image cannot be read."""
-    unreadable = sum(summary.unreadable for summary in summaries)
-    rows = sum(summary.inputs for summary in summaries) + unreadable
-    failed = sum(summary.failed for summary in summaries) + unreadable
+    unreadable = sum(summary["unreadable"] for summary in summaries)
+    rows = sum(summary["inputs"] for summary in summaries) + unreadable
+    failed = sum(summary["failed"] for summary in summaries) + unreadable
     note = f"{unreadable} of them because their image cannot be read" if unreadable else ""
     return Conclusion(rows, failed, {"unreadable": unreadable}, note)
 
@@ -146,7 +90,7 @@ def conclude(run: Run, summaries: Sequence[CorrespondenceSummary]) -> Conclusion
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Success, errors and times against the share of outliers."""
     found = [summarize(run) for run in runs]
-    inputs = max((summary.inputs for summary in found[0]), default=0)
+    inputs = max((summary["inputs"] for summary in found[0]), default=0)
     made = []
     for metric in (metrics.SUCCESS, *ERRORS, metrics.MILLISECONDS):
         note = f"{QUARTILES_NOTE}; failures count as infinite"
@@ -158,8 +102,8 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
         for index, summaries in enumerate(found):
             for method in runs[index].methods:
                 rows = [summary for summary in summaries if summary.method == method]
-                x = [100 * summary.outliers for summary in rows]
-                y = [getattr(summary, metric.key) for summary in rows]
+                x = [100 * summary["outliers"] for summary in rows]
+                y = [summary[metric.key] for summary in rows]
                 traces.append(Trace.of(index, method, x, y, metric))
         caption = f"{inputs} inputs each; {note or SUCCESS_NOTE}"
         figure = f"outliers_{metric.key}"
@@ -167,7 +111,7 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
     return made
 
 
-def _summarize(share: float, method: str, cells: Cells) -> CorrespondenceSummary:
+def _summarize(share: float, method: str, cells: Cells) -> Summary:
     chosen = (cells["outliers"] == share) & (cells["method"] == method)
     # No points were given where the image cannot be read.
     given = chosen & ~np.isnan(cells["points"].astype(float))
@@ -178,18 +122,18 @@ def _summarize(share: float, method: str, cells: Cells) -> CorrespondenceSummary
         errors = np.full(inputs, np.inf)
         errors[solved[given]] = cells[metric.key][solved].astype(float)
         quartiles[metric.key] = Quartiles.of(errors)
-    return CorrespondenceSummary(
-        outliers=share,
-        method=method,
-        inputs=inputs,
-        failed=inputs - int(solved.sum()),
-        unreadable=int(chosen.sum()) - inputs,
-        success=float(cells["success"][given].astype(float).mean()) if inputs else np.nan,
-        inlier_precision=median_of(cells["inlier_precision"][solved]),
-        inlier_recall=median_of(cells["inlier_recall"][solved]),
-        milliseconds=Quartiles.of(1e3 * cells["seconds"][given]),
+    values = {
+        "inputs": inputs,
+        "failed": inputs - int(solved.sum()),
+        "unreadable": int(chosen.sum()) - inputs,
+        "success": float(cells["success"][given].astype(float).mean()) if inputs else np.nan,
         **quartiles,
-    )
+        "inlier_precision": median_of(cells["inlier_precision"][solved]),
+        "inlier_recall": median_of(cells["inlier_recall"][solved]),
+        "milliseconds": Quartiles.of(1e3 * cells["seconds"][given]),
+    }
+    names = {"outliers": share, "method": method}
+    return Summary(group_name(metrics.OUTLIERS, share), names, values, tasks=inputs)
 
 
 def _three(values: Quartiles, metric: Metric) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from cadalign.evaluation.options import NoiseOption
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class DemoOptions(NoiseOption):
     """Align stretched models to pictures of the originals and show the result.
 
@@ -23,6 +23,7 @@ class DemoOptions(NoiseOption):
 
     root: Path | None = None
     """Folder of a dataset in KeypointNet's layout; by default a sample dataset is generated."""
+    _: KW_ONLY
     categories: tuple[str, ...] | None = None
     """Categories to take; all by default."""
     per_category: int = 6

@@ -14,13 +14,13 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
-from cadalign.evaluation.keypointnet.summary import TABLE, CategorySummary
+from cadalign.evaluation.keypointnet.summary import TABLE
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
-from cadalign.evaluation.summary import ALL, ConsoleTable
+from cadalign.evaluation.summary import ALL, ConsoleTable, Summary
 from cadalign.io.files import write_text
 
 METHOD = "optimal"
@@ -86,7 +86,7 @@ def _clear(folder: RunFolder, config: dict[str, Any]) -> None:
     shutil.rmtree(folder.parts, ignore_errors=True)
 
 
-def _table(run: Run, summaries: Sequence[CategorySummary]) -> ConsoleTable:
+def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """Medians per category."""
     counts = (metrics.INSTANCES, metrics.FAILED)
     return ConsoleTable(
@@ -94,16 +94,16 @@ def _table(run: Run, summaries: Sequence[CategorySummary]) -> ConsoleTable:
         labels=("category",),
         heads=tuple(column.heading for column in (*counts, *TABLE)),
         rows=[
-            (s.category, *(column.text(getattr(s, column.key)) for column in (*counts, *TABLE)))
+            (s.group, *(column.text(s[column.key]) for column in (*counts, *TABLE)))
             for s in summaries
-            if s.category != ALL
+            if s.group != ALL
         ],
         grouped=False,
         wraps=True,
     )
 
 
-def _write_csv(run: Run, summaries: Sequence[CategorySummary]) -> None:
+def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
     """Write ``results.csv`` with all rows, the seed and the seconds."""
     text = io.StringIO()
     names = [*(name for name, _ in COLUMNS), "seed", "seconds"]

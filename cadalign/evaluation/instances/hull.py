@@ -52,7 +52,7 @@ class KeypointHull:
         return np.asarray((high - low) * (_SIGNS - 0.5))
 
     def visible_from(self, position: FloatArray) -> npt.NDArray[np.bool_]:
-        """Which keypoints count as visible from a place (3,) in model coordinates; (k,) bool."""
+        """Mask (k,) of the keypoints that count as visible from a place (3,) of the model."""
         if self._faces is None:
             return np.ones(len(self.xyz), dtype=bool)
         faces, beside = self._faces
@@ -61,7 +61,7 @@ class KeypointHull:
 
     @cached_property
     def _faces(self) -> tuple[FloatArray, npt.NDArray[np.bool_]] | None:
-        """Planes (f, 4) of the faces, outward, and which face is next to which keypoint (k, f)."""
+        """Planes (f, 4) of the faces, outward, and a mask (k, f) of those next to each keypoint."""
         from scipy.spatial import ConvexHull, QhullError
 
         if len(self.xyz) < 4:
@@ -110,7 +110,7 @@ def sample_hull_view(
             translation = center - rotation @ middle
             visible = hull.visible_from(-rotation.T @ translation)
             if visible.sum() >= min_visible:
-                return Alignment.from_solver(rotation, translation, np.ones(3)), visible
+                return Alignment(rotation, translation, np.ones(3), is_valid=True), visible
             best = max(best, int(visible.sum()))
     found = f"the best of {_ATTEMPTS} views shows {best}" if best else f"there are only {count}"
     raise DegenerateError(
@@ -134,7 +134,7 @@ def _upright_rotation(azimuth: float, elevation: float) -> FloatArray:
 
 
 def _framed_center(corners: FloatArray, camera: Camera, *, fill: float) -> FloatArray:
-    """Where in the camera frame a box's centre must lie for its corners to fill so much.
+    """Place in the camera frame of a box's centre, for its corners to fill a share of the image.
 
     ``corners`` (8, 3) are relative to the centre. The corner X of a box at depth d on the ray a
     through the image's centre lies f |X - a X_z| / (X_z + d) off it; solved for d, for each corner

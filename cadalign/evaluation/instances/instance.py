@@ -218,7 +218,9 @@ def _stretched(
         points_2d=projected + noise_px * rng.standard_normal(projected.shape),
         semantic_ids=semantic_ids[visible],
         bounds=bounds * stretch,
-        gt=Alignment.from_solver(cam_from_model.rotation, cam_from_model.translation, 1 / stretch),
+        gt=Alignment(
+            cam_from_model.rotation, cam_from_model.translation, 1 / stretch, is_valid=True
+        ),
         visibility=visibility,
         scene=scene,
         diagonal=1.0 if scene is None else float(np.linalg.norm(np.ptp(bounds, axis=0))),

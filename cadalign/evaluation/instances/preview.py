@@ -32,7 +32,7 @@ class MeshPreview:
         [model units]
     faces : (m, 3) int
     edges : (k, 2) int
-        Pairs of vertices for a wireframe: what is too thin for triangles, creases and borders.
+        Pairs of vertices for a wireframe: parts too thin for triangles, creases and borders.
     """
 
     vertices: FloatArray

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import rotation_from_vector
 
 if TYPE_CHECKING:
     from cadalign.datasets.models.keypoints import Symmetries
@@ -58,7 +59,7 @@ class SymmetryGroup:
 
     @property
     def is_trivial(self) -> bool:
-        """Whether the identity is the only symmetry."""
+        """True where the identity is the only symmetry."""
         return self.axis is None and len(self.rotations) == 1
 
     def __str__(self) -> str:
@@ -93,10 +94,11 @@ class SymmetryGroup:
         candidates = [self._turned(rotation, relative) for rotation in self.rotations]
         traces = [float(np.sum(candidate * relative)) for candidate in candidates]
         best = candidates[int(np.argmax(traces))]
-        return Alignment.from_solver(
+        return Alignment(
             gt.rotation @ best,
             gt.translation + gt.rotation @ (self.center - best @ self.center),
             gt.scale,
+            is_valid=True,
         )
 
     def _turned(self, rotation: FloatArray, relative: FloatArray) -> FloatArray:
@@ -107,7 +109,7 @@ class SymmetryGroup:
         along = float(self.axis @ n @ self.axis)
         turn = np.array([n[2, 1] - n[1, 2], n[0, 2] - n[2, 0], n[1, 0] - n[0, 1]])
         angle = np.arctan2(float(self.axis @ turn), float(np.trace(n)) - along)
-        return np.asarray(rotation @ rotation_about(self.axis, float(angle)))
+        return np.asarray(rotation @ rotation_from_vector(self.axis * float(angle)))
 
 
 def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
@@ -118,7 +120,7 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
     xyz : (k, 3) float
         The model's keypoints.
     symmetries : Symmetries
-        What is annotated of them.
+        The annotated ones.
     """
     trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
@@ -133,15 +135,6 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
     if not kept.any():
         return trivial
     return SymmetryGroup(center, np.concatenate([np.eye(3)[None], _candidates()[kept]]))
-
-
-def rotation_about(axis: FloatArray, angle: float) -> FloatArray:
-    """The rotation matrix (3, 3) about an axis of length 1 by an angle [rad] (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(
-        np.eye(3) + np.sin(angle) * cross + 2 * np.sin(angle / 2) ** 2 * (cross @ cross)
-    )
 
 
 def _axis_of_revolution(
@@ -175,7 +168,7 @@ def _axis_of_revolution(
 
 
 def _equivalent(count: int, symmetries: Symmetries) -> npt.NDArray[np.bool_]:
-    """Which keypoints a rotation may take to one another, (k, k) bool."""
+    """Mask (k, k) of the keypoints that a rotation may take to one another."""
     orbits = np.arange(count)
     for first, second in symmetries.reflections:
         orbits[orbits == orbits[second]] = orbits[first]
@@ -190,13 +183,15 @@ def _equivalent(count: int, symmetries: Symmetries) -> npt.NDArray[np.bool_]:
 def _candidates() -> FloatArray:
     """Rotations (g, 3, 3) about the coordinate axes, but for the identity."""
     turns = sorted({k / fold for fold in _FOLDS for k in range(1, fold)})
-    return np.array([rotation_about(axis, 2 * np.pi * t) for axis in np.eye(3) for t in turns])
+    return np.array(
+        [rotation_from_vector(2 * np.pi * t * axis) for axis in np.eye(3) for t in turns]
+    )
 
 
 def _map_onto_themselves(
     centered: FloatArray, equivalent: npt.NDArray[np.bool_], tolerance: float
 ) -> npt.NDArray[np.bool_]:
-    """Which of the candidates are symmetries, (g,) bool."""
+    """Mask (g,) of the candidates that are symmetries."""
     count = len(centered)
     moved = centered @ _candidates().transpose(0, 2, 1)
     squares = (centered**2).sum(axis=1)

@@ -39,7 +39,7 @@ import numpy as np
 
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, fit_batch_with, fit_with, has_statistics
+from cadalign.evaluation.accuracy.methods import LIMIT, fit_options, has_statistics
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
@@ -54,8 +54,10 @@ from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reas
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
+from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.projection import perspective
 
 if TYPE_CHECKING:
     from cadalign.render import Scene
@@ -172,12 +174,11 @@ class KeypointNetExperiment:
             return [self._estimate(method, instance) for instance in instances]
         if not instances:
             return []
-        batch = fit_batch_with(
-            method,
+        batch = fit_batch(
             [instance.points_3d for instance in instances],
             [instance.points_2d for instance in instances],
             [instance.camera for instance in instances],
-            sigma=self.noise_px or 1.0,
+            **fit_options(method, sigma=self.noise_px or 1.0),
         )
         return [
             batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))
@@ -189,7 +190,7 @@ class KeypointNetExperiment:
         try:
             if method == LIMIT:
                 return limit_estimate(*given, instance.gt)
-            return fit_with(method, *given, sigma=self.noise_px or 1.0)
+            return fit(*given, **fit_options(method, sigma=self.noise_px or 1.0))
         except CadalignError as error:
             return error
 
@@ -264,7 +265,7 @@ def _errors(
 def _rms(instance: Instance, est: Alignment) -> float:
     """Root mean square residual [px]; also of the bound's estimates behind the camera."""
     points = (instance.points_3d @ est.linear.T) + est.translation
-    pixels = instance.camera.pixels_from_normalized(points[:, :2] / points[:, 2:])
+    pixels = instance.camera.pixels_from_normalized(perspective(points))
     return float(np.sqrt(((pixels - instance.points_2d) ** 2).sum(axis=1).mean()))
 
 

@@ -10,17 +10,17 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
-from cadalign.evaluation.keypointnet.summary import CategorySummary
 from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import in_math
 from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.summary import Summary
 
 _BARS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
 _CURVES = (metrics.SYM_ROTATION, metrics.SYM_TRANSLATION, metrics.SCALE_Y)
 
 
-def draw_figures(run: Run, summaries: Sequence[CategorySummary]) -> None:
+def draw_figures(run: Run, summaries: Sequence[Summary]) -> None:
     """Draw all figures of a run, PNG and PDF."""
     folder = run.folder.made_figures()
     for metric in _BARS:
@@ -29,15 +29,15 @@ def draw_figures(run: Run, summaries: Sequence[CategorySummary]) -> None:
         _draw_curves(folder / f"within_{metric.key}", run, metric)
 
 
-def _draw_categories(path: Path, summaries: Sequence[CategorySummary], metric: Metric) -> None:
+def _draw_categories(path: Path, summaries: Sequence[Summary], metric: Metric) -> None:
     """Draw a metric's medians, a column of points for each category."""
-    categories = list(dict.fromkeys(summary.category for summary in summaries))
+    categories = list(dict.fromkeys(summary.group for summary in summaries))
     places = np.arange(len(categories))
     with new_figure(figsize=(max(6.4, 0.62 * len(categories) + 2), 4.2)) as figure:
         axes = figure.add_subplot()
         for method in dict.fromkeys(summary.method for summary in summaries):
             look = look_of(method)
-            found = {s.category: getattr(s, metric.key) for s in summaries if s.method == method}
+            found = {s.group: s[metric.key] for s in summaries if s.method == method}
             heights = metric.factor * np.array([found.get(name, np.nan) for name in categories])
             if look.marker:
                 axes.plot(places, heights, look.marker, color=look.color, label=look.label)

@@ -19,9 +19,6 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
     row per model, view and method, summary.csv, figures, report.html and, if asked for, overlays.
     Killed, it goes on where it was when the same command is started again.
-
-    Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or all
-    rows failed, 2 a wrong command line.
     """
 
     experiment: ClassVar[str] = "keypointnet"

@@ -52,12 +52,8 @@ class KeypointTask:
 
     def names(self, method: str) -> Row:
         """The cells that name the row of a method."""
-        return {
-            "category": self.category,
-            "model_id": self.model_id,
-            "view": self.view,
-            "method": method,
-        }
+        model = {"category": self.category, "model_id": self.model_id}
+        return {**model, "view": self.view, "method": method}
 
     @classmethod
     def of_model(

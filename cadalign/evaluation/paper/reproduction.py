@@ -14,21 +14,22 @@ from cadalign.evaluation.accuracy.methods import LIMIT
 from cadalign.evaluation.api import run
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import SPEC as KEYPOINTNET
-from cadalign.evaluation.keypointnet.summary import CategorySummary
+from cadalign.evaluation.keypointnet.summary import texts
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.paper.table import PAPER_TABLE, PERCENT_NOTE, STATED
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.spec import SPEC as SIMULATION
-from cadalign.evaluation.summary import ALL
+from cadalign.evaluation.summary import ALL, Summary
 from cadalign.io.files import write_text, writing
 
 _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
 
 
-@dataclass(frozen=True)
-class PaperPlan:
+@dataclass(frozen=True, kw_only=True)
+class PaperPlan(RunOptions):
     """Runs for the paper's tables and figures."""
 
     out: Path = Path("paper")
@@ -37,12 +38,8 @@ class PaperPlan:
     """Dataset in KeypointNet's layout, besides the sample dataset."""
     quick: bool = False
     """Few problems: about two minutes."""
-    seed: int = 0
+    seed: int = ExperimentOptions.seed
     """Seed of everything random."""
-    workers: int = -1
-    """Processes; -1 for all cores."""
-    dask: str | None = None
-    """Address of a Dask scheduler to use instead."""
 
 
 Announce = Callable[[str], Callable[[Progress], object]]
@@ -97,16 +94,16 @@ def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
         on_progress=announce(f"simulation: {name}"),
     )
     summaries = SIMULATION.write(Run.open(folder.path))
-    keys = list(dict.fromkeys(summary.metric for summary in summaries))
+    keys = list(dict.fromkeys(summary["metric"] for summary in summaries))
     pictures = [f"{name}_{key}" for key in keys[: 1 if kind.is_timed else None]]
     for picture in pictures:
         for ending in ("png", "pdf"):
             _copy(folder.figures / f"{picture}.{ending}", plan.out / "figures")
     head = ["", *kind.methods]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    shown = [summary for summary in summaries if summary.metric == keys[0]]
+    shown = [summary for summary in summaries if summary["metric"] == keys[0]]
     for value in kind.values:
-        cells = [f"{summary.median:.3g}" for summary in shown if summary.value == value]
+        cells = [f"{s['median']:.3g}" for s in shown if s["value"] == value]
         lines.append(f"| {value:g} | {' | '.join(cells)} |")
     images = "\n".join(f"![{picture}](figures/{picture}.png)" for picture in pictures)
     table = "\n".join(lines)
@@ -126,7 +123,7 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
     if plan.root is not None:
         roots["keypointnet"] = (plan.root, 1 if plan.quick else 10)
     rows: list[list[str]] = []
-    texts = []
+    sections = []
     for name, (root, views) in roots.items():
         folder = RunFolder(plan.out / f"evaluate_{name}")
         run(
@@ -143,14 +140,14 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
                 _copy(source, plan.out / "figures", f"{name}_{source.name}")
         table = _table_rows(summaries)
         rows += [[name, *row] for row in table]
-        texts.append(
+        sections.append(
             f"### {_DATASETS[name]}\n\n{_markdown(table)}\n\n"
             f"![rotation errors](figures/{name}_categories_rotation_error_deg.png)\n"
         )
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([["dataset", *_HEAD], *rows])
     write_text(plan.out / "table1.csv", text.getvalue())
-    body = "\n".join(texts)
+    body = "\n".join(sections)
     return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
 
 
@@ -161,15 +158,15 @@ _DATASETS = {
 _HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z) [%]", "R / limit")
 
 
-def _table_rows(summaries: Sequence[CategorySummary]) -> list[list[str]]:
+def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
     """The rows of Table 1: our medians, and the paper's beneath where it states them."""
     rows = []
-    for category in dict.fromkeys(summary.category for summary in summaries):
-        of_category = [summary for summary in summaries if summary.category == category]
+    for category in dict.fromkeys(summary.group for summary in summaries):
+        of_category = [summary for summary in summaries if summary.group == category]
         for summary in of_category:
-            ratio = "-" if summary.over_limit != summary.over_limit else f"{summary.over_limit:.2f}"
+            ratio = metrics.OVER_BOUND.text(summary["over_limit"])
             name = "Cramer-Rao bound" if summary.method == LIMIT else summary.method
-            rows.append([category, name, *summary.texts()[:5], ratio])
+            rows.append([category, name, *texts(summary)[:5], ratio])
         stated = PAPER_TABLE.get(category) if category != ALL else None
         if stated is not None:
             # With the digits that the paper prints.

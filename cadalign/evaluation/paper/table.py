@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cadalign.evaluation.summary import Line
+from cadalign.evaluation.summary import Summary
 
 STATED = "AEPnP, stated in the paper"
 
@@ -44,6 +44,9 @@ PERCENT_NOTE = (
 )
 
 
-def paper_lines() -> list[Line]:
+def paper_lines() -> list[Summary]:
     """The paper's rows as lines of a headline table."""
-    return [Line(category, STATED, vars(row)) for category, row in PAPER_TABLE.items()]
+    return [
+        Summary(category, {"category": category, "method": STATED}, vars(row))
+        for category, row in PAPER_TABLE.items()
+    ]

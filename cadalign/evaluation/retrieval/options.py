@@ -29,9 +29,6 @@ class RetrievalRunOptions(ModelOptions):
     (leave-in), and in one that doesn't (leave-out). The run's folder gets results.parquet with a
     row per query, protocol and method, summary.csv, figures and the library. Killed, it goes on
     where it was when the same command is started again.
-
-    Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or all
-    rows failed, 2 a wrong command line.
     """
 
     experiment: ClassVar[str] = "retrieval"

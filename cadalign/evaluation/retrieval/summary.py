@@ -1,10 +1,18 @@
-"""Rates of retrieval by category, protocol, noise and number of keypoints."""
+"""Rates of retrieval by category, protocol, noise and number of keypoints.
+
+Cells of a summary: ``queries``, the number made, without models of which no view shows enough
+keypoints; ``failed``, those without a match; ``rank_1`` and ``rank_5``, the share of the queries
+with the true model, or one that counts as it, first or among the first 5; ``reciprocal_rank``, the
+mean of one over the rank, 0 beyond 50 (these three are NaN in the leave-out protocol); ``score``,
+the mean probability of the best match, which is the rank-1 rate where it is calibrated; of the best
+match the medians ``shape_distance``, ``box_iou``, ``rotation_error_deg`` and the mean
+``mean_box_iou``; ``milliseconds``, the median time of a query on one core.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +23,7 @@ from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.retrieval.experiment import NO_VIEW
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT
 from cadalign.evaluation.runs.opened import Cells, Run
-from cadalign.evaluation.summary import ALL, ConsoleTable, Line, mean_of, median_of
+from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
@@ -31,65 +39,7 @@ _PLOTS = (
 )
 
 
-@dataclass(frozen=True)
-class RetrievalSummary:
-    """Numbers of one method on one category's queries of one kind.
-
-    Parameters
-    ----------
-    category, protocol, method : str
-    noise_px : float
-        [px]
-    keypoints : int
-        Number that was handed over.
-    queries : int
-        Number that was made; models without a view that shows enough keypoints are not counted.
-    failed : int
-        Number of these that gave no match.
-    rank_1, rank_5 : float
-        Share of the queries with the true model, or one that counts as it, first, or among the
-        first 5; NaN in the leave-out protocol.
-    reciprocal_rank : float
-        Mean of one over the rank, 0 beyond 50; NaN in the leave-out protocol.
-    score : float
-        Mean probability of the best match: where it is calibrated, that is the rank-1 rate.
-    shape_distance, box_iou, rotation_error_deg : float
-        Medians of the best match: keypoints' distance after stretch, as a share of their extent;
-        box IoU; rotation error [degrees].
-    mean_box_iou : float
-    milliseconds : float
-        Median time of a query on one core.
-    """
-
-    category: str
-    protocol: str
-    method: str
-    noise_px: float
-    keypoints: int
-    queries: int
-    failed: int
-    rank_1: float
-    rank_5: float
-    reciprocal_rank: float
-    score: float
-    shape_distance: float
-    box_iou: float
-    mean_box_iou: float
-    rotation_error_deg: float
-    milliseconds: float
-
-    def cells(self) -> dict[str, Any]:
-        """All numbers by name."""
-        return asdict(self)
-
-    @property
-    def group(self) -> str:
-        """Category, protocol, noise and number of keypoints."""
-        view = f"{self.noise_px:g} px, {self.keypoints} keypoints"
-        return f"{self.category}, {self.protocol}, {view}"
-
-
-def summarize(run: Run) -> list[RetrievalSummary]:
+def summarize(run: Run) -> list[Summary]:
     """A summary for every category, protocol, method, noise and number of keypoints."""
     cells = run.cells
     categories = sorted(set(cells["category"].tolist()))
@@ -104,17 +54,16 @@ def summarize(run: Run) -> list[RetrievalSummary]:
     ]
 
 
-def lines(summaries: Sequence[RetrievalSummary]) -> list[Line]:
+def lines(summaries: Sequence[Summary]) -> list[Summary]:
     """Lines of the headline table, those of a group together."""
-    groups: dict[str, list[Line]] = {}
-    for s in summaries:
-        if s.queries:
-            values = {**vars(s), "instances": s.queries}
-            groups.setdefault(s.group, []).append(Line(s.group, s.method, values))
-    return [line for found in groups.values() for line in found]
+    groups: dict[str, list[Summary]] = {}
+    for summary in summaries:
+        if summary.tasks:
+            groups.setdefault(summary.group, []).append(summary)
+    return [summary for found in groups.values() for summary in found]
 
 
-def console_table(run: Run, summaries: Sequence[RetrievalSummary]) -> ConsoleTable:
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """Rates and medians over all categories for the console."""
     shown = (
         *(metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK, metrics.SCORE),
@@ -127,13 +76,13 @@ def console_table(run: Run, summaries: Sequence[RetrievalSummary]) -> ConsoleTab
         heads=("px", metrics.KEYPOINTS.symbol, "n", *(metric.symbol for metric in shown)),
         rows=[
             (
-                s.protocol,
+                s["protocol"],
                 s.method,
-                *(f"{s.noise_px:g}", str(s.keypoints), str(s.queries)),
-                *(metric.text(getattr(s, metric.key)) for metric in shown),
+                *(f"{s['noise_px']:g}", str(s["keypoints"]), str(s["queries"])),
+                *(metric.text(s[metric.key]) for metric in shown),
             )
             for s in summaries
-            if s.category == ALL
+            if s["category"] == ALL
         ],
         narrow=True,
         grouped=False,
@@ -142,29 +91,27 @@ def console_table(run: Run, summaries: Sequence[RetrievalSummary]) -> ConsoleTab
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Rates and medians against the number of keypoints, over all categories, for each noise."""
-    found = [[s for s in summarize(run) if s.category == ALL and s.queries] for run in runs]
+    found = [[s for s in summarize(run) if s["category"] == ALL and s.tasks] for run in runs]
     return [
         _plot(metric, protocol, noise, found)
         for metric, protocol in _PLOTS
-        for noise in sorted({s.noise_px for summaries in found for s in summaries})
-        if any(s.protocol == protocol and s.noise_px == noise for ss in found for s in ss)
+        for noise in sorted({s["noise_px"] for summaries in found for s in summaries})
+        if any(s["protocol"] == protocol and s["noise_px"] == noise for ss in found for s in ss)
     ]
 
 
-def _plot(
-    metric: Metric, protocol: str, noise: float, found: Sequence[Sequence[RetrievalSummary]]
-) -> Plot:
+def _plot(metric: Metric, protocol: str, noise: float, found: Sequence[Sequence[Summary]]) -> Plot:
     chosen = [
-        [s for s in summaries if s.protocol == protocol and s.noise_px == noise]
+        [s for s in summaries if s["protocol"] == protocol and s["noise_px"] == noise]
         for summaries in found
     ]
     traces = []
     for index, summaries in enumerate(chosen):
         for method in dict.fromkeys(s.method for s in summaries):
             rows = [s for s in summaries if s.method == method]
-            y = [getattr(s, metric.key) for s in rows]
-            traces.append(Trace.of(index, method, [s.keypoints for s in rows], y, metric))
-    queries = sorted({s.queries for summaries in chosen for s in summaries})
+            y = [s[metric.key] for s in rows]
+            traces.append(Trace.of(index, method, [s["keypoints"] for s in rows], y, metric))
+    queries = sorted({s["queries"] for summaries in chosen for s in summaries})
     count = f"{queries[0]:,} to {queries[-1]:,}" if len(queries) > 1 else f"{queries[0]:,}"
     return Plot(
         id=f"{metric.key}_{noise:g}",
@@ -181,7 +128,7 @@ def _plot(
 
 def _summarize(
     cells: Cells, category: str, protocol: str, method: str, noise: float, keypoints: int
-) -> RetrievalSummary:
+) -> Summary:
     chosen = (
         (cells["protocol"] == protocol)
         & (cells["method"] == method)
@@ -195,21 +142,25 @@ def _summarize(
     queries = int(made.sum())
     ranks = cells["rank"][made].astype(float)  # NaN beyond 50
     ranked = queries and protocol == LEAVE_IN
-    return RetrievalSummary(
-        category=category,
-        protocol=protocol,
-        method=method,
-        noise_px=noise,
-        keypoints=keypoints,
-        queries=queries,
-        failed=queries - int(solved.sum()),
-        rank_1=float((ranks == 1).mean()) if ranked else np.nan,
-        rank_5=float((ranks <= 5).mean()) if ranked else np.nan,
-        reciprocal_rank=float(np.nan_to_num(1 / ranks).mean()) if ranked else np.nan,
-        score=mean_of(cells["score"][solved]),
-        shape_distance=median_of(cells["shape_distance"][solved]),
-        box_iou=median_of(cells["box_iou"][solved]),
-        mean_box_iou=mean_of(cells["box_iou"][solved]),
-        rotation_error_deg=median_of(cells["rotation_error_deg"][solved]),
-        milliseconds=median_of(1e3 * cells["seconds"][solved]),
-    )
+    values = {
+        "queries": queries,
+        "failed": queries - int(solved.sum()),
+        "rank_1": float((ranks == 1).mean()) if ranked else np.nan,
+        "rank_5": float((ranks <= 5).mean()) if ranked else np.nan,
+        "reciprocal_rank": float(np.nan_to_num(1 / ranks).mean()) if ranked else np.nan,
+        "score": mean_of(cells["score"][solved]),
+        "shape_distance": median_of(cells["shape_distance"][solved]),
+        "box_iou": median_of(cells["box_iou"][solved]),
+        "mean_box_iou": mean_of(cells["box_iou"][solved]),
+        "rotation_error_deg": median_of(cells["rotation_error_deg"][solved]),
+        "milliseconds": median_of(1e3 * cells["seconds"][solved]),
+    }
+    names = {
+        "category": category,
+        "protocol": protocol,
+        "method": method,
+        "noise_px": noise,
+        "keypoints": keypoints,
+    }
+    group = f"{category}, {protocol}, {noise:g} px, {keypoints} keypoints"
+    return Summary(group, names, values, tasks=queries)

@@ -96,8 +96,8 @@ class Plan(Generic[T]):
     config : dict
         All that the results depend on, JSON; the run can only go on with the same.
     chunk_size : int
-        How many tasks a worker gets at a time. Part of the configuration: another size would cut a
-        half-done run into other chunks.
+        Number of tasks that a worker gets at a time. Part of the configuration: another size would
+        cut a half-done run into other chunks.
     """
 
     experiment: Experiment[T]

@@ -17,12 +17,13 @@ import numpy as np
 from cadalign.errors import CadalignError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, fit_batch_with, fit_with
+from cadalign.evaluation.accuracy.methods import LIMIT, fit_options
 from cadalign.evaluation.outcome import Outcome, alignment_errors
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.seeding import instance_rng
 
@@ -177,12 +178,11 @@ def _estimates(
     """A method's estimate of every problem."""
     if method == LIMIT:
         return [_bound(problem) for problem in problems]
-    batch = fit_batch_with(
-        method,
+    batch = fit_batch(
         [problem.points_3d for problem in problems],
         [problem.points_2d for problem in problems],
         problems[0].camera,
-        sigma=sigma,
+        **fit_options(method, sigma=sigma),
     )
     return [batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))]
 
@@ -193,13 +193,11 @@ def _timed(
     """An estimate, and the time of the quickest of some calls."""
     if method == LIMIT:
         return _bound(problem), None
-    best = np.inf
+    best, how = np.inf, fit_options(method, sigma=sigma)
     try:
         for _ in range(_REPEATS):
             start = time.perf_counter()
-            result = fit_with(
-                method, problem.points_3d, problem.points_2d, problem.camera, sigma=sigma
-            )
+            result = fit(problem.points_3d, problem.points_2d, problem.camera, **how)
             best = min(best, time.perf_counter() - start)
     except CadalignError as error:
         return error, None

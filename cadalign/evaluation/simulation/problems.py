@@ -60,7 +60,7 @@ def simulate_problem(
     rng : numpy.random.Generator
         The only source of randomness.
     points : int
-        How many points.
+        Number of points.
     noise_px : float
         Standard deviation of the Gaussian noise on each image coordinate [px].
     outlier_share : float

@@ -1,4 +1,4 @@
-"""What keypoints look like at every focal length that a search tries."""
+"""Rays and weights of keypoints at every focal length that a search tries."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_bounds, focal_grid
 from cadalign.fitting.noise import rays_of, whitening_of
-from cadalign.fitting.options import Sigma
+from cadalign.fitting.options import FitOptions, Sigma
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.evidence import LogFocalPrior
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +72,9 @@ def focal_view(
 
 
 def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
-    """How undistorted pixels, over the focal length, change with its logarithm.
+    """Derivatives of undistorted pixels, over the focal length, by its logarithm.
 
-    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they don't.
+    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they are 0.
     """
     if not camera.distortion:
         return np.empty((0, 2))
@@ -82,9 +83,15 @@ def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> Flo
     return np.asarray(rays - np.einsum("nij,nj->ni", inverse, distorted))
 
 
-def log_limits(camera: Camera, prior: FocalPrior | None) -> tuple[float, float]:
-    """Bounds of the focal length's logarithm, which a prior may widen."""
+def log_focal_prior(camera: Camera, options: FitOptions) -> LogFocalPrior:
+    """Bounds of the log focal length, which a prior may widen, and that prior."""
     low, high = focal_bounds(camera)
-    if prior is not None:
-        low, high = min(low, prior.focal), max(high, prior.focal)
-    return math.log(low), math.log(high)
+    prior = options.focal_prior
+    if prior is None:
+        return LogFocalPrior(math.log(low), math.log(high), 0.0, 0.0)
+    return LogFocalPrior(
+        math.log(min(low, prior.focal)),
+        math.log(max(high, prior.focal)),
+        math.log(prior.focal),
+        prior.relative_sigma**-2,
+    )

@@ -1,4 +1,4 @@
-"""What is known of an unknown focal length: the range it is searched in, and priors from EXIF."""
+"""Search range and priors of an unknown focal length, from EXIF data for example."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 @dataclass(frozen=True)
 class FocalPrior:
-    """What is known of a focal length beforehand: a Gaussian on its logarithm.
+    """Prior on a focal length: a Gaussian on its logarithm.
 
     Parameters
     ----------
@@ -119,14 +119,14 @@ def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
 
 
 def focal_doubt(camera: Camera, prior: FocalPrior | None) -> str | None:
-    """Why an estimated focal length is doubtful, in words; None where it is not.
+    """Warning about an estimated focal length that is doubtful, or None.
 
     Parameters
     ----------
     camera : Camera
         With the estimate.
     prior : FocalPrior, optional
-        What it was estimated with.
+        The prior of the estimate.
     """
     if prior is not None:
         off = math.log(camera.fx / prior.focal)

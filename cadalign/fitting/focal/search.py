@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.focal.grid import (
     FocalViews,
     focal_slopes,
     focal_view,
     focal_views,
-    log_limits,
+    log_focal_prior,
 )
 from cadalign.fitting.focal.prior import focal_bounds
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
+from cadalign.fitting.solutions import Solutions
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.batch import optimal_batch
-from cadalign.solvers.constants import DEGENERATE, NOT_FOUND, POSE_SIZE, TOO_FEW, UNKNOWNS
-from cadalign.solvers.focal import focal_covariance, linear_focal, refine_focal
+from cadalign.solvers.constants import DEGENERATE, NOT_FOUND, OK, POSE_SIZE, TOO_FEW, UNKNOWNS
+from cadalign.solvers.covariance import focal_covariance
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, relative_to
+from cadalign.solvers.focal import linear_focal, refine_focal
 from cadalign.solvers.objective import Objective
-from cadalign.solvers.optimal import MAX_MINIMA, has_collapsed, orthonormalize, uncenter
+from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
+from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
 
 _MOST_STARTS = 8
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
@@ -36,35 +40,8 @@ _ALL_STEPS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Minima:
-    """The minima of every problem, the best first.
-
-    Parameters
-    ----------
-    poses, costs : (B, MAX_MINIMA, 15), (B, MAX_MINIMA) float
-    covariances : (B, 8, 8) or (B, 9, 9) float
-        Of the best: rotation vector, translation, log scales, log focal length.
-    statuses : (B,) int
-    info : (B, 4) int
-        Minima, iterations, hypotheses, undetermined unknown or -1.
-    focals : (B, MAX_MINIMA) float, optional
-        Focal lengths [px], where they were estimated.
-    """
-
-    poses: FloatArray
-    costs: FloatArray
-    covariances: FloatArray
-    statuses: IntArray
-    info: IntArray
-    focals: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class _Task:
-    """One problem, and what it looks like at a focal length.
-
-    ``noise`` is the standard deviation that priors and loss scales are to be multiplied by.
-    """
+    """One problem; priors and loss scales are multiples of ``noise``, a standard deviation."""
 
     points: FloatArray
     points_2d: FloatArray
@@ -75,20 +52,18 @@ class _Task:
 
     def objective(self, focal: float) -> Objective:
         view = focal_view(self.points_2d, self.camera, focal, sigma=self.sigma)
+        loss_scale = self.options.loss_scale * self.noise
         return Objective(
-            self.points,
-            *view,
-            LOSSES[self.options.loss],
-            self.options.loss_scale * self.noise,
-            self.options.prior_weight * self.noise**2,
             self.options.free,
+            Keypoints(self.points, *view, LOSSES[self.options.loss], loss_scale),
+            ScalePrior(self.options.prior_weight * self.noise**2),
         )
 
     @property
-    def prior(self) -> tuple[float, float]:
-        """Mean and inverse variance of the focal length's logarithm; the weight 0 for none."""
-        center, weight = self.options.log_focal_prior
-        return center, weight * self.noise**2
+    def prior(self) -> LogFocalPrior:
+        """Bounds and prior of the log focal length."""
+        prior = log_focal_prior(self.camera, self.options)
+        return prior._replace(weight=prior.weight * self.noise**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +78,8 @@ def search_focal(
     options: FitOptions,
     points: FloatArray,
     sigmas: Sequence[Sigma] | None,
-    errors: dict[int, CadalignError],
     noises: FloatArray,
-) -> Minima:
+) -> Solutions:
     """Find the minima over alignment and focal length for every problem.
 
     Parameters
@@ -116,21 +90,17 @@ def search_focal(
         Model points, the known axis first.
     sigmas : sequence of B, optional
         Take the place of the options' sigma.
-    errors : dict of int to CadalignError
-        Receives why a problem cannot be solved, where its keypoints are the reason.
     noises : (B,) float
-        Standard deviations that priors and loss scales are to be multiplied by.
+        Standard deviations that priors and loss scales are multiplied by.
     """
     count = len(problems)
+    poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))
+    costs = np.full((count, MAX_MINIMA), np.inf)
     focals = np.full((count, MAX_MINIMA), np.nan)
-    found = Minima(
-        poses=np.zeros((count, MAX_MINIMA, POSE_SIZE)),
-        costs=np.full((count, MAX_MINIMA), np.inf),
-        covariances=np.zeros((count, UNKNOWNS + 1, UNKNOWNS + 1)),
-        statuses=np.zeros(count, dtype=np.int64),
-        info=np.zeros((count, 4), dtype=np.int64),
-        focals=focals,
-    )
+    covariances = np.zeros((count, UNKNOWNS + 1, UNKNOWNS + 1))
+    statuses = np.full(count, OK)
+    info = np.zeros((count, 4), dtype=np.int64)
+    errors: dict[int, CadalignError] = {}
     for b in range(count):
         rows = problems.rows(b)
         sigma = options.sigma if sigmas is None else sigmas[b]
@@ -138,26 +108,24 @@ def search_focal(
             points[rows], problems.points_2d[rows], problems.camera(b), sigma, options, noises[b]
         )
         if len(task.points) < options.min_points:
-            found.statuses[b] = TOO_FEW
+            statuses[b] = TOO_FEW
             continue
         try:
-            minima, found.info[b, 1], found.info[b, 2] = _minima(task)
+            minima, iterations, hypotheses = _minima(task)
         except InputError as error:
             errors[b] = error
             continue
         for k, minimum in enumerate(minima[:MAX_MINIMA]):
-            found.poses[b, k] = minimum.pose
-            found.costs[b, k] = minimum.cost
-            focals[b, k] = minimum.focal
-        found.info[b, 0] = len(minima)
-        found.info[b, 3] = -1
+            poses[b, k], costs[b, k], focals[b, k] = minimum.pose, minimum.cost, minimum.focal
+        undetermined = -1
+        if minima:
+            undetermined, covariances[b] = _covariance(task, minima[0])
+        info[b] = len(minima), iterations, hypotheses, undetermined
         if not minima:
-            found.statuses[b] = NOT_FOUND
-            continue
-        found.info[b, 3] = _covariance(task, minima[0], found.covariances[b])
-        if found.info[b, 3] >= 0:
-            found.statuses[b] = DEGENERATE
-    return found
+            statuses[b] = NOT_FOUND
+        elif undetermined >= 0:
+            statuses[b] = DEGENERATE
+    return Solutions(poses, costs, covariances, statuses, info, focals=focals, errors=errors)
 
 
 def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
@@ -176,14 +144,20 @@ def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
             continue
         if not any(_are_same(minimum, other) for other in minima):
             minima.append(minimum)
-    for minimum in minima:
-        orthonormalize(minimum.pose)
-        uncenter(minimum.pose, center, unit)
+    minima = [replace(minimum, pose=_uncentered(minimum.pose, center, unit)) for minimum in minima]
     return sorted(minima, key=lambda minimum: minimum.cost), iterations, hypotheses
 
 
+def _uncentered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
+    """The pose of points x, from that of points (x - center) / unit."""
+    pose = pose.copy()
+    orthonormalize(pose)
+    uncenter(pose, center, unit)
+    return pose
+
+
 def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
-    """Where to start: the optima at fixed focal lengths that no neighbouring one improves on."""
+    """Starts: the optima at fixed focal lengths that no neighbouring one improves on."""
     views = _with_linear_guess(
         task, focal_views(task.points_2d, task.camera, task.options.focal_prior, sigma=task.sigma)
     )
@@ -200,8 +174,8 @@ def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
         task.options.free,
         0,
     )
-    center, weight = task.prior
-    costs = costs + (weight * (np.log(focals) - center) ** 2)[:, None]
+    prior = task.prior
+    costs = costs + (prior.weight * (np.log(focals) - prior.center) ** 2)[:, None]
     starts: list[_Minimum] = []
     for flat in np.argsort(costs, axis=None, kind="stable").tolist():
         k, row = divmod(flat, MAX_MINIMA)
@@ -235,8 +209,7 @@ def _with_linear_guess(task: _Task, views: FocalViews) -> FocalViews:
 
 def _descend(task: _Task, start: _Minimum) -> tuple[_Minimum, int]:
     """The minimum of all 9 unknowns below a start, and the iterations it took."""
-    center, weight = task.prior
-    low, high = log_limits(task.camera, task.options.focal_prior)
+    prior = task.prior
     pose, focal, cost = start.pose.copy(), start.focal, np.inf
     iterations = 0
     for _ in range(_LENS_ROUNDS if task.camera.distortion else 1):
@@ -244,22 +217,14 @@ def _descend(task: _Task, start: _Minimum) -> tuple[_Minimum, int]:
             objective = task.objective(focal)
         except InputError:
             break
-        slopes = focal_slopes(task.points_2d, task.camera.with_focal(focal), objective.rays)
-        log_focal = np.log(focal)
-        cost, moved, used = refine_focal(
-            objective,
-            slopes,
-            center - log_focal,
-            weight,
-            low - log_focal,
-            high - log_focal,
-            _ALL_STEPS,
-            pose,
-            0.0,
+        slopes = focal_slopes(
+            task.points_2d, task.camera.with_focal(focal), objective.keypoints.rays
         )
+        here = relative_to(prior, math.log(focal))
+        cost, moved, used = refine_focal(objective, slopes, here, _ALL_STEPS, pose, 0.0)
         iterations += used
         focal *= float(np.exp(moved))
-        if abs(moved) < _LENS_TOLERANCE:  # a lens's slopes hold near the focal length they are of
+        if abs(moved) < _LENS_TOLERANCE:  # slopes are valid near the focal length of their rays
             break
     return _Minimum(pose, focal, float(cost)), iterations
 
@@ -271,9 +236,12 @@ def _are_same(first: _Minimum, second: _Minimum) -> bool:
     return bool(np.hypot(turned, stretched) < _SAME_CHORD and zoomed < _SAME_FOCAL)
 
 
-def _covariance(task: _Task, minimum: _Minimum, covariance: FloatArray) -> int:
-    """Fill in (9, 9); returns the number of an undetermined unknown, or -1."""
+def _covariance(task: _Task, minimum: _Minimum) -> tuple[int, FloatArray]:
+    """The number of an undetermined unknown or -1, and the covariance (9, 9)."""
     objective = task.objective(minimum.focal)
     camera = task.camera.with_focal(minimum.focal)
-    slopes = focal_slopes(task.points_2d, camera, objective.rays)
-    return int(focal_covariance(objective, slopes, task.prior[1], minimum.pose, covariance))
+    slopes = focal_slopes(task.points_2d, camera, objective.keypoints.rays)
+    covariance = np.zeros((UNKNOWNS + 1, UNKNOWNS + 1))
+    weight = task.prior.weight
+    undetermined = focal_covariance(objective, slopes, weight, minimum.pose, covariance)
+    return int(undetermined), covariance

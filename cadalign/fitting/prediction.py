@@ -1,4 +1,4 @@
-"""How projected keypoints depend on the unknowns of a fit, and how well they are predicted."""
+"""Derivatives and covariances of projected keypoints, by the unknowns of a fit."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.fitting.uncertainty import unknown_axes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
+from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.projection import ray_derivatives
 
-_WITHOUT_FOCAL, _WITH_FOCAL = 8, 9
+_WITHOUT_FOCAL, _WITH_FOCAL = UNKNOWNS, UNKNOWNS + 1
 
 
 def projection_jacobian(
@@ -52,27 +54,29 @@ def projection_jacobian(
     """
     if unknowns not in (_WITHOUT_FOCAL, _WITH_FOCAL):
         raise InputError(f"{unknowns} is neither 8 nor 9", where="unknowns")
-    turned = points_3d @ alignment.linear.T
-    in_camera = turned + alignment.translation
-    depth = in_camera[:, 2]
-    if not (depth > 0).all():
-        raise InputError("a point lies behind the camera", where="points_3d")
-    moved = np.zeros((len(points_3d), 3, 8))
-    for axis in range(3):
-        moved[:, :, axis] = np.cross(np.eye(3)[axis], turned)
-        moved[:, axis, 3 + axis] = 1.0
-    for place, axis in enumerate(unknown_axes(known_axis)):
-        moved[:, :, 6 + place] = points_3d[:, axis, None] * alignment.linear[:, axis]
-    rays = in_camera[:, :2] / depth[:, None]
-    of_rays = np.zeros((len(points_3d), 2, 3))
-    of_rays[:, [0, 1], [0, 1]] = 1 / depth[:, None]
-    of_rays[:, :, 2] = -rays / depth[:, None]
+    rays = _rays_ahead(points_3d, alignment)
+    # The kernel takes the known axis first, and has the scales of the other two in cyclic order.
+    first = "xyz".index(known_axis)
+    order = [first, (first + 1) % 3, (first + 2) % 3]
+    ordered = Alignment(
+        alignment.rotation[:, order], alignment.translation, alignment.scale[order], is_valid=True
+    )
+    of_rays = ray_derivatives(np.ascontiguousarray(points_3d[:, order], float), ordered.packed)
+    if order[1] > order[2]:
+        of_rays = of_rays[:, :, [0, 1, 2, 3, 4, 5, 7, 6]]
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
-    jacobian = to_pixels @ of_rays @ moved
+    jacobian = to_pixels @ of_rays
     if unknowns == _WITH_FOCAL:
         off_center = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
         jacobian = np.concatenate([jacobian, off_center[:, :, None]], axis=2)
     return np.asarray(jacobian)
+
+
+def _rays_ahead(points_3d: FloatArray, alignment: Alignment) -> FloatArray:
+    in_camera = alignment.apply(points_3d)
+    if not (in_camera[:, 2] > 0).all():
+        raise InputError("a point lies behind the camera", where="points_3d")
+    return perspective(in_camera)
 
 
 def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

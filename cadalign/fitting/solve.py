@@ -1,0 +1,278 @@
+"""Solving of packed problems: the methods, and the noise where it is estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import CadalignError
+from cadalign.fitting.degeneracy import no_redundancy_error, solver_error
+from cadalign.fitting.focal.search import search_focal
+from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.options import LOSSES, FitOptions, Sigma
+from cadalign.fitting.problems import Problems
+from cadalign.fitting.solutions import Solutions
+from cadalign.solvers.constants import OK, POSE_SIZE
+from cadalign.solvers.linear import aepnp_batch
+from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.projection import reproject_batch
+
+_SIGMA_ROUNDS = 20
+_SIGMA_TOLERANCE = 1e-3
+# Median length of a two-dimensional Gaussian error of unit standard deviation: sqrt(2 ln 2).
+_RAYLEIGH_MEDIAN = 1.1774100225154747
+# Errors of the model's shape aside, no keypoint is known better: keeps a perfect fit from
+# claiming to be certain of everything.
+_LEAST_SIGMA = 1e-9
+_EXACT_COST = 1e-6
+# Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
+_ONE_MINIMUM = np.array([1, 0, 1, -1])
+
+Errors = dict[int, CadalignError]
+Baseline = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
+
+
+def solve(
+    problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None = None
+) -> Solutions:
+    """Solve every problem with the method of the options.
+
+    ``sigmas``, one for each problem, takes the place of the options' sigma.
+    """
+    points = problems.points_3d
+    if options.known_axis != "x":
+        points = np.ascontiguousarray(points[:, options.axis_order])
+    if options.focal == "known":
+        for camera in problems.cameras:
+            camera.require_focal()
+    if options.method == "optimal":
+        found = _solve_optimal(problems, options, points, sigmas)
+    elif options.method == "aepnp":
+        rays, errors = _rays(problems)
+        found = _one_minimum(*aepnp_batch(points, rays, problems.offsets), errors)
+    else:
+        found = _solve_baseline(problems, options, points)
+    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
+    residuals, statuses = _residuals(seen, points, found)
+    found = found._replace(residuals=residuals, statuses=statuses)
+    if np.count_nonzero(statuses):
+        found = found._replace(errors=_errors(problems, options, found))
+    return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors:
+    """Those found on the way, and otherwise those of the statuses."""
+    errors = {
+        b: solver_error(
+            int(found.statuses[b]),
+            int(found.info[b, 3]),
+            problems.points_3d[problems.rows(b)],
+            options,
+        )
+        for b in np.flatnonzero(found.statuses).tolist()
+        if b not in found.errors
+    }
+    return {**found.errors, **errors}
+
+
+def _rays(problems: Problems) -> tuple[FloatArray, Errors]:
+    """Normalised image coordinates (n, 2) of all problems, and errors by problem."""
+    if len(problems.cameras) == 1 and (len(problems) == 1 or not problems.cameras[0].distortion):
+        return rays_of(problems.points_2d, problems.cameras[0]), {}
+    rays = np.zeros_like(problems.points_2d)
+    errors: Errors = {}
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        try:
+            rays[rows] = rays_of(problems.points_2d[rows], problems.camera(b))
+        except CadalignError as error:
+            errors[b] = error
+    return rays, errors
+
+
+def _whitening(
+    problems: Problems, options: FitOptions, rays: FloatArray, sigmas: Sequence[Sigma] | None
+) -> FloatArray:
+    """Weights (1 or n, 3) of the residuals of all problems."""
+    if sigmas is None and len(problems.cameras) == 1:
+        return whitening_of(options.sigma, rays, problems.cameras[0])
+    weights = np.empty((len(rays), 3))
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        sigma = options.sigma if sigmas is None else sigmas[b]
+        weights[rows] = whitening_of(sigma, rays[rows], problems.camera(b))
+    return weights
+
+
+def _solve_optimal(
+    problems: Problems, options: FitOptions, points: FloatArray, sigmas: Sequence[Sigma] | None
+) -> Solutions:
+    """The maximum-likelihood solutions, with sigma estimated in rounds where it is unknown."""
+    if options.focal == "estimate":
+        search = partial(search_focal, problems, options, points, sigmas)
+    else:
+        rays, errors = _rays(problems)
+        whitening = _whitening(problems, options, rays, sigmas)
+        search = partial(_search, problems, options, points, rays, whitening, errors)
+    if options.sigma is None and sigmas is None:
+        found = _with_estimated_sigmas(problems, options, points, search)
+    else:
+        found = search(np.ones(len(problems)))
+    exact = (2 * problems.counts == options.unknowns) & (found.info[:, 0] > 1)
+    return _with_exact_sorted(found, exact) if exact.any() else found
+
+
+def _search(
+    problems: Problems,
+    options: FitOptions,
+    points: FloatArray,
+    rays: FloatArray,
+    whitening: FloatArray,
+    errors: Errors,
+    noises: FloatArray,
+) -> Solutions:
+    """Search at known focal lengths; ``noises`` (B,) multiply prior deviations and loss scales."""
+    minima = optimal_batch(
+        points,
+        rays,
+        whitening,
+        problems.offsets,
+        LOSSES[options.loss],
+        options.loss_scale * noises,
+        options.prior_weight * noises**2,
+        options.free,
+        options.min_points,
+    )
+    return Solutions(*minima, errors=errors)
+
+
+def _with_estimated_sigmas(
+    problems: Problems,
+    options: FitOptions,
+    points: FloatArray,
+    search: Callable[[FloatArray], Solutions],
+) -> Solutions:
+    """Search with the standard deviations that the residuals have."""
+    sigmas = np.ones(len(problems))
+    for _ in range(_SIGMA_ROUNDS):
+        found = search(sigmas)
+        previous, sigmas = sigmas, _estimate_sigmas(problems, options, points, found)
+        if not options.estimates_in_rounds or np.allclose(
+            sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0
+        ):
+            break
+    covariances = found.covariances
+    exact = np.flatnonzero(2 * problems.counts <= options.unknowns).tolist()
+    too_few = {b: no_redundancy_error(int(problems.counts[b])) for b in exact}
+    return found._replace(
+        costs=found.costs / sigmas[:, None] ** 2,
+        covariances=None if covariances is None else covariances * (sigmas**2)[:, None, None],
+        sigmas=sigmas,
+        errors={**found.errors, **too_few},
+    )
+
+
+def _estimate_sigmas(
+    problems: Problems, options: FitOptions, points: FloatArray, found: Solutions
+) -> FloatArray:
+    """Standard deviations (B,) of the keypoints from their residuals [px].
+
+    From the sum of squares, or from the median where the loss is robust.
+    """
+    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
+    residuals, _ = _residuals(seen, points, found)
+    sigmas = np.ones(len(problems))
+    for b in range(len(problems)):
+        squares = (residuals[problems.rows(b)] ** 2).sum(axis=1)
+        equations = 2 * len(squares)
+        redundancy = max(equations - options.unknowns, 1)
+        if options.loss == "linear":
+            sigma = np.sqrt(squares.sum() / redundancy)
+        else:
+            sigma = np.sqrt(np.median(squares) * equations / redundancy) / _RAYLEIGH_MEDIAN
+        sigmas[b] = max(sigma, _LEAST_SIGMA) if np.isfinite(sigma) else 1.0
+    return sigmas
+
+
+def _residuals(
+    problems: Problems, points: FloatArray, found: Solutions
+) -> tuple[FloatArray, IntArray]:
+    """Projected minus observed keypoints (n, 2) [px], and the statuses (B,) that follow."""
+    residuals, statuses = reproject_batch(
+        points,
+        problems.points_2d,
+        problems.offsets,
+        found.poses,
+        problems.calibrations,
+        found.statuses,
+    )
+    for b, camera in enumerate(problems.each_camera()):
+        if camera.distortion and statuses[b] == OK and b not in found.errors:
+            rows = problems.rows(b)
+            pixels = problems.points_2d[rows] + residuals[rows]
+            rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+            residuals[rows] = camera.pixels_from_normalized(rays) - problems.points_2d[rows]
+    return residuals, statuses
+
+
+def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
+    """Put solutions that all fit exactly into the order of least stretch.
+
+    ``exact`` (B,) marks the problems with as many equations as unknowns.
+    """
+    order = np.tile(np.arange(found.costs.shape[1]), (len(found.costs), 1))
+    for b in np.flatnonzero(exact).tolist():
+        count = int((found.costs[b, : found.info[b, 0]] < _EXACT_COST).sum())
+        stretch = (np.log(found.poses[b, :count, 13:]) ** 2).sum(axis=1)
+        order[b, :count] = np.argsort(stretch, kind="stable")
+    return found._replace(
+        poses=np.take_along_axis(found.poses, order[:, :, None], axis=1),
+        costs=np.take_along_axis(found.costs, order, axis=1),
+        focals=None if found.focals is None else np.take_along_axis(found.focals, order, axis=1),
+    )
+
+
+def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
+    """Solve with a baseline, which is not compiled."""
+    solver = _baseline(options.method)
+    rays, errors = _rays(problems)
+    poses = np.zeros((len(problems), 1, POSE_SIZE))
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        try:
+            rotation, translation, scale = solver(points[rows], rays[rows])
+            poses[b, 0] = np.concatenate([rotation.ravel(), translation, scale])
+        except CadalignError as error:
+            errors.setdefault(b, error)
+    return _one_minimum(poses, np.zeros(len(problems), dtype=np.int64), errors)
+
+
+def _baseline(method: str) -> Baseline:
+    if method == "epnp":
+        from cadalign.solvers.opencv import epnp  # OpenCV takes longer to import than all the rest
+
+        return epnp
+    from cadalign.solvers.paper import aepnp_paper
+
+    return aepnp_paper
+
+
+def _one_minimum(poses: FloatArray, statuses: IntArray, errors: Errors) -> Solutions:
+    """The solutions of a method that supports neither noise nor alternatives."""
+    costs = np.empty(poses.shape[:2])
+    costs.fill(np.inf)
+    info = np.empty((len(poses), 4), dtype=np.int64)
+    info[:] = _ONE_MINIMUM
+    return Solutions(poses, costs, None, statuses, info, errors=errors)
+
+
+def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
+    """Turn solutions for the reordered model axes into solutions for the model's own."""
+    covariances = found.covariances
+    if covariances is not None and options.known_axis == "y":  # solved as z, x
+        swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: covariances.shape[1]]
+        covariances = covariances[:, swapped][:, :, swapped]
+    return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)

@@ -1,0 +1,51 @@
+"""Rotation matrices from and to rotation vectors and quaternions, on SciPy's `Rotation`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+
+
+def rotation_from_vector(vector: FloatArray) -> FloatArray:
+    """The rotation matrix (3, 3) of a rotation vector (3,): axis times angle [rad].
+
+    Examples
+    --------
+    >>> rotation_from_vector(np.array([0.0, 0.0, np.pi / 2])).round(12).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    from scipy.spatial.transform import Rotation  # too slow to load with `import cadalign`
+
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+
+def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
+    """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
+
+    Raises
+    ------
+    InputError
+        If it is zero or not finite.
+
+    Examples
+    --------
+    >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
+    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    from scipy.spatial.transform import Rotation
+
+    length = np.linalg.norm(quat_wxyz)
+    if not (np.isfinite(length) and length > 0):
+        raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
+    w, x, y, z = quat_wxyz / length
+    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
+
+
+def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
+    """The quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.array([w, x, y, z])

@@ -1,0 +1,247 @@
+"""Evidence about an alignment: each block adds its part to the cost and the normal equations.
+
+A block is a NamedTuple of its data with two kernels: one returns its cost at a pose, the other also
+adds J' W J to the upper triangle of a ``hessian`` (8, 8) and J' W r to a ``gradient`` (8,), in the
+order of `cadalign.solvers.unknowns`. `cadalign.solvers.objective` sums the blocks.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import fast_sums, inlined, kernel
+from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.projection import (
+    Scalars,
+    Triple,
+    project_point,
+    scalars_of,
+    write_derivatives,
+)
+
+BLOCK = 32
+"""Points whose derivatives are written before their products are summed."""
+
+
+class Keypoints(NamedTuple):
+    """Keypoints of the model and their places in one image.
+
+    Parameters
+    ----------
+    points : (n, 3) float
+        Model points.
+    rays : (n, 2) float
+        Observed normalised image coordinates.
+    whitening : (1 or n, 3) float
+        (a, b, c) such that (a du + b dv, c dv) has unit covariance for an error (du, dv).
+    loss, loss_scale : int, float
+        The loss on the length of a whitened residual, and the length at which it starts to bend.
+    """
+
+    points: FloatArray
+    rays: FloatArray
+    whitening: FloatArray
+    loss: int
+    loss_scale: float
+
+
+class ScalePrior(NamedTuple):
+    """Gaussian prior on log s_y and log s_z about 0: its inverse variance, 0 for none."""
+
+    weight: float
+
+
+class LogFocalPrior(NamedTuple):
+    """Bounds and Gaussian prior of the log focal length, relative to a reference.
+
+    Parameters
+    ----------
+    low, high : float
+        Bounds.
+    center, weight : float
+        Mean and inverse variance; the weight 0 for no prior.
+    """
+
+    low: float
+    high: float
+    center: float
+    weight: float
+
+
+@inlined
+def add_keypoints(
+    keypoints: Keypoints,
+    pose: FloatArray,
+    rows: FloatArray,
+    hessian: FloatArray,
+    gradient: FloatArray,
+) -> float:
+    """Add the keypoints' part; returns its cost, infinite if a point lies behind the camera.
+
+    ``rows`` (9, 2 * BLOCK) is scratch space.
+    """
+    cost = 0.0
+    for start in range(0, keypoints.points.shape[0], BLOCK):
+        size = min(BLOCK, keypoints.points.shape[0] - start)
+        cost += keypoint_rows(keypoints, pose, start, size, rows)
+        if not cost < np.inf:
+            return np.inf
+        _add_products(rows, 2 * size, hessian, gradient)
+    return cost
+
+
+@kernel
+def keypoint_rows(
+    keypoints: Keypoints, pose: FloatArray, start: int, size: int, rows: FloatArray
+) -> float:
+    """Write whitened, loss-weighted derivatives and residuals of a block of points.
+
+    Row k < 8 of ``rows`` is unknown k, row 8 the residual; the block's u equations stand before
+    its v equations. Returns the block's cost, infinite if a point lies behind the camera.
+    """
+    points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
+    scalars = scalars_of(pose)
+    loss, loss_scale = keypoints.loss, keypoints.loss_scale
+    each = whitening.shape[0] > 1
+    weights = (whitening[0, 0], whitening[0, 1], whitening[0, 2])
+    cost = 0.0
+    nearest = np.inf
+    for b in range(size):
+        i = start + b
+        point = (points[i, 0], points[i, 1], points[i, 2])
+        if each:
+            weights = (whitening[i, 0], whitening[i, 1], whitening[i, 2])
+        ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
+        nearest = min(nearest, depth)
+        part, root = _loss_and_root(loss, loss_scale, ru * ru + rv * rv)
+        cost += part
+        weighted = (root * weights[0], root * weights[1], root * weights[2])
+        write_derivatives(scalars, point, weighted, rows, b, size + b)
+        rows[UNKNOWNS, b] = root * ru
+        rows[UNKNOWNS, size + b] = root * rv
+    return cost if nearest > 0 else np.inf
+
+
+@inlined
+def _residual(
+    pose: Scalars, point: Triple, u: float, v: float, weights: Triple
+) -> tuple[float, float, float]:
+    """Whitened residual of a point observed at (u, v), and its depth."""
+    projected_u, projected_v, depth = project_point(pose, point)
+    du = projected_u - u
+    dv = projected_v - v
+    return weights[0] * du + weights[1] * dv, weights[2] * dv, depth
+
+
+@inlined
+def _loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]:
+    """The loss of a squared residual, and the root of the weight that it gives to the residual."""
+    if loss == LINEAR:
+        return square, 1.0
+    if loss == HUBER:
+        length = np.sqrt(square)
+        if length > scale:
+            return (2.0 * length - scale) * scale, np.sqrt(scale / length)
+        return square, 1.0
+    ratio = square / (scale * scale)
+    return scale * scale * np.log1p(ratio), np.sqrt(1.0 / (1.0 + ratio))
+
+
+@fast_sums
+def _add_products(
+    rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray
+) -> None:
+    """Add the rows' inner products to the upper triangle of J' W J and to J' W r."""
+    for k in range(UNKNOWNS):
+        for m in range(k, UNKNOWNS + 1):
+            total = 0.0
+            for c in range(columns):
+                total += rows[k, c] * rows[m, c]
+            if m < UNKNOWNS:
+                hessian[k, m] += total
+            else:
+                gradient[k] += total
+
+
+@kernel
+def keypoint_cost(keypoints: Keypoints, pose: FloatArray) -> float:
+    """The keypoints' cost; infinite if a point lies behind the camera."""
+    points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
+    scalars = scalars_of(pose)
+    loss, loss_scale = keypoints.loss, keypoints.loss_scale
+    each = whitening.shape[0] > 1
+    weights = (whitening[0, 0], whitening[0, 1], whitening[0, 2])
+    cost = 0.0
+    for i in range(points.shape[0]):
+        point = (points[i, 0], points[i, 1], points[i, 2])
+        if each:
+            weights = (whitening[i, 0], whitening[i, 1], whitening[i, 2])
+        ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
+        if not depth > 0:
+            return np.inf
+        cost += _loss_and_root(loss, loss_scale, ru * ru + rv * rv)[0]
+    return cost
+
+
+@inlined
+def squared_error(keypoints: Keypoints, pose: Scalars, i: int) -> float:
+    """Squared whitened residual of keypoint i; infinite behind the camera."""
+    points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
+    w = i if whitening.shape[0] > 1 else 0
+    weights = (whitening[w, 0], whitening[w, 1], whitening[w, 2])
+    point = (points[i, 0], points[i, 1], points[i, 2])
+    ru, rv, depth = _residual(pose, point, rays[i, 0], rays[i, 1], weights)
+    return ru * ru + rv * rv if depth > 0 else np.inf
+
+
+@kernel
+def take_keypoints(keypoints: Keypoints, chosen: IntArray) -> Keypoints:
+    """The keypoints with the numbers ``chosen`` (k,)."""
+    count = chosen.shape[0]
+    each = keypoints.whitening.shape[0] > 1
+    points = np.empty((count, 3))
+    rays = np.empty((count, 2))
+    whitening = np.empty((count if each else 1, 3))
+    for k in range(count):
+        points[k] = keypoints.points[chosen[k]]
+        rays[k] = keypoints.rays[chosen[k]]
+    for k in range(whitening.shape[0]):
+        whitening[k] = keypoints.whitening[chosen[k] if each else 0]
+    return Keypoints(points, rays, whitening, keypoints.loss, keypoints.loss_scale)
+
+
+@inlined
+def add_scale_prior(
+    prior: ScalePrior, pose: FloatArray, hessian: FloatArray, gradient: FloatArray
+) -> float:
+    """Add the prior on the log scales; returns its cost."""
+    cost = 0.0
+    for k in range(2):
+        log_scale = np.log(pose[13 + k])
+        cost += prior.weight * log_scale * log_scale
+        gradient[6 + k] += prior.weight * log_scale
+        hessian[6 + k, 6 + k] += prior.weight
+    return cost
+
+
+@kernel
+def scale_prior_cost(prior: ScalePrior, pose: FloatArray) -> float:
+    """The cost of the prior on the log scales."""
+    return float(prior.weight * (np.log(pose[13]) ** 2 + np.log(pose[14]) ** 2))
+
+
+@kernel
+def focal_prior_cost(prior: LogFocalPrior, log_ratio: float) -> float:
+    """The cost of the prior on the log focal length."""
+    return prior.weight * (log_ratio - prior.center) ** 2
+
+
+@kernel
+def relative_to(prior: LogFocalPrior, log_ratio: float) -> LogFocalPrior:
+    """The prior relative to exp(log_ratio) times its reference."""
+    return LogFocalPrior(
+        prior.low - log_ratio, prior.high - log_ratio, prior.center - log_ratio, prior.weight
+    )

@@ -1,0 +1,99 @@
+"""Unknowns of an alignment: their order, their packing, and the step that moves them.
+
+A pose is packed into 15 numbers: rotation row by row (9), translation (3), scale (3). Its unknowns
+are, in this order, a rotation vector that is applied in the camera frame (3), the translation (3),
+log s_y and log s_z. The logarithm of the focal length is a ninth, see `cadalign.solvers.focal`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.linalg import polish_rotation
+
+_LARGEST_STRETCH = 1e3
+_LARGEST_LOG_STEP = 2.0
+
+
+@kernel
+def pack_pose(
+    rotation: FloatArray, translation: FloatArray, scale: FloatArray, pose: FloatArray
+) -> None:
+    """Write rotation (3, 3), translation (3,) and scale (3,) into ``pose`` (15,)."""
+    for i in range(3):
+        for j in range(3):
+            pose[3 * i + j] = rotation[i, j]
+        pose[9 + i] = translation[i]
+        pose[12 + i] = scale[i]
+
+
+@kernel
+def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
+    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
+    angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
+    angle = np.sqrt(angle2)
+    if angle > 1e-4:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle2
+    else:
+        a = 1.0 - angle2 / 6.0
+        b = 0.5 - angle2 / 24.0
+    x, y, z = step[0], step[1], step[2]
+    for c in range(3):
+        p, q, r = pose[c], pose[3 + c], pose[6 + c]
+        # Rodrigues: v + a (w x v) + b (w x (w x v))
+        dot = x * p + y * q + z * r
+        moved[c] = p + a * (y * r - z * q) + b * (x * dot - p * angle2)
+        moved[3 + c] = q + a * (z * p - x * r) + b * (y * dot - q * angle2)
+        moved[6 + c] = r + a * (x * q - y * p) + b * (z * dot - r * angle2)
+    for c in range(3):
+        moved[9 + c] = pose[9 + c] + step[3 + c]
+    moved[12] = pose[12]
+    for k in range(2):
+        log_step = min(max(step[6 + k], -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)
+        moved[13 + k] = pose[13 + k] * np.exp(log_step)
+
+
+@inlined
+def hold_fixed(free: FloatArray, hessian: FloatArray, gradient: FloatArray) -> None:
+    """Replace the equations of unknowns that are not ``free`` (8,) by unit rows."""
+    for k in range(UNKNOWNS):
+        if free[k] == 0.0:
+            gradient[k] = 0.0
+            for m in range(UNKNOWNS):
+                hessian[k, m] = hessian[m, k] = 0.0
+            hessian[k, k] = 1.0
+
+
+@kernel
+def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
+    """Turn the pose of points (x - center) / unit into the pose of points x, in place."""
+    for c in range(3):
+        pose[9 + c] *= unit
+        for j in range(3):
+            pose[9 + c] -= pose[3 * c + j] * pose[12 + j] * center[j]
+
+
+@kernel
+def orthonormalize(pose: FloatArray) -> None:
+    """Remove the rounding errors of the steps from the rotation, in place."""
+    rotation = np.empty((3, 3))
+    polish_rotation(pose[:9].reshape(3, 3), rotation)
+    for i in range(3):
+        for j in range(3):
+            pose[3 * i + j] = rotation[i, j]
+
+
+@kernel
+def has_collapsed(pose: FloatArray) -> bool:
+    """Report a pose whose scales ran off to zero or infinity.
+
+    With few points the likelihood may rise forever as a scale goes to zero. No real object is
+    there, and the other minima are of use.
+    """
+    low = min(pose[13], pose[14])
+    high = max(pose[13], pose[14])
+    return not (low > 1.0 / _LARGEST_STRETCH and high < _LARGEST_STRETCH)

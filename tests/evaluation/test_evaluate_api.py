@@ -1,0 +1,75 @@
+"""`cadalign.evaluate`: every experiment that the command line has, with the same options."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cadalign
+from cadalign import Mesh
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.instances.instance import make_instance
+from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.registry import known_options, spec_named
+from cadalign.render import Scene
+
+
+def evaluate(*arguments: Any, **options: Any) -> Any:
+    return cadalign.evaluate(*arguments, workers=0, **options)
+
+
+def test_every_experiment_has_a_specification_with_its_name() -> None:
+    names = [options.experiment for options in known_options()]
+    assert names == ["keypointnet", "demo", "simulate", "correspondences", "retrieval"]
+    for options in known_options():
+        spec = spec_named(options.experiment)
+        assert spec.options is options
+        assert len({column.key for column in spec.columns}) == len(spec.columns)
+
+
+def test_retrieval(sample_root: Path) -> None:
+    table = evaluate(sample_root, "retrieval", keypoints=[8], noises_px=[1.0], methods=["optimal"])
+    assert set(table.protocol) == {"leave-in", "leave-out"}
+    assert (table[table.protocol == "leave-in"]["rank"] == 1).all()
+    assert (table.seconds[table.status == "ok"] > 0).all()
+
+
+def test_the_demonstration(sample_root: Path, tmp_path: Path) -> None:
+    table = evaluate(sample_root, "demo", categories=["car"], per_category=1, out=tmp_path)
+    assert table.status.tolist() == ["ok"]
+    assert len(list((tmp_path / "overlays").iterdir())) == 1
+
+
+def test_the_simulation() -> None:
+    table = evaluate(experiment="simulate", sweep="points", values=[8], runs=2, methods=["aepnp"])
+    assert table.points.tolist() == [8, 8]
+
+
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown experiment 'brewing'; known are keypointnet"):
+        evaluate(tmp_path, "brewing")
+    with pytest.raises(DataError, match="no such folder"):
+        evaluate(tmp_path / "none", "correspondences")
+    with pytest.raises(TypeError, match="nois_px"):
+        evaluate(tmp_path, nois_px=1.0)
+
+
+def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> None:
+    dataset = KeypointNet(sample_root)
+    model = dataset[dataset.ids("chair")[0]]
+    mesh = model.load_mesh()
+    large = replace(model, keypoints=replace(model.keypoints, xyz=3 * model.keypoints.xyz))
+    found = []
+    for size, some in ((1.0, model), (3.0, large)):
+        scene = Scene(Mesh(size * mesh.vertices, mesh.faces))
+        instance = make_instance(some, scene=scene, noise_px=0.5)
+        # The object's, as the image shows it, and not the stretched model's.
+        assert instance.diagonal == pytest.approx(size, rel=1e-6)
+        fitted = cadalign.fit(instance.points_3d, instance.points_2d, instance.camera)
+        errors = alignment_errors(est=fitted.alignment, gt=instance.gt, length=instance.diagonal)
+        found.append(errors["translation_error"])
+    assert found[0] == pytest.approx(found[1], rel=1e-4)

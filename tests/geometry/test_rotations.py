@@ -1,0 +1,39 @@
+"""Rotations: each form turns into the others and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign.errors import InputError
+from cadalign.geometry.rotations import (
+    quat_wxyz_from_rotation,
+    rotation_from_quat_wxyz,
+    rotation_from_vector,
+)
+
+vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
+
+
+@given(vector=vectors, length=st.floats(1e-3, 1e3))
+def test_quaternions_of_any_length_give_their_rotation_back(vector, length) -> None:
+    rotation = rotation_from_vector(vector)
+    quaternion = quat_wxyz_from_rotation(rotation)
+    assert quaternion[0] >= 0
+    np.testing.assert_allclose(rotation_from_quat_wxyz(length * quaternion), rotation, atol=1e-12)
+
+
+@given(vector=vectors)
+def test_rotation_keeps_its_axis_and_is_orthonormal(vector) -> None:
+    rotation = rotation_from_vector(vector)
+    np.testing.assert_allclose(rotation @ vector, vector, atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("quaternion", [np.zeros(4), np.array([np.nan, 0, 0, 1])])
+def test_quaternion_without_direction_is_refused(quaternion) -> None:
+    with pytest.raises(InputError, match=r"quaternion: .* is not a rotation"):
+        rotation_from_quat_wxyz(quaternion)

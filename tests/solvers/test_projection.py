@@ -1,0 +1,130 @@
+"""The one projection and its derivatives, against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cadalign import Alignment, Camera
+from cadalign.fitting.prediction import projection_jacobian
+from cadalign.geometry.projection import perspective
+from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.evidence import BLOCK, Keypoints, ScalePrior
+from cadalign.solvers.objective import Objective, evaluate, evaluate_cost
+from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
+from cadalign.solvers.unknowns import move_pose
+
+PLAIN = Camera(640, 480, 600, 620, 315, 245)
+LENS = Camera(640, 480, 600, 620, 315, 245, (-0.2, 0.05, 0.001, -0.002))
+STEP = 1e-6
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def pose_and_points(seed: int, count: int = 7) -> tuple[Alignment, np.ndarray]:
+    """A random alignment and model points in front of the camera; some rotations near identity."""
+    rng = np.random.default_rng(seed)
+    vector = rng.normal(size=3) * rng.choice([1e-9, 1e-3, 1.0, 3.0])
+    alignment = Alignment(
+        Rotation.from_rotvec(vector).as_matrix(),
+        [*rng.uniform(-0.5, 0.5, 2), rng.uniform(5, 9)],
+        rng.uniform(0.5, 2, 3),
+    )
+    return alignment, rng.uniform(-1, 1, (count, 3))
+
+
+def moved(pose: np.ndarray, unknown: int, step: float) -> np.ndarray:
+    there = np.empty_like(pose)
+    move_pose(pose, step * np.eye(UNKNOWNS)[unknown], there)
+    return there
+
+
+def project(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.array([project_point(scalars_of(pose), tuple(point))[:2] for point in points])
+
+
+@given(seed=seeds)
+def test_kernel_projects_as_alignment_and_perspective_do(seed: int) -> None:
+    alignment, points = pose_and_points(seed)
+    rays = perspective(alignment.apply(points))
+    np.testing.assert_allclose(project(alignment.packed, points), rays, rtol=0, atol=1e-14)
+
+
+@given(seed=seeds)
+def test_ray_derivatives_are_those_of_finite_differences(seed: int) -> None:
+    alignment, points = pose_and_points(seed)
+    pose = alignment.packed
+    numerical = [
+        (project(moved(pose, k, STEP), points) - project(moved(pose, k, -STEP), points))
+        / (2 * STEP)
+        for k in range(UNKNOWNS)
+    ]
+    np.testing.assert_allclose(
+        ray_derivatives(points, pose), np.moveaxis(numerical, 0, -1), rtol=0, atol=1e-8
+    )
+
+
+@given(seed=seeds, axis=st.sampled_from("xyz"), camera=st.sampled_from([PLAIN, LENS]))
+def test_pixel_derivatives_are_those_of_finite_differences(
+    seed: int, axis: str, camera: Camera
+) -> None:
+    alignment, points = pose_and_points(seed)
+    first, second = (k for k in range(3) if "xyz"[k] != axis)
+
+    def pixels(unknown: int, step: float) -> np.ndarray:
+        turn, shift, stretch = np.zeros(3), np.zeros(3), np.zeros(3)
+        lens = camera
+        if unknown < 3:
+            turn[unknown] = step
+        elif unknown < 6:
+            shift[unknown - 3] = step
+        elif unknown < 8:
+            stretch[(first, second)[unknown - 6]] = step
+        else:
+            lens = camera.with_focal(camera.fx * np.exp(step))
+        changed = Alignment(
+            Rotation.from_rotvec(turn).as_matrix() @ alignment.rotation,
+            alignment.translation + shift,
+            alignment.scale * np.exp(stretch),
+        )
+        return lens.project(changed.apply(points))
+
+    jacobian = projection_jacobian(points, camera, alignment, known_axis=axis, unknowns=9)
+    for k in range(9):
+        numerical = (pixels(k, STEP) - pixels(k, -STEP)) / (2 * STEP)
+        np.testing.assert_allclose(jacobian[:, :, k], numerical, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("loss", [LINEAR, HUBER, CAUCHY])
+@given(seed=seeds, each=st.booleans(), weight=st.sampled_from([0.0, 10.0]))
+@settings(max_examples=30)
+def test_gradient_of_all_evidence_is_that_of_the_cost(
+    loss: int, seed: int, each: bool, weight: float
+) -> None:
+    alignment, points = pose_and_points(seed, 40)  # more than a block of points
+    rng = np.random.default_rng(seed)
+    pose = alignment.packed
+    count = len(points) if each else 1
+    free = np.array([1.0, 1, 1, 1, 1, 1, 1, rng.integers(2)])
+    objective = Objective(
+        free,
+        Keypoints(
+            points,
+            perspective(alignment.apply(points)) + rng.normal(scale=0.02, size=(len(points), 2)),
+            np.abs(rng.normal(100, 10, (count, 3))),
+            loss,
+            2.0,
+        ),
+        ScalePrior(weight),
+    )
+    hessian, gradient = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    cost = evaluate(objective, pose, np.empty((UNKNOWNS + 1, 2 * BLOCK)), hessian, gradient)
+    assert cost == pytest.approx(evaluate_cost(objective, pose), rel=1e-12)
+    np.testing.assert_array_equal(hessian, hessian.T)
+    for k in range(UNKNOWNS):
+        ahead, behind = (evaluate_cost(objective, moved(pose, k, s)) for s in (STEP, -STEP))
+        slope = free[k] * (ahead - behind) / (4 * STEP)  # the gradient is half that of the cost
+        assert gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))

@@ -1,0 +1,64 @@
+"""Every result of a solver is a rotation, whatever the keypoints are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign import Camera, FitResult, RansacOptions, fit
+from cadalign.errors import CadalignError
+from cadalign.evaluation.simulation.problems import random_rotation
+
+CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def departure(rotation: np.ndarray) -> float:
+    """Largest entry of R R' - I; infinite for a reflection."""
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    return float(error) if np.linalg.det(rotation) > 0 else np.inf
+
+
+def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:
+    points_2d = [
+        [265, 200],
+        [268, 157],
+        [293, 230],
+        [296, 190],
+        [346, 197],
+        [348, 153],
+        [368, 228],
+        [370, 187],
+    ]
+    result = fit(0.25 * CORNERS, points_2d, CAMERA, stretch="none")
+    assert departure(result.alignment.rotation) < 1e-9
+    assert result.rms == pytest.approx(10.462, abs=1e-3)  # the best of all rotations
+    assert FitResult.from_json(result.to_json()).alignment == result.alignment
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"stretch": "none"},
+        {"stretch": "y"},
+        {"scale_prior_sigma": 0.3},
+        {"ransac": RansacOptions(refine=False)},
+    ],
+    ids=lambda options: "-".join(options),
+)
+def test_boxes_and_flat_boxes_give_rotations(options: dict[str, object]) -> None:
+    rng = np.random.default_rng(0)
+    found = []
+    for number in range(150):
+        extents = rng.uniform(0.1, 0.5, 3) * (1, 1, rng.choice([1.0, 0.05]))
+        scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
+        shift = [0, 0, rng.uniform(2, 4)]
+        pixels = CAMERA.project((CORNERS * extents * scale) @ random_rotation(rng).T + shift)
+        pixels += rng.normal(scale=1 + number % 3, size=pixels.shape)
+        try:
+            result = fit(CORNERS * extents, pixels, CAMERA, **options)
+        except CadalignError:
+            continue
+        found += [result.alignment, *(other.alignment for other in result.alternatives)]
+    assert len(found) > 50
+    assert max(departure(alignment.rotation) for alignment in found) < 1e-9

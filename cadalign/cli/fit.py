@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
@@ -29,7 +29,7 @@ class _FitOptions(FitOptions):
     focal_prior: tyro.conf.Suppress[FocalPrior | None] = FitOptions.focal_prior
 
     def __post_init__(self) -> None:
-        with named_as_flags(self):
+        with named_as_flags(self, kind=OptionError):
             super().__post_init__()
 
 
@@ -38,7 +38,7 @@ class _RansacOptions(RansacOptions):
     """Search for outliers (LO-RANSAC), with --robust."""
 
     def __post_init__(self) -> None:
-        with named_as_flags(self):
+        with named_as_flags(self, kind=OptionError):
             super().__post_init__()
 
 

@@ -16,13 +16,23 @@ if TYPE_CHECKING:
 class OptionError(CadalignError):
     """A command line option has an invalid value.
 
-    It is no ValueError, which the parser would report without the option's name.
+    Other than InputError it is no ValueError, which the parser would report without the name.
     """
 
 
 @contextmanager
-def named_as_flags(*options: DataclassInstance) -> Iterator[None]:
-    """Let errors about fields of dataclasses of options name the command line's options."""
+def named_as_flags(
+    *options: DataclassInstance, kind: type[CadalignError] = InputError
+) -> Iterator[None]:
+    """Let errors about fields of dataclasses of options name the command line's options.
+
+    Parameters
+    ----------
+    *options : dataclass
+        Their fields are names of options.
+    kind : type of error
+        `OptionError` while the command line is parsed.
+    """
     try:
         yield
     except InputError as error:
@@ -30,4 +40,4 @@ def named_as_flags(*options: DataclassInstance) -> Iterator[None]:
         if error.where not in names:
             raise
         flag = "--" + str(error.where).replace("_", "-")
-        raise OptionError(error.what, where=flag, fix=error.fix) from None
+        raise kind(error.what, where=flag, fix=error.fix) from None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json
 from cadalign.errors import InputError
@@ -28,7 +28,7 @@ class _RetrievalOptions(RetrievalOptions):
     sigma: tyro.conf.Suppress[Sigma] = RetrievalOptions.sigma
 
     def __post_init__(self) -> None:
-        with named_as_flags(self):
+        with named_as_flags(self, kind=OptionError):
             super().__post_init__()
 
 

@@ -74,20 +74,18 @@ def read_json(path: Path) -> Any:
     raise DataError(f"not valid JSON: {reason}", where=where)
 
 
-def convert(
-    data: Any, kind: type[T] | Any, *, where: str | None = None, strict: bool = True
-) -> T | Any:
+def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | Any:
     """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
 
     ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
-    ``keypoints[3].uv``. ``strict=False`` reads numbers out of text, as in CSV files.
+    ``keypoints[3].uv``.
     """
     try:
-        return msgspec.convert(data, kind, strict=strict)
+        return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         plain = _plain(data)
         if plain is not data:
-            return convert(plain, kind, where=where, strict=strict)
+            return convert(plain, kind, where=where)
         raise _located(error, data, kind, where or "") from None
 
 

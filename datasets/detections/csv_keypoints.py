@@ -100,7 +100,7 @@ def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | Non
         return None
     with in_file(where):
         row = {
-            name: convert(cell, _COLUMNS[name], where=name, strict=False)
+            name: convert(_value(name, cell), _COLUMNS[name], where=name)
             for name, cell in cells.items()
         }
         if row.get("semantic_id", 0) % 1:
@@ -108,6 +108,15 @@ def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | Non
         if row.get("visibility", 0) not in (0, 1, 2):
             raise InputError(f"{row['visibility']:g} is not 0, 1 or 2", where="visibility")
     return row
+
+
+def _value(name: str, cell: str) -> str | float:
+    """A cell as a number in the columns that hold numbers, where it is a finite one."""
+    try:
+        number = np.nan if name in ("image", "name") else float(cell)
+    except ValueError:
+        return cell
+    return number if np.isfinite(number) else cell
 
 
 def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:

@@ -19,12 +19,9 @@ MOST_FACES = 150_000
 def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
     """Encode the model for display, simplified to at most ``max_faces`` triangles.
 
-    Returns
-    -------
-    bytes
-        Length of a JSON header (uint32, little-endian, a multiple of 4 with padding), the header
-        with ``faces``, ``shown`` and ``all``; then positions (faces, 3, 3) float32 in display
-        coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
+    First the length of a JSON header (uint32, little-endian, a multiple of 4 with padding), and the
+    header with ``shown`` and ``all``, the numbers of faces; then positions (faces, 3, 3) float32 in
+    display coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
     """
     mesh = model.scene.mesh
     small = simplify(mesh, max_faces=max_faces)

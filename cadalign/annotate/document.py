@@ -14,27 +14,13 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class Pair:
-    """One keypoint; either half may be placed first.
+    """One keypoint; either half may be placed first."""
 
-    Parameters
-    ----------
-    number : int
-        Identifier, unique in a document.
-    uv : (float, float), optional
-        The photo half [px].
-    keypoint : int, optional
-        The model half: a semantic id.
-    sigma : float, optional
-        Standard deviation of ``uv`` [px], if the observation file gives one.
-    confidence : float, optional
-        Confidence in the observation file.
-    """
-
-    number: int
-    uv: Pixel | None = None
-    keypoint: int | None = None
-    sigma: float | None = None
-    confidence: float | None = None
+    number: int  # unique in a document
+    uv: Pixel | None = None  # the photo half [px]
+    keypoint: int | None = None  # the model half: a semantic id
+    sigma: float | None = None  # of ``uv`` [px], if the observation file gives one
+    confidence: float | None = None  # in the observation file
 
     @property
     def complete(self) -> bool:
@@ -44,18 +30,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class FocalChoice:
-    """The user's choice of a known or estimated focal length.
-
-    Parameters
-    ----------
-    known : bool
-        False to estimate it from the pairs.
-    pixels : float, optional
-        Typed focal length [px]; None for that of the camera.
-    """
+    """The user's choice of a known focal length, or of one estimated from the pairs."""
 
     known: bool
-    pixels: float | None = None
+    pixels: float | None = None  # as typed [px]; None for the camera's
 
 
 @dataclass(frozen=True)
@@ -97,29 +75,15 @@ class Document:
         return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
 
     def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Document, int]:
-        """Place the photo half of a pair that lacks it, or of a new one.
+        """Place the photo half of a pair that lacks it, by preference of the pair of that number.
 
-        Parameters
-        ----------
-        uv : (float, float)
-            [px]
-        preferred : int, optional
-            Number of the pair to complete, if it lacks this half.
-
-        Returns
-        -------
-        Document
-        int
-            The pair's number.
+        If none lacks it, a new pair is begun. The second value is the pair's number.
         """
-        lacking = [pair.number for pair in self.pairs if pair.uv is None]
-        return self._fill(lacking, preferred, Pair(self.next_number, uv=uv))
+        pair = self._lacking("uv", preferred)
+        return self._with(replace(pair, uv=uv)), pair.number
 
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Document, int]:
-        """Place the model half of a pair that lacks it, or of a new one; as `place_uv`.
-
-        Raises InputError if the keypoint is already placed in the photo.
-        """
+        """Place the model half of a pair, as `place_uv`; it must not be placed already."""
         for position, pair in enumerate(self.pairs, start=1):
             if pair.keypoint == keypoint:
                 raise InputError(
@@ -127,8 +91,8 @@ class Document:
                     where="keypoint",
                     fix="move or delete that pair: a keypoint occurs once in a photo",
                 )
-        lacking = [pair.number for pair in self.pairs if pair.keypoint is None]
-        return self._fill(lacking, preferred, Pair(self.next_number, keypoint=keypoint))
+        pair = self._lacking("keypoint", preferred)
+        return self._with(replace(pair, keypoint=keypoint)), pair.number
 
     def move(self, number: int, uv: Pixel) -> Document:
         """Move the photo half of a pair."""
@@ -150,19 +114,13 @@ class Document:
         """Choose a known or an estimated focal length."""
         return replace(self, focal=focal)
 
-    def _fill(self, lacking: list[int], preferred: int | None, half: Pair) -> tuple[Document, int]:
-        """Merge half a pair into one that lacks it, or append it."""
-        if not lacking:
-            return self.append(half), half.number
-        number = preferred if preferred in lacking else lacking[0]
-        pair = self.pair(number)
-        merged = replace(
-            pair,
-            uv=half.uv if pair.uv is None else pair.uv,
-            keypoint=half.keypoint if pair.keypoint is None else pair.keypoint,
-        )
-        return self._with(merged), number
+    def _lacking(self, half: str, preferred: int | None) -> Pair:
+        lacking = [pair for pair in self.pairs if getattr(pair, half) is None]
+        wanted = [pair for pair in lacking if pair.number == preferred]
+        return (wanted + lacking + [Pair(self.next_number)])[0]
 
     def _with(self, changed: Pair) -> Document:
+        if changed.number == self.next_number:
+            return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
         return replace(self, pairs=pairs)

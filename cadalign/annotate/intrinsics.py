@@ -21,22 +21,13 @@ _DEFAULT_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]
 class Intrinsics:
     """Intrinsics of the camera that took a photo, and their source.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera; without one, image size, principal point and a likely focal length.
-    calibrated : bool
-        True if the focal length was given.
-    prior : FocalPrior, optional
-        Prior on the focal length from the photo's EXIF data.
-    note : str
-        Source of the focal length, for the page.
+    Without a calibrated camera it has the photo's size and a likely focal length.
     """
 
     camera: Camera
-    calibrated: bool
-    prior: FocalPrior | None = None
-    note: str = ""
+    calibrated: bool  # True if the focal length was given
+    prior: FocalPrior | None = None  # from the photo's EXIF data
+    note: str = ""  # source of the focal length, for the page
 
     def with_focal(self, choice: FocalChoice) -> Camera:
         """The camera with the focal length that the user typed, if any."""
@@ -53,10 +44,7 @@ class Intrinsics:
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera in COLMAP's form, or the first one of an Open3D, NeRF or COLMAP file.
-
-    Raises DataError if the file is missing or has none of these formats.
-    """
+    """Read a camera in COLMAP's form, or the first one of an Open3D, NeRF or COLMAP file."""
     if not path.is_dir():
         data = read_json(path)
         if isinstance(data, dict) and "params" in data:
@@ -66,10 +54,7 @@ def read_camera(path: Path) -> Camera:
 
 
 def intrinsics_of(photo: Photo, camera: Camera | None) -> Intrinsics:
-    """Combine a photo's EXIF data with its calibrated camera, which may lack a focal length.
-
-    Raises DataError if the camera's image has another size than the photo.
-    """
+    """Combine a photo's EXIF data with its calibrated camera, which may lack a focal length."""
     if camera is None:
         camera = Camera.without_focal(photo.width, photo.height)
     if (camera.width, camera.height) != (photo.width, photo.height):

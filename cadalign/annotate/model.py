@@ -23,22 +23,7 @@ _EXACT = 1e-6
 
 
 class CadModel:
-    """A mesh that can be clicked on.
-
-    Parameters
-    ----------
-    mesh : Mesh
-
-    Attributes
-    ----------
-    scene : Scene
-    center : (3,) float
-        The middle of its bounding box [model units].
-    diagonal : float
-        The length of the box's diagonal [model units].
-
-    Raises InputError if the mesh is a single point.
-    """
+    """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.scene = Scene(mesh)
@@ -57,20 +42,7 @@ class CadModel:
         return np.asarray(np.asarray(xyz, dtype=float) * self.diagonal + self.center)
 
     def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> ModelKeypoint | None:
-        """Intersect a ray with the surface.
-
-        Parameters
-        ----------
-        origin, direction : (3,) float
-            In model coordinates.
-
-        Returns
-        -------
-        ModelKeypoint or None
-            The first intersection; None if the ray misses.
-
-        Raises InputError if the ray is not made of finite numbers, or its direction is zero.
-        """
+        """Intersect a ray, in model coordinates, with the surface; None if it misses."""
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))
         if not along.any():

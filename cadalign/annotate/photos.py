@@ -49,15 +49,7 @@ class Photo:
 
 
 def find_photos(path: Path) -> list[Path]:
-    """List the photos of a folder by name, or the given photo.
-
-    Raises
-    ------
-    DataError
-        If the path does not exist.
-    InputError
-        If the folder holds no photos.
-    """
+    """List the photos of a folder by name, or the given photo."""
     if path.is_dir():
         found = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
         if not found:

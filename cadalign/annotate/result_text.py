@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.next_best import NextBest, unknown_name
+from cadalign.annotate.suggestion import NextBest
 from cadalign.fitting.result import FitResult
 
+UNKNOWNS = (
+    *["the rotation"] * 3,
+    *("the position sideways", "the height", "the distance"),
+    *("the stretch along y", "the stretch along z", "the focal length"),
+)
+"""Names of the unknowns of a covariance, for a sentence."""
 _ROTATIONS = 3
 _UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
 _UNDETERMINED = "not determined", "these pairs leave it open"
@@ -60,7 +66,7 @@ def next_best_text(next_best: NextBest, name: str) -> str:
     """Name of the next-best keypoint, and the uncertainty that it would leave."""
     factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
     before, after = (_short(factor * std) + unit for std in (next_best.before, next_best.after))
-    unknown = unknown_name(next_best.unknown)
+    unknown = UNKNOWNS[next_best.unknown]
     return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
 
 

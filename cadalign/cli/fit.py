@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags
+from cadalign.cli.options import OptionError, named_as_flags, sigma_of
 from cadalign.cli.output import make_folder, new_console
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
@@ -79,7 +79,9 @@ class Fit:
         observation = Observation.load(self.observation)
         console = new_console()
         focal = self.focal or ("known" if observation.camera.focal_known else "estimate")
-        prior = self._focal_prior(observation) if focal == "estimate" else None
+        prior = None
+        if focal == "estimate" and self.exif and observation.image is not None:
+            prior = FocalPrior.from_exif(observation.image)
         if prior is not None:
             share = 100 * prior.relative_sigma
             text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
@@ -120,11 +122,4 @@ class Fit:
                     fix="give one of the two options",
                 )
             return None
-        if self.sigma is not None:
-            return self.sigma
-        return FitOptions.sigma if observation.sigma is None else observation.sigma
-
-    def _focal_prior(self, observation: Observation) -> FocalPrior | None:
-        if not self.exif or observation.image is None:
-            return None
-        return FocalPrior.from_exif(observation.image)
+        return sigma_of(self.sigma, observation)

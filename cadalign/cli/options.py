@@ -12,6 +12,9 @@ from cadalign.errors import CadalignError, InputError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from cadalign.fitting.options import Sigma
+    from cadalign.io.observation import Observation
+
 
 class OptionError(CadalignError):
     """A command line option has an invalid value.
@@ -26,12 +29,7 @@ def named_as_flags(
 ) -> Iterator[None]:
     """Let errors about fields of dataclasses of options name the command line's options.
 
-    Parameters
-    ----------
-    *options : dataclass
-        Their fields are names of options.
-    kind : type of error
-        `OptionError` while the command line is parsed.
+    Their kind is `OptionError` while the command line is parsed.
     """
     try:
         yield
@@ -41,3 +39,10 @@ def named_as_flags(
             raise
         flag = "--" + str(error.where).replace("_", "-")
         raise kind(error.what, where=flag, fix=error.fix) from None
+
+
+def sigma_of(given: float | None, observation: Observation) -> Sigma:
+    """Standard deviation of the keypoints: the given one, the file's, or 1."""
+    if given is not None:
+        return given
+    return 1.0 if observation.sigma is None else observation.sigma

@@ -32,21 +32,10 @@ _MARGIN = 0.15  # around keypoints and boxes, as a share of their extent
 
 
 def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
-    """Rank matches by keypoints and silhouettes together.
+    """Rank the best matches by keypoints and silhouettes together.
 
-    Parameters
-    ----------
-    matches : sequence of Match
-        The best matches by their keypoints.
-    mask : (h, w) bool
-        The object's pixels, as `cadalign.render.silhouette_iou` takes them.
-    camera : Camera
-
-    Returns
-    -------
-    list of Match
-        With ``silhouette_iou``, and ``score`` redistributed among them. The likelihood remains that
-        of the keypoints.
+    They get their ``silhouette_iou``, and ``score`` is redistributed among them. The likelihood
+    remains that of the keypoints.
     """
     overlaps = [_overlap(match, mask, camera) for match in matches]
     known = [overlap for overlap in overlaps if overlap is not None]
@@ -74,28 +63,19 @@ def mask_of(
     """Choose the object's pixels: the given mask, the image's opacity, or a segmentation.
 
     The segmentation (OpenCV's GrabCut) starts from the box around the keypoints and the best match.
-
-    Parameters
-    ----------
-    mask : (h, w) bool, optional
-        For numbers, values above half of the largest possible one count.
-    image : (h, w, 3) or (h, w, 4) uint8, optional
-    matches : sequence of Match
-    camera : Camera
-
-    Returns
-    -------
-    (h, w) bool or uint8
-
-    Raises
-    ------
-    InputError
-        If both or neither are given, or one has the wrong type or size, or no pixel of the object.
+    The parameters are those of `cadalign.Library.retrieve`.
     """
     if (mask is None) == (image is None):
         raise InputError("give a mask or an image, not both", where="mask")
     where = "image" if mask is None else "mask"
-    found = np.asarray(mask) if mask is not None else _object_in(np.asarray(image), matches, camera)
+    found = np.asarray(image if mask is None else mask)
+    if mask is None:
+        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[2] not in (3, 4):
+            raise InputError(
+                f"{found.dtype} of shape {found.shape}, expected an RGB or RGBA image of uint8",
+                where="image",
+            )
+        found = found[:, :, 3] if found.shape[2] == 4 else _segment(found, matches, camera)
     if found.shape != (camera.height, camera.width):
         raise InputError(
             f"shape {found.shape}, but the camera's image is {camera.height} high and "
@@ -105,20 +85,6 @@ def mask_of(
     if np.isnan(silhouette_iou(est=found, gt=found)):
         raise InputError("contains no pixel of the object", where=where)
     return found
-
-
-def _object_in(
-    pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera
-) -> npt.NDArray[Any]:
-    """Take an image's opacity, or segment the image."""
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise InputError(
-            f"{pixels.dtype} of shape {pixels.shape}, expected an RGB or RGBA image of uint8",
-            where="image",
-        )
-    if pixels.shape[2] == 4:
-        return np.asarray(pixels[:, :, 3])
-    return _segment(pixels, matches, camera)
 
 
 def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:

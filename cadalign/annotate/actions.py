@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -158,7 +158,8 @@ class Focal(Action):
                     where="pixels",
                     fix=f"give {low:.0f} to {high:.0f} px",
                 )
-        state.history.record(state.document.choose_focal(FocalChoice(self.known, self.pixels)))
+        focal = FocalChoice(self.known, self.pixels)
+        state.history.record(replace(state.document, focal=focal))
         return Outcome()
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.intrinsics import Intrinsics
 from cadalign.annotate.outliers import Rows, find_outliers
+from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit

@@ -1,15 +1,16 @@
 """Annotation document of one photo: pairs of a photo point and a keypoint of the model.
 
-Documents are immutable; every edit makes a new one, which undo keeps.
+Documents are immutable; every edit makes a new one, which the history keeps for undo and redo.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from cadalign.errors import InputError
 
 Pixel = tuple[float, float]
+_LONGEST = 1000  # of a history
 
 
 @dataclass(frozen=True)
@@ -38,19 +39,10 @@ class FocalChoice:
 
 @dataclass(frozen=True)
 class Document:
-    """All annotations of one photo; ``next_number`` is the number of the next pair.
-
-    Examples
-    --------
-    >>> empty = Document(focal=FocalChoice(known=True))
-    >>> placed, pair = empty.place_uv((3.0, 4.0))
-    >>> placed, pair = placed.place_keypoint(7, pair)
-    >>> placed.complete_pairs
-    (Pair(number=1, uv=(3.0, 4.0), keypoint=7, sigma=None, confidence=None),)
-    """
+    """All annotations of one photo; ``next_number`` is the number of the next pair."""
 
     pairs: tuple[Pair, ...] = ()
-    focal: FocalChoice = field(default_factory=lambda: FocalChoice(known=False))
+    focal: FocalChoice = FocalChoice(known=False)
     next_number: int = 1
 
     @property
@@ -110,11 +102,8 @@ class Document:
         gone = self.pair(number)
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
 
-    def choose_focal(self, focal: FocalChoice) -> Document:
-        """Choose a known or an estimated focal length."""
-        return replace(self, focal=focal)
-
     def _lacking(self, half: str, preferred: int | None) -> Pair:
+        """The preferred pair if it lacks this half, otherwise the first that does, or a new one."""
         lacking = [pair for pair in self.pairs if getattr(pair, half) is None]
         wanted = [pair for pair in lacking if pair.number == preferred]
         return (wanted + lacking + [Pair(self.next_number)])[0]
@@ -124,3 +113,52 @@ class Document:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
         return replace(self, pairs=pairs)
+
+
+class History:
+    """The current document, those before it, and those that were undone."""
+
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self._before: list[Document] = []
+        self._after: list[Document] = []
+        self._step: object = None
+
+    @property
+    def can_undo(self) -> bool:
+        """True if there is a change to undo."""
+        return bool(self._before)
+
+    @property
+    def can_redo(self) -> bool:
+        """True if there is a change to redo."""
+        return bool(self._after)
+
+    def record(self, document: Document, *, step: object = None) -> None:
+        """Go on to another document.
+
+        Consecutive changes with the same ``step`` are undone together, such as the positions of a
+        point while it is dragged.
+        """
+        if step is None or step != self._step or not self._before:
+            self._before.append(self.document)
+            del self._before[:-_LONGEST]
+        self._after.clear()
+        self.document = document
+        self._step = step
+
+    def undo(self) -> bool:
+        """Go back by one change; returns False if there is none."""
+        return self._go(self._before, self._after)
+
+    def redo(self) -> bool:
+        """Redo the last undone change; returns False if there is none."""
+        return self._go(self._after, self._before)
+
+    def _go(self, source: list[Document], target: list[Document]) -> bool:
+        self._step = None
+        if not source:
+            return False
+        target.append(self.document)
+        self.document = source.pop()
+        return True

@@ -76,19 +76,17 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(
-        self, empty: Document, registry: KeypointRegistry, diagonal: float
-    ) -> tuple[Document, Camera | None]:
-        """Read an earlier session's annotation into the ``empty`` document.
+    def read(self, registry: KeypointRegistry, diagonal: float) -> tuple[Document, Camera | None]:
+        """Read an earlier session's annotation.
 
         New model points are added to the registry; ``diagonal`` is that of the model's box. The
         second value is the observation's camera, if the file exists.
         """
-        document, camera = empty, None
+        document, camera = Document(), None
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
-            document = _with_pairs(document, observation, registry, diagonal)
+            document = _document_of(observation, registry, diagonal)
         if self.unfinished.exists():
             document = _with_halves(document, self.unfinished, registry)
         return document, camera
@@ -179,9 +177,8 @@ def write_keypoints(
     ModelKeypoints(kept, model).save(path)
 
 
-def _with_pairs(
-    document: Document, observation: Observation, registry: KeypointRegistry, diagonal: float
-) -> Document:
+def _document_of(observation: Observation, registry: KeypointRegistry, diagonal: float) -> Document:
+    document = Document()
     ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)

@@ -89,10 +89,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        if scope["type"] == "lifespan":
-            await self._app(scope, receive, send)
-            return
-        if scope["type"] != "http":  # web sockets are not used
+        if scope["type"] != "http":  # web sockets and lifespan events are not used
             return
         refused = self._access.refusal(scope)
         if refused is None:

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
-from cadalign.annotate.document import Document, FocalChoice
-from cadalign.annotate.files import (
-    SAME_PLACE,
-    AnnotationFiles,
-    keypoints_file,
-    refuse_other_model,
-)
-from cadalign.annotate.history import History
-from cadalign.annotate.intrinsics import intrinsics_of, read_camera
+from cadalign.annotate.document import FocalChoice, History
+from cadalign.annotate.files import SAME_PLACE, AnnotationFiles, keypoints_file, refuse_other_model
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.photos import Photo, find_photos, intrinsics_of, read_camera
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
@@ -77,7 +71,7 @@ def _open_photo_state(
     diagonal: float,
 ) -> PhotoState:
     files = AnnotationFiles(file, photo.path, model)
-    document, own = files.read(Document(), registry, diagonal)
+    document, own = files.read(registry, diagonal)
     if own is not None and not own.focal_known:
         # The file leaves it to be estimated; the given camera's is kept for the user to choose.
         intrinsics = intrinsics_of(photo, camera or own)
@@ -85,7 +79,7 @@ def _open_photo_state(
     else:
         intrinsics = intrinsics_of(photo, own or camera)
         known = intrinsics.calibrated
-    document = document.choose_focal(FocalChoice(known=known))
+    document = replace(document, focal=FocalChoice(known=known))
     return PhotoState(photo, files, intrinsics, History(document))
 
 

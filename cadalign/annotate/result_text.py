@@ -28,7 +28,7 @@ class Fact:
 
     label: str
     value: str
-    note: str = ""
+    note: str
 
 
 def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
@@ -38,7 +38,7 @@ def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
         return ()
     facts = [_stretch(result, axis) for axis in result.stretched_axes]
     if result.std is not None:
-        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°"))
+        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°", ""))
     facts += [_distance(result), _focal(result)]
     if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
         note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
@@ -92,7 +92,7 @@ def _distance(result: FitResult) -> Fact:
     translation = result.alignment.translation
     distance = float(np.linalg.norm(translation))
     if result.covariance is None or not distance > 0:
-        return Fact("Distance", f"{distance:.3g} model units")
+        return Fact("Distance", f"{distance:.3g} model units", "")
     along = translation / distance
     std = math.sqrt(max(float(along @ result.covariance[3:6, 3:6] @ along), 0.0))
     return Fact("Distance", f"{distance:.3g} ± {_short(std)}", "model units")

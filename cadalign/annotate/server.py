@@ -14,8 +14,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from cadalign.annotate.display import display_bytes
 from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.model import display_bytes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError

@@ -13,13 +13,11 @@ import numpy as np
 
 from cadalign.annotate.actions import ACTIONS, Outcome
 from cadalign.annotate.alignment import LiveAlignment, align
-from cadalign.annotate.document import Document, FocalChoice
+from cadalign.annotate.document import Document, FocalChoice, History
 from cadalign.annotate.files import AnnotationFiles, filled, write_keypoints
-from cadalign.annotate.history import History
-from cadalign.annotate.intrinsics import Intrinsics
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.photos import Photo
+from cadalign.annotate.photos import Intrinsics, Photo
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags, sigma_of
+from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
@@ -43,7 +43,7 @@ class _RansacOptions(RansacOptions):
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(ObservationCommand):
     """Align a model to one image's keypoints and draw the result.
 
     Prints the alignment; writes fit.json and overlay.png.
@@ -53,10 +53,6 @@ class Fit:
     """JSON file with camera and keypoints, optionally image and model."""
     out: Path | None = None
     """Folder to write to; by default <observation>_fit beside the file."""
-    json: bool = False
-    """Print the result as JSON."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object."""
     robust: bool = False
@@ -122,4 +118,4 @@ class Fit:
                     fix="give one of the two options",
                 )
             return None
-        return sigma_of(self.sigma, observation)
+        return self.sigma_of(observation)

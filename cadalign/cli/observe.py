@@ -93,9 +93,7 @@ class Observe:
             sizes[found.source] = found.size
         if not sizes:
             raise DataError(
-                "the photo's size is unknown",
-                where=found.source,
-                fix="give --image or --camera",
+                "the photo's size is unknown", where=found.source, fix="give --image or --camera"
             )
         (first, size), *others = sizes.items()
         for name, other in others:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 from cadalign.errors import CadalignError, InputError
@@ -41,8 +41,17 @@ def named_as_flags(
         raise kind(error.what, where=flag, fix=error.fix) from None
 
 
-def sigma_of(given: float | None, observation: Observation) -> Sigma:
-    """Standard deviation of the keypoints: the given one, the file's, or 1."""
-    if given is not None:
-        return given
-    return 1.0 if observation.sigma is None else observation.sigma
+@dataclass(frozen=True, kw_only=True)
+class ObservationCommand:
+    """Options of the commands on an observation file."""
+
+    json: bool = False
+    """Print the result as JSON."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+
+    def sigma_of(self, observation: Observation) -> Sigma:
+        """Standard deviation of the keypoints: the given one, the file's, or 1."""
+        if self.sigma is not None:
+            return self.sigma
+        return 1.0 if observation.sigma is None else observation.sigma

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags, sigma_of
+from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
@@ -32,7 +32,7 @@ class _RetrievalOptions(RetrievalOptions):
 
 
 @dataclass(frozen=True)
-class Retrieve:
+class Retrieve(ObservationCommand):
     """Find the models of a library that explain an image's keypoints best.
 
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
@@ -46,10 +46,6 @@ class Retrieve:
     """File that `cadalign library build` wrote."""
     out: Path | None = None
     """Folder to write to."""
-    json: bool = False
-    """Print the matches as JSON."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     robust: bool = False
     """Not available here: use --loss cauchy against outliers."""
     mask: Path | None = None
@@ -90,7 +86,7 @@ class Retrieve:
                 query.points_2d,
                 query.semantic_ids,
                 camera,
-                **vars(replace(self.ranking, sigma=sigma_of(self.sigma, query))),
+                **vars(replace(self.ranking, sigma=self.sigma_of(query))),
                 mask=mask,
                 image=image,
                 workers=self.workers,

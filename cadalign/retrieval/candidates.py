@@ -31,10 +31,7 @@ class Observed:
 
 
 def observe(
-    points_2d: npt.ArrayLike,
-    semantic_ids: npt.ArrayLike,
-    camera: Camera,
-    options: RetrievalOptions,
+    points_2d: npt.ArrayLike, semantic_ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
 ) -> Observed:
     """Check an image's keypoints and prepare them for the kernels."""
     if not isinstance(camera, Camera):
@@ -90,10 +87,7 @@ class CandidateSet:
 
 
 def gather_candidates(
-    table: ModelTable,
-    observed: Observed,
-    options: RetrievalOptions,
-    exclude: Collection[ModelKey],
+    table: ModelTable, observed: Observed, options: RetrievalOptions, exclude: Collection[ModelKey]
 ) -> CandidateSet:
     """Gather the candidates of a query, without the models to ``exclude``."""
     chosen = _chosen_models(table, options.category, exclude)
@@ -168,21 +162,17 @@ def _candidates(
 ) -> tuple[IntArray, Candidates, IntArray]:
     """List the candidates: models (c,), keypoints, and numbers of labelings of each model (c,)."""
     first, last = table.offsets[chosen], table.offsets[chosen + 1]
-    spans = np.stack([first, last, first], axis=1)
-    rows = table.places
-    if not symmetries:
-        candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
-        return chosen, candidates, np.ones(len(chosen), dtype=np.int64)
-    counts = last - first
-    start = len(table.xyz)
-    extra = (table.labeling_offsets[chosen + 1] - table.labeling_offsets[chosen]) // counts
-    models = np.repeat(chosen, 1 + extra)
-    number = np.arange(len(models)) - np.repeat(np.cumsum(1 + extra) - (1 + extra), 1 + extra)
-    spans = np.repeat(spans, 1 + extra, axis=0)
-    own = start + table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
-    spans[:, 2] = np.where(number > 0, own, spans[:, 0])
-    candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
-    return models, candidates, np.repeat(1 + extra, 1 + extra)
+    labelings = np.ones_like(chosen)
+    if symmetries:
+        starts, ends = table.labeling_offsets[chosen], table.labeling_offsets[chosen + 1]
+        labelings += (ends - starts) // (last - first)
+    models = np.repeat(chosen, labelings)
+    number = np.arange(len(models)) - np.repeat(np.cumsum(labelings) - labelings, labelings)
+    spans = np.repeat(np.stack([first, last, first], axis=1), labelings, axis=0)
+    mirrored = table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
+    spans[:, 2] = np.where(number > 0, len(table.xyz) + mirrored, spans[:, 0])
+    candidates = Candidates(table.xyz, table.semantic_ids, table.places, spans)
+    return models, candidates, np.repeat(labelings, labelings)
 
 
 def _ranges(ids: IntArray) -> str:

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import write_json, write_text, writing
 from cadalign.io.images import write_image
-from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
+from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
 from cadalign.retrieval.match import Match
+from cadalign.retrieval.silhouettes import cast_match
 from cadalign.web import asset, fill
 
 
@@ -71,21 +71,10 @@ def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
         image,
         camera,
         est_box=match.box,
-        est_frame=_cast(camera, match),
+        est_frame=cast_match(match, camera),  # without a mesh, keypoints and box are drawn
         observed=match.points_2d,
         reprojected=match.points_2d + match.residuals,
     )
-
-
-def _cast(camera: Camera, match: Match) -> Geometry | None:
-    from cadalign.datasets import load_mesh
-
-    if match.mesh_path is None:
-        return None
-    try:
-        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
-    except CadalignError:  # keypoints and box are drawn without the mesh
-        return None
 
 
 def _card(rank: int, match: Match) -> str:

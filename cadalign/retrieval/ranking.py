@@ -209,11 +209,7 @@ def shared_keypoints(
 
 
 def make_matches(
-    table: ModelTable,
-    candidates: CandidateSet,
-    observed: Observed,
-    ranking: Ranking,
-    top: int,
+    table: ModelTable, candidates: CandidateSet, observed: Observed, ranking: Ranking, top: int
 ) -> list[Match]:
     """Make matches of the first models of a ranking."""
     matches = []

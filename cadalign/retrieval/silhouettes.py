@@ -21,7 +21,7 @@ from cadalign.arrays import BoolArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.render import Scene, cast_geometry, silhouette_iou
+from cadalign.render import Geometry, Scene, cast_geometry, silhouette_iou
 from cadalign.retrieval.match import Match
 
 logger = logging.getLogger("cadalign")
@@ -37,7 +37,8 @@ def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> lis
     They get their ``silhouette_iou``, and ``score`` is redistributed among them. The likelihood
     remains that of the keypoints.
     """
-    overlaps = [_overlap(match, mask, camera) for match in matches]
+    casts = (cast_match(match, camera) for match in matches)
+    overlaps = [None if cast is None else silhouette_iou(est=cast.mask, gt=mask) for cast in casts]
     known = [overlap for overlap in overlaps if overlap is not None]
     if not known:
         logger.warning("none of the matches has a mesh: the mask is not used")
@@ -87,16 +88,15 @@ def mask_of(
     return found
 
 
-def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:
-    """Intersection over union of a match's silhouette; None without a mesh."""
+def cast_match(match: Match, camera: Camera) -> Geometry | None:
+    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
     if match.mesh_path is None:
         return None
     try:
-        scene = Scene(load_mesh(match.mesh_path))
+        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
     except CadalignError as error:
         logger.warning("no silhouette: %s", error)
         return None
-    return silhouette_iou(est=cast_geometry(scene, camera, match.alignment).mask, gt=mask)
 
 
 def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:

@@ -110,8 +110,17 @@ def _row(header: list[str], line: list[str], where: str) -> _Row | None:
     if not cells["u"] and not cells["v"]:
         return None
     with in_file(where):
-        row: _Row = convert(cells, _Row, strict=False)
+        row: _Row = convert({name: _value(name, cell) for name, cell in cells.items()}, _Row)
     return row
+
+
+def _value(name: str, cell: str) -> str | float:
+    """A cell as a number in the columns that hold numbers, where it is a finite one."""
+    try:
+        number = np.nan if name in ("image", "name") else float(cell)
+    except ValueError:
+        return cell
+    return number if np.isfinite(number) else cell
 
 
 def _object(path: Path, image: str | None, rows: list[_Row]) -> ImageKeypoints:

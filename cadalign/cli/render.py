@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.output import make_folder, new_console, progress_over
+from cadalign.cli.output import make_folder, new_console
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from rich.progress import track
+
         from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
@@ -72,9 +74,8 @@ class Render:
         make_folder(self.out.absolute().parent)
         if job.is_movie:
             frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
-            job.write_movie(
-                progress_over(frames, total=count, label="drawing", console=console), fps=self.fps
-            )
+            shown = track(frames, "drawing", total=count, console=console, transient=True)
+            job.write_movie(shown, fps=self.fps)
         else:
             job.write_picture(draw_picture(job))
         console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)

@@ -123,18 +123,10 @@ def run(
     ----------
     options : ExperimentOptions
         Of the experiment to run.
-    folder : RunFolder
     workers, dask
         See `evaluate`.
     on_progress : callable
         Told of every chunk.
-
-    Raises
-    ------
-    InputError
-        If an option does not fit the data.
-    DataError
-        If there are no data, or the folder holds another run.
     """
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask=dask)

@@ -67,7 +67,6 @@ def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> d
 
     Parameters
     ----------
-    est, gt : Alignment
     length : float
         Unit of the translation error [model units]: the diagonal of the model's bounding box,
         for example.

@@ -33,7 +33,6 @@ class Trace:
     ----------
     run : int
         Place of the run among those that are compared.
-    method : str
     x, y : list of float
         None where there is no value.
     low, high : list of float, optional
@@ -72,11 +71,8 @@ class Plot:
 
     Parameters
     ----------
-    id : str
     x, y : Metric
         The axes.
-    traces : list of Trace
-    note : str
     caption : str
         Quantities that are held, and the number of problems; for the figure.
     figure : str

@@ -42,13 +42,7 @@ def known_options() -> Iterator[type[ExperimentOptions]]:
 
 
 def spec_named(name: str, *, where: str = "experiment") -> Spec:
-    """The specification of an experiment.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """The specification of an experiment."""
     if name in _REGISTERED:
         return _REGISTERED[name]
     for folder in _FOLDERS:
@@ -62,13 +56,7 @@ def spec_named(name: str, *, where: str = "experiment") -> Spec:
 
 
 def spec_of(run: Run) -> Spec:
-    """The specification of a run's experiment.
-
-    Raises
-    ------
-    DataError
-        If it is unknown.
-    """
+    """The specification of a run's experiment."""
     return spec_of_config(run.config, run.folder.path)
 
 

@@ -119,13 +119,7 @@ class Spec:
         return [c for c in self.columns if any(line.number(c.key) is not None for line in lines)]
 
     def write(self, run: Run) -> Summaries:
-        """Write ``summary.csv`` and ``figures`` of a finished run.
-
-        Raises
-        ------
-        DataError
-            If the files cannot be written.
-        """
+        """Write ``summary.csv`` and ``figures`` of a finished run."""
         summaries = self.summarize(run)
         write_text(
             run.folder.summary, summary_csv(summaries, rename={"value": self.group(run).key})

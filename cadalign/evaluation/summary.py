@@ -82,12 +82,10 @@ class ConsoleTable:
 
     Parameters
     ----------
-    title : str
     labels : tuple of str
         Heads of the columns of texts, which come first.
     heads : tuple of str
         Heads of the columns of numbers.
-    rows : list of tuple of str
     note : str
         Text beneath.
     narrow : bool
@@ -184,7 +182,6 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
 
     Parameters
     ----------
-    run : Run
     columns : sequence of Metric
         Of which those are taken that are columns of the run's results.
     group : Metric

@@ -28,7 +28,6 @@ class HeadlineRow:
         Place of the run.
     category : str
         The group: a category, or the value that was varied.
-    method : str
     cells : dict of str to float
         By column, as displayed; None where there is none.
     best : tuple of str
@@ -67,12 +66,8 @@ class Headline:
     ----------
     group : str
         Name of the groups, which is the head of their column.
-    columns : tuple of Metric
-    rows : list of HeadlineRow
-    failures : list of Failure
     paper : list of HeadlineRow
         Published numbers on the same groups.
-    note : str
     """
 
     group: str

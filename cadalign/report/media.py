@@ -58,13 +58,7 @@ class AssetStore:
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
-        """Take in the pictures and records of runs, and enter their keys in the table.
-
-        Raises
-        ------
-        DataError
-            If a file cannot be read or written.
-        """
+        """Take in the pictures and records of runs, and enter their keys in the table."""
         if self.assets is not None:
             with writing(self.assets):
                 self.assets.mkdir(parents=True, exist_ok=True)
@@ -88,13 +82,7 @@ class AssetStore:
                 self.records[str(place)] = f"{dense_json(keys)[:-1]},{row['exhibit'][1:]}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The page's part of it; writes the files that are beside the page.
-
-        Raises
-        ------
-        DataError
-            If a file cannot be written.
-        """
+        """The page's part of it; writes the files that are beside the page."""
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
             exhibits = {key: json.loads(text) for key, text in self.records.items()}

@@ -60,17 +60,6 @@ def write_report(
     title : str, optional
         By default it says what was run on what.
 
-    Returns
-    -------
-    Report
-
-    Raises
-    ------
-    InputError
-        If there are no runs, one is given twice, or they are of different kinds.
-    DataError
-        If a folder is not a run's, nothing of a run is finished, or the page cannot be written.
-
     Examples
     --------
     >>> write_report(["runs/keypointnet"], "report.html").assets  # doctest: +SKIP

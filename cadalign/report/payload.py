@@ -75,13 +75,11 @@ def payload_of(
     ----------
     runs : sequence of Run
         Of one kind.
-    headline : Headline
     table : InstanceTable, optional
         For runs that have instances.
     media : dict
         Pictures, thumbs, instance records and mesh previews; see
         `cadalign.report.media.AssetStore`.
-    title : str
     """
     spec = spec_of(runs[0])
     return {

@@ -51,18 +51,6 @@ def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str = "md")
         Best values are bold but in CSV, whose numbers are not rounded. LaTeX needs the packages
         booktabs and textcomp.
 
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        If there are no runs, one is given twice, they are of different kinds, or the format is
-        unknown.
-    DataError
-        If a folder is not a run's, or nothing of a run is finished.
-
     Examples
     --------
     >>> print(headline_text(["runs/keypointnet"], format="latex"))  # doctest: +SKIP

@@ -39,7 +39,6 @@ def cramer_rao_bound(
     ----------
     points_3d : (n, 3) float
         Model points.
-    camera : Camera
     gt : Alignment
         The truth, with the scale 1 along x.
     sigma : float, (n,) float or (n, 2, 2) float
@@ -52,11 +51,6 @@ def cramer_rao_bound(
     (8, 8) or (9, 9) float
         Rotation vector in the camera frame [rad], translation [model units], log s_y and log s_z,
         and, where it is estimated, the logarithm of the focal length.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
     """
     in_camera = gt.apply(points_3d)
     rays = perspective(in_camera)
@@ -126,11 +120,6 @@ def limit_estimate(
     -------
     Alignment
         exp(w) R, t + dt, s exp(ds): the truth, changed by the step.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
     """
     jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS) / sigma
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel() / sigma

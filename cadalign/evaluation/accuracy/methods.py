@@ -47,13 +47,7 @@ def has_statistics(name: str) -> bool:
 
 
 def check_methods(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, if all are known.
-
-    Raises
-    ------
-    InputError
-        If there are none, or one is unknown; the message names the known ones.
-    """
+    """Return the names, each once, if all are known."""
     unique = tuple(dict.fromkeys(names))
     known = method_names()
     for name in unique:

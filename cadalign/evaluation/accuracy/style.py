@@ -117,13 +117,7 @@ def label_log_axis(axes: Axes) -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:
-    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    """
+    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files."""
     files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
     for file in files:
         # Without its date a PDF is the same in every run.

@@ -152,7 +152,6 @@ def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -
 
     Parameters
     ----------
-    seen : Correspondences
     outliers : float
         Share of the points that are moved, rounded to a whole number of them.
     rng : numpy.random.Generator
@@ -163,11 +162,6 @@ def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -
     Problem
         The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
         alignment has the scene's true pose and the scale (1, s_y, s_z).
-
-    Raises
-    ------
-    DataError
-        If the lens model is not valid in nearly the whole image.
     """
     scale = np.array([1.0, *rng.uniform(*_STRETCH, 2)])
     pose = seen.cam_from_world

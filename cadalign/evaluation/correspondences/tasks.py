@@ -48,18 +48,7 @@ class CorrespondenceTask:
 
 
 class CorrespondenceTasks(Sequence[CorrespondenceTask]):
-    """All draws, image by image and share by share, made when asked for.
-
-    Parameters
-    ----------
-    images : CorrespondenceSet
-    options : CorrespondenceOptions
-
-    Raises
-    ------
-    DataError
-        If no image can be read.
-    """
+    """All draws, image by image and share by share, made when asked for."""
 
     def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
         self._images = images

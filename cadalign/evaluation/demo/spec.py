@@ -31,11 +31,6 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan one view of the first models with a mesh of every category.
 
     Another demonstration in the folder is replaced, one that was interrupted goes on.
-
-    Raises
-    ------
-    DataError
-        If no model has a mesh.
     """
     root = options.root
     if root is None:

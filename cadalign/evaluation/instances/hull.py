@@ -85,18 +85,12 @@ def sample_hull_view(
     hull : KeypointHull
     camera : Camera
         Without lens distortion.
-    rng : numpy.random.Generator
     min_visible : int
 
     Returns
     -------
     cam_from_model : Alignment
     visible : (k,) bool
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints; it says how many the best one showed.
     """
     count = len(hull.xyz)
     best = 0

@@ -39,7 +39,6 @@ class Instance:
 
     Parameters
     ----------
-    camera : Camera
     cam_from_model : Alignment
         The pose of the model as the image shows it.
     points_3d : (n, 3) float
@@ -78,13 +77,7 @@ class Instance:
 
 
 def load_scene(model: AnnotatedModel) -> Scene:
-    """Read a model's mesh for `make_instance`.
-
-    Raises
-    ------
-    DataError
-        If the mesh is missing, damaged or flat.
-    """
+    """Read a model's mesh for `make_instance`."""
     from cadalign.datasets import check_solid
     from cadalign.render import Scene
 
@@ -109,8 +102,6 @@ def make_instance(
 
     Parameters
     ----------
-    model : AnnotatedModel
-    camera : Camera
     noise_px : float
         Standard deviation of the Gaussian noise on each image coordinate [px].
     min_visible : int
@@ -118,17 +109,6 @@ def make_instance(
     seed, view_index : int
     scene : Scene, optional
         The model's, as `load_scene` gives it, where it has been loaded.
-
-    Returns
-    -------
-    Instance
-
-    Raises
-    ------
-    DataError
-        If the mesh is missing, damaged or flat.
-    RenderError
-        If no view shows enough keypoints.
     """
     from cadalign.render import sample_view
 
@@ -173,11 +153,6 @@ def make_hull_instance(
         Category and model id.
     noise_px, min_visible, seed, view_index
         As for `make_instance`.
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints.
     """
     rng = instance_rng(seed, *names, str(view_index))
     pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)

@@ -65,7 +65,6 @@ def preview_of(
 
     Parameters
     ----------
-    mesh : Mesh
     max_faces, max_edges : int
         Largest numbers of triangles and lines.
 
@@ -88,13 +87,7 @@ def preview_of(
 
 
 def write_preview(path: Path, mesh: Mesh) -> None:
-    """Write a preview of a mesh as JSON.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    """
+    """Write a preview of a mesh as JSON."""
     write_text(path, dense_json(preview_of(mesh).to_dict()))
 
 

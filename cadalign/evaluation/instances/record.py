@@ -69,7 +69,6 @@ def record_row(
 
     Parameters
     ----------
-    instance : Instance
     outcomes : sequence of Outcome
         One for each method.
     estimates : sequence of FitResult, Alignment or CadalignError

@@ -79,14 +79,6 @@ class SymmetryGroup:
         The best angle about an axis a follows in closed form: with N = G' R_gt' R_est the trace
         of Rot(a, angle)' N is A cos(angle) + B sin(angle) + a'N a, where A = tr N - a'N a and
         B = a . (N_32 - N_23, N_13 - N_31, N_21 - N_12).
-
-        Parameters
-        ----------
-        est, gt : Alignment
-
-        Returns
-        -------
-        Alignment
         """
         if self.is_trivial:
             return gt

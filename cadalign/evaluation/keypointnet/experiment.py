@@ -230,13 +230,7 @@ class _InstanceMaker:
         self._scene: Scene | None = None
 
     def instance(self, task: KeypointTask) -> Instance:
-        """The instance of a task.
-
-        Raises
-        ------
-        CadalignError
-            If there is none.
-        """
+        """The instance of a task."""
         if task.problem:
             raise DataError(task.problem)
         names = task.category, task.model_id

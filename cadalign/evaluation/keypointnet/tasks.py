@@ -29,12 +29,10 @@ class KeypointTask:
 
     Parameters
     ----------
-    category, model_id : str
     view : int
     xyz : (k, 3) float
         Keypoints.
     semantic_ids : (k,) int
-    symmetry : SymmetryGroup
     model : AnnotatedModel, optional
         The model with its mesh; None where it is evaluated on its keypoints alone.
     problem : str
@@ -92,11 +90,6 @@ class KeypointTasks(Sequence[KeypointTask]):
     visibility : {"auto", "rays", "hull"}
     max_models : int, optional
         Largest number of models of each category.
-
-    Raises
-    ------
-    DataError
-        If there are no models.
     """
 
     def __init__(

@@ -50,7 +50,6 @@ def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda
 
     Parameters
     ----------
-    plan : PaperPlan
     announce : callable
         Told the name of the next run; returns the function to tell its progress to.
 

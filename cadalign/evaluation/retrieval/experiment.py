@@ -85,7 +85,6 @@ class RetrievalExperiment:
     ----------
     library : str
         The library's file, which all workers map into memory.
-    options : RetrievalRunOptions
     """
 
     columns: ClassVar[Columns] = COLUMNS
@@ -183,7 +182,6 @@ def match_values(
 
     Parameters
     ----------
-    matches : sequence of Match
     best : LibraryModel
         The model of the first match.
     gt : LibraryModel

@@ -37,13 +37,7 @@ class RetrievalTask:
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
-    """Every model with every noise and number of keypoints that it has, those of a model together.
-
-    Raises
-    ------
-    InputError
-        If a category is unknown, or no model has so many keypoints.
-    """
+    """Every model with every noise and number of keypoints that it has, model by model."""
     from cadalign.datasets.models.categories import require_category
 
     names = library.categories
@@ -76,7 +70,6 @@ class RetrievalQuery:
     points_2d : (n, 2) float
         Noisy keypoints [px].
     semantic_ids : (n,) int
-    camera : Camera
     gt : Alignment
         The model's true pose and stretch.
     """
@@ -92,11 +85,6 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
 
     Everything random follows from the seed and the task. Visibility follows from the
     keypoints alone; see `cadalign.evaluation.instances.hull`.
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints.
     """
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])

@@ -46,12 +46,7 @@ class _Inside:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run's folder.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """A run's folder."""
 
     path: Path
 
@@ -87,13 +82,7 @@ class RunFolder:
         return self.parts / f"{index:07d}.exhibits.parquet"
 
     def make(self) -> None:
-        """Make the folder.
-
-        Raises
-        ------
-        DataError
-            If that is not possible.
-        """
+        """Make the folder."""
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
 
@@ -113,13 +102,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes out; a killed process holds no lock.
-
-        Raises
-        ------
-        DataError
-            If one is at work here.
-        """
+        """Keep other processes out; a killed process holds no lock."""
         with writing(self.path), (self.path / ".lock").open("a") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -132,13 +115,7 @@ class RunFolder:
             yield
 
     def read_config(self) -> dict[str, Any] | None:
-        """Read ``run.json``; None where there is none.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read.
-        """
+        """Read ``run.json``; None where there is none."""
         try:
             found = json.loads(self.config_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -152,13 +129,7 @@ class RunFolder:
         return found
 
     def claim(self, config: dict[str, Any]) -> None:
-        """Write ``run.json``, or see that the one that is there says the same.
-
-        Raises
-        ------
-        DataError
-            If it says something else, or the folder holds something else.
-        """
+        """Write ``run.json``, or see that the one that is there says the same."""
         wanted = json.loads(json.dumps({**config, **_versions()}))
         found = self.read_config()
         if found is None:

@@ -30,7 +30,6 @@ class Run:
 
     Parameters
     ----------
-    folder : RunFolder
     name : str
         Its name beside others.
     config : dict
@@ -53,13 +52,7 @@ class Run:
 
     @classmethod
     def open(cls, path: Path, *, name: str | None = None) -> Run:
-        """Read a run.
-
-        Raises
-        ------
-        DataError
-            If the folder is not a run's, or nothing of the run is finished.
-        """
+        """Read a run."""
         folder = RunFolder(path)
         if not path.is_dir():
             raise DataError("no such folder", where=str(path), fix=_FIX)

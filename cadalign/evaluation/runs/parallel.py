@@ -42,7 +42,6 @@ class Chunk(Generic[T]):
     ----------
     index : int
         Which chunk of the run.
-    tasks : sequence
     """
 
     index: int
@@ -138,7 +137,6 @@ def evaluate_on(
     ----------
     executor : callable
         Gives an executor that works; asked again after every death.
-    experiment : Experiment
     chunks : iterable of Chunk
         Asked for only as fast as they are evaluated.
     window : int
@@ -150,11 +148,6 @@ def evaluate_on(
     ------
     chunk : Chunk
     rows : Rows
-
-    Raises
-    ------
-    CadalignError
-        If workers cannot start at all, or the run cannot go on.
     """
     _check_life(executor, experiment, deadly)
     source = iter(chunks)
@@ -246,13 +239,7 @@ def _check_life(
 
 
 def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
-    """Evaluate tasks; one that raises becomes failed rows and does not stop the others.
-
-    Raises
-    ------
-    AbortError
-        If the run cannot go on.
-    """
+    """Evaluate tasks; one that raises becomes failed rows and does not stop the others."""
     try:
         return experiment.evaluate(tasks)
     except AbortError as error:

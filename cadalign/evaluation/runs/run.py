@@ -54,19 +54,10 @@ def execute(
 
     Parameters
     ----------
-    plan : Plan
-    folder : RunFolder
     workers : Workers, optional
         By default a process for each core.
     on_progress : callable
         Told of every chunk.
-
-    Raises
-    ------
-    DataError
-        If the folder holds another run, another process works on it, or it cannot be written.
-    CadalignError
-        If workers cannot work.
     """
     folder.make()
     total = len(plan.tasks)
@@ -89,11 +80,6 @@ def workers_of(count: int, *, dask: str | None = None) -> Workers:
         Processes; -1 for one for each core, 0 for none: all in this process.
     dask : str, optional
         Address of a Dask scheduler, whose workers are used instead.
-
-    Raises
-    ------
-    InputError
-        If the number is less than -1.
     """
     if dask is not None:
         from cadalign.evaluation.runs.cluster import DaskWorkers

@@ -33,25 +33,13 @@ def schema_of(columns: Columns) -> pa.Schema:
 
 
 def write_rows(path: Path, columns: Columns, rows: Sequence[Row]) -> None:
-    """Write rows as a Parquet file, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
+    """Write rows as a Parquet file, whole or not at all."""
     table = pa.Table.from_pylist(list(rows), schema=schema_of(columns))
     write_tables(path, columns, [table])
 
 
 def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> None:
-    """Write one Parquet file of successive tables, holding few of them in memory at a time.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
+    """Write one Parquet file of successive tables, holding few of them in memory at a time."""
 
     def write(unfinished: Path) -> None:
         with pq.ParquetWriter(unfinished, schema_of(columns), compression="zstd") as writer:
@@ -62,13 +50,7 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
 
 
 def read_table(path: Path, *, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a Parquet file.
-
-    Raises
-    ------
-    DataError
-        If it is missing or damaged.
-    """
+    """Read a Parquet file."""
     try:
         # Threads would gain nothing here and cost memory for each.
         return pq.read_table(path, columns=columns, use_threads=False)

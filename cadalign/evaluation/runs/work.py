@@ -90,7 +90,6 @@ class Plan(Generic[T]):
 
     Parameters
     ----------
-    experiment : Experiment
     tasks : sequence
         In the order of the result table. Sliced, and only as far as chunks are handed out.
     config : dict

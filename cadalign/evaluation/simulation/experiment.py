@@ -81,7 +81,6 @@ class SweepExperiment:
 
     Parameters
     ----------
-    kind : SweepKind
     seed : int
     """
 

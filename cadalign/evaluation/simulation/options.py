@@ -19,7 +19,6 @@ class SweepKind:
 
     Parameters
     ----------
-    name : str
     column : str
         The column of the result table that is varied.
     values : tuple of float
@@ -28,7 +27,6 @@ class SweepKind:
     noise_px : float
         [px]
     outlier_share : float
-    methods : tuple of str
     runs : int
         Problems for each value.
     """
@@ -145,13 +143,7 @@ _CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
 
 
 def _check_values(kind: SweepKind) -> None:
-    """Check the values of a sweep.
-
-    Raises
-    ------
-    InputError
-        If one is out of range.
-    """
+    """Check the values of a sweep."""
     if not kind.values:
         raise InputError("none is given", where="values")
     settings = {column: (getattr(kind, column),) for column in _CHECKS}

@@ -24,7 +24,6 @@ class Problem:
         Model points.
     points_2d : (n, 2) float
         Their noisy observations [px].
-    camera : Camera
     alignment : Alignment
         The truth.
     outliers : (n,) bool, optional
@@ -66,10 +65,6 @@ def simulate_problem(
     outlier_share : float
         Share of the observations, rounded to a whole number of them, that are moved to anywhere in
         the image instead.
-
-    Returns
-    -------
-    Problem
 
     Examples
     --------

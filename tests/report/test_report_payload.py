@@ -424,9 +424,12 @@ def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> P
     tasks = KeypointTasks(KeypointNet(root), views=1)
     for index in (0, 2):
         result = experiment.evaluate(tasks[64 * index : 64 * index + 64])
-        write_rows(folder.part(index), experiment.columns, result.rows)
-        write_rows(folder.part_records(index), experiment.record_columns, result.records)
-        write_rows(folder.part_timings(index), experiment.timing_columns, result.timings)
+        for table, columns, rows in (
+            (folder.results, experiment.columns, result.rows),
+            (folder.records, experiment.record_columns, result.records),
+            (folder.timings, experiment.timing_columns, result.timings),
+        ):
+            write_rows(folder.part(table, index), columns, rows)
     return run
 
 
@@ -568,7 +571,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
     assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
     rows = [row["cells"] for row in found["headline"]["rows"]]
     assert [row["instances"] for row in rows] == [16, 16]
-    results = read_table(folder.part(0)).to_pylist()
+    results = read_table(folder.part(folder.results, 0)).to_pylist()
     ranks = [row["rank"] for row in results if row["protocol"] == "leave-in"]
     assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
     assert rows[0]["milliseconds"] > 0

@@ -69,17 +69,10 @@ class RunFolder:
         """True once all results are there."""
         return self.results.is_file()
 
-    def part(self, index: int) -> Path:
-        """The results of a chunk."""
-        return self.parts / f"{index:07d}.parquet"
-
-    def part_timings(self, index: int) -> Path:
-        """The timings of a chunk."""
-        return self.parts / f"{index:07d}.timings.parquet"
-
-    def part_records(self, index: int) -> Path:
-        """The instance records of a chunk."""
-        return self.parts / f"{index:07d}.exhibits.parquet"
+    def part(self, table: Path, index: int) -> Path:
+        """A chunk's rows of the results, timings or records."""
+        kind = "" if table == self.results else f".{table.stem}"
+        return self.parts / f"{index:07d}{kind}.parquet"
 
     def make(self) -> None:
         """Make the folder."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -67,7 +67,7 @@ class Run:
             timings = [folder.timings] if folder.timings.is_file() else []
             results = read_table(folder.results)
             return cls(folder, name, config, results, _joined(timings), total, total)
-        parts = _parts(folder, folder.part)
+        parts = _parts(folder, folder.results)
         if not parts:
             raise DataError(
                 "nothing of the run is finished yet",
@@ -75,9 +75,9 @@ class Run:
                 fix="wait, or start the command that made it again: it goes on",
             )
         size = int(config.get("chunk_size", 1))
-        done = sum(min(size, total - index * size) for index, _ in parts)
-        timings = [folder.part_timings(index) for index, _ in parts]
-        results = _joined([path for _, path in parts])
+        done = sum(min(size, total - index * size) for index in parts)
+        timings = [folder.part(folder.timings, index) for index in parts]
+        results = _joined([folder.part(folder.results, index) for index in parts])
         return cls(folder, name, config, results, _joined(timings), done, total)
 
     @property
@@ -148,17 +148,17 @@ class Run:
         return count
 
     def _record_files(self) -> list[Path]:
-        whole = self.folder.records
+        folder, whole = self.folder, self.folder.records
         if self.is_finished:
             return [whole] if whole.is_file() else []
-        return [path for _, path in _parts(self.folder, self.folder.part_records)]
+        return [folder.part(whole, index) for index in _parts(folder, whole)]
 
 
-def _parts(folder: RunFolder, file_of: Callable[[int], Path]) -> list[tuple[int, Path]]:
-    """The finished chunks with the files of one of their tables, in order."""
+def _parts(folder: RunFolder, table: Path) -> list[int]:
+    """The finished chunks that have a part of a table, in order."""
     names = (path.name.removesuffix(".parquet") for path in folder.parts.glob("*.parquet"))
     indices = sorted(int(name) for name in names if name.isdecimal())
-    return [(index, file_of(index)) for index in indices if file_of(index).is_file()]
+    return [index for index in indices if folder.part(table, index).is_file()]
 
 
 def _joined(paths: Sequence[Path]) -> pa.Table:

@@ -19,12 +19,7 @@ Columns = tuple[tuple[str, type], ...]
 
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 16
-_TYPES: dict[type, pa.DataType] = {
-    str: pa.string(),
-    int: pa.int64(),
-    float: pa.float64(),
-    bool: pa.bool_(),
-}
+_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
 def schema_of(columns: Columns) -> pa.Schema:
@@ -49,11 +44,11 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
     write_whole(path, write)
 
 
-def read_table(path: Path, *, columns: Sequence[str] | None = None) -> pa.Table:
+def read_table(path: Path) -> pa.Table:
     """Read a Parquet file."""
     try:
         # Threads would gain nothing here and cost memory for each.
-        return pq.read_table(path, columns=columns, use_threads=False)
+        return pq.read_table(path, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
             f"not a table that can be read ({error})",

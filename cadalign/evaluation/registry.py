@@ -41,7 +41,7 @@ def known_options() -> Iterator[type[ExperimentOptions]]:
     yield from (spec.options for spec in _REGISTERED.values())
 
 
-def spec_named(name: str, *, where: str = "experiment") -> Spec:
+def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
     if name in _REGISTERED:
         return _REGISTERED[name]
@@ -50,9 +50,8 @@ def spec_named(name: str, *, where: str = "experiment") -> Spec:
             spec: Spec = import_module(f"{__package__}.{folder}.spec").SPEC
             return spec
     names = [options.experiment for options in known_options()]
-    raise InputError(
-        f"unknown experiment {name!r}", where=where, fix=f"known are {', '.join(names)}"
-    )
+    what, fix = f"unknown experiment {name!r}", f"known are {', '.join(names)}"
+    raise InputError(what, where="experiment", fix=fix)
 
 
 def spec_of(run: Run) -> Spec:

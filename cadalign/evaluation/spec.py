@@ -23,8 +23,8 @@ Summaries = Sequence[Summary]
 class Reference:
     """Published numbers beside a headline table, and a note on them."""
 
-    lines: tuple[Summary, ...] = ()
-    note: str = ""
+    lines: tuple[Summary, ...]
+    note: str
 
 
 def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
@@ -91,7 +91,7 @@ class Spec:
     describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
     about: str = ""
     note: str = ""
-    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda runs, groups: Reference()
+    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: Reference((), "")
 
     @property
     def name(self) -> str:

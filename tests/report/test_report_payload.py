@@ -400,7 +400,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
     root = annotations(tmp_path / "data", [f"m{k:03d}" for k in range(150)])
     run = evaluate(root, tmp_path / "run", methods=("optimal", "limit"))
     whole = report(tmp_path, run)
-    unfinished = half_finished(run, KeypointNetExperiment(("optimal", "limit")), root)
+    unfinished = half_finished(run, KeypointNetOptions(root, methods=("optimal", "limit")))
     found = report(tmp_path, unfinished)
     (state,) = found["runs"]
     assert (state["state"], state["done"], state["total"]) == ("unfinished", 64 + 22, 150)
@@ -413,7 +413,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
     assert found["exhibits"]["85"] == last
 
 
-def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> Path:
+def half_finished(run: Path, options: KeypointNetOptions) -> Path:
     """Put a run back to where its second chunk of three was missing."""
     from cadalign.evaluation.runs.tables import write_rows
 
@@ -421,7 +421,8 @@ def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> P
     for path in (folder.results, folder.records, folder.timings):
         path.unlink()
     folder.parts.mkdir()
-    tasks = KeypointTasks(KeypointNet(root), views=1)
+    experiment = KeypointNetExperiment(options, drawn_in=None)
+    tasks = KeypointTasks(KeypointNet(options.root), options)
     for index in (0, 2):
         result = experiment.evaluate(tasks[64 * index : 64 * index + 64])
         for table, columns, rows in (

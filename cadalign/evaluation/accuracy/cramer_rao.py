@@ -94,8 +94,6 @@ def limit_estimate(
     points_2d: FloatArray,
     camera: Camera,
     gt: Alignment,
-    *,
-    sigma: float = 1.0,
 ) -> Alignment:
     """Estimate of an ideal estimator from these observations, to first order.
 
@@ -113,16 +111,14 @@ def limit_estimate(
         Without lens distortion.
     gt : Alignment
         The truth, with the scale 1 along x.
-    sigma : float
-        Standard deviation of the noise [px]; cancels out as long as it is the same for all.
 
     Returns
     -------
     Alignment
         exp(w) R, t + dt, s exp(ds): the truth, changed by the step.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS) / sigma
-    noise = (points_2d - camera.project(gt.apply(points_3d))).ravel() / sigma
+    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS)
+    noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
     norms = np.linalg.norm(jacobian, axis=0)
     if len(noise) < UNKNOWNS or not (norms > 0).all():
         raise DegenerateError("the points do not determine the alignment", where="points_3d")

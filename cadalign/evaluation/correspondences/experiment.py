@@ -30,7 +30,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -78,8 +78,8 @@ class CorrespondenceExperiment:
         Of which those on methods, the search for inliers and the seed are used.
     """
 
-    columns: ClassVar[Columns] = COLUMNS
-    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    columns = COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
 
     options: CorrespondenceOptions
 

@@ -13,9 +13,10 @@ from cadalign.errors import DataError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
 from cadalign.evaluation.keypointnet.summary import TABLE
-from cadalign.evaluation.keypointnet.tasks import KeypointTask
+from cadalign.evaluation.keypointnet.tasks import AUTO, KeypointTask
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -59,13 +60,11 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "models": ["/".join(key) for key in keys],
     }
     _clear(folder, config)
-    experiment = KeypointNetExperiment(
-        (METHOD,),
-        noise_px=options.noise_px,
-        seed=options.seed,
-        drawn_in=folder.made_for_pictures(),
+    views = KeypointNetOptions(
+        root, methods=(METHOD,), noise_px=options.noise_px, seed=options.seed
     )
-    tasks = [KeypointTask.of_model(dataset, *key) for key in keys]
+    experiment = KeypointNetExperiment(views, folder.made_for_pictures())
+    tasks = [KeypointTask.of_model(dataset, *key, visibility=AUTO) for key in keys]
     return Plan(experiment, tasks, config, chunk_size=1)
 
 

@@ -67,8 +67,8 @@ class Instance:
     bounds: FloatArray
     gt: Alignment
     visibility: str
-    scene: Scene | None = None
-    diagonal: float = 1.0
+    scene: Scene | None
+    diagonal: float
 
     @cached_property
     def gt_box(self) -> Box:
@@ -89,12 +89,11 @@ def load_scene(model: AnnotatedModel) -> Scene:
 def make_instance(
     model: AnnotatedModel,
     *,
-    camera: Camera = KEYPOINT_CAMERA,
-    noise_px: float = 1.0,
-    min_visible: int = 6,
-    seed: int = 0,
-    view_index: int = 0,
-    scene: Scene | None = None,
+    noise_px: float,
+    min_visible: int,
+    seed: int,
+    view_index: int,
+    scene: Scene,
 ) -> Instance:
     """Draw a view, a stretch and keypoint noise for an annotated model with a mesh.
 
@@ -106,20 +105,18 @@ def make_instance(
         Standard deviation of the Gaussian noise on each image coordinate [px].
     min_visible : int
         Least number of keypoints that a view must show.
-    seed, view_index : int
-    scene : Scene, optional
-        The model's, as `load_scene` gives it, where it has been loaded.
+    scene : Scene
+        The model's, as `load_scene` gives it.
     """
     from cadalign.render import sample_view
 
     rng = instance_rng(seed, model.category, model.model_id, str(view_index))
-    scene = scene or load_scene(model)
-    view = sample_view(scene, model.keypoints.xyz, camera, rng=rng, min_visible=min_visible)
+    xyz = model.keypoints.xyz
+    view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
     return _stretched(
-        model.keypoints.xyz,
+        xyz,
         model.keypoints.semantic_ids,
         view.visible,
-        camera=camera,
         cam_from_model=view.cam_from_model,
         bounds=scene.bounds,
         noise_px=noise_px,
@@ -134,10 +131,10 @@ def make_hull_instance(
     semantic_ids: IntArray,
     *,
     names: tuple[str, str],
-    noise_px: float = 1.0,
-    min_visible: int = 6,
-    seed: int = 0,
-    view_index: int = 0,
+    noise_px: float,
+    min_visible: int,
+    seed: int,
+    view_index: int,
 ) -> Instance:
     """Draw a view, a stretch and keypoint noise for an annotated model without a mesh.
 
@@ -160,12 +157,12 @@ def make_hull_instance(
         hull.xyz,
         semantic_ids,
         visible,
-        camera=KEYPOINT_CAMERA,
         cam_from_model=pose,
         bounds=hull.bounds,
         noise_px=noise_px,
         rng=rng,
         visibility=HULL,
+        scene=None,
     )
 
 
@@ -174,20 +171,19 @@ def _stretched(
     semantic_ids: IntArray,
     visible: npt.NDArray[np.bool_],
     *,
-    camera: Camera,
     cam_from_model: Alignment,
     bounds: FloatArray,
     noise_px: float,
     rng: np.random.Generator,
     visibility: str,
-    scene: Scene | None = None,
+    scene: Scene | None,
 ) -> Instance:
     """The instance of a view, with a stretch and noise drawn for it."""
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
     seen = xyz[visible]
-    projected = camera.project(cam_from_model.apply(seen))
+    projected = KEYPOINT_CAMERA.project(cam_from_model.apply(seen))
     return Instance(
-        camera=camera,
+        camera=KEYPOINT_CAMERA,
         cam_from_model=cam_from_model,
         points_3d=seen * stretch,
         points_2d=projected + noise_px * rng.standard_normal(projected.shape),

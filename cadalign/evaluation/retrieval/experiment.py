@@ -33,7 +33,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -87,8 +87,8 @@ class RetrievalExperiment:
         The library's file, which all workers map into memory.
     """
 
-    columns: ClassVar[Columns] = COLUMNS
-    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    columns = COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
 
     library: str
     options: RetrievalRunOptions

@@ -63,14 +63,7 @@ class Outcome:
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
-    """Errors of pose and stretch by column.
-
-    Parameters
-    ----------
-    length : float
-        Unit of the translation error [model units]: the diagonal of the model's bounding box,
-        for example.
-    """
+    """Errors of pose and stretch by column, the translation's over a length [model units]."""
     _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
     return {
         "rotation_error_deg": rotation_error(est=est, gt=gt),

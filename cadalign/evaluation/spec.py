@@ -29,7 +29,7 @@ class Reference:
 
 def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
     statuses = run.results["status"].to_pylist()
-    return Conclusion(len(statuses), statuses.count(FAILED))
+    return Conclusion(len(statuses), statuses.count(FAILED), {}, "")
 
 
 @dataclass(frozen=True)

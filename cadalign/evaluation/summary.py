@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -108,31 +108,17 @@ class ConsoleTable:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Numbers of rows, and of failed ones, that a finished run ends with.
-
-    Parameters
-    ----------
-    rows, failed : int
-    counts : dict
-        More numbers to be told.
-    note : str
-        Remark on the failed rows.
-    """
+    """Numbers of rows and of failed ones, and a note on these, that a finished run ends with."""
 
     rows: int
     failed: int
-    counts: dict[str, int] = field(default_factory=dict)
-    note: str = ""
+    counts: dict[str, int]
+    note: str
 
 
 @dataclass(frozen=True)
 class Quartiles:
-    """Quartiles, NaN where there are none.
-
-    Parameters
-    ----------
-    lower, median, upper : float
-    """
+    """Quartiles, NaN where there are none."""
 
     lower: float
     median: float
@@ -170,22 +156,22 @@ class Quartiles:
 def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> str:
     """The summaries as a CSV file, some columns by another name; unknown cells are empty."""
     rows = [summary.cells() for summary in summaries]
+    head = [rename.get(name, name) for name in rows[0]]
+    cells = [["" if value != value else value for value in row.values()] for row in rows]
+    return csv_text([head, *cells])
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows as a CSV file."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([rename.get(name, name) for name in rows[0]])
-    writer.writerows(["" if value != value else value for value in row.values()] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Summary]:
     """Numbers of rows, of failures, and medians of the others, for every group and method.
 
-    Parameters
-    ----------
-    columns : sequence of Metric
-        Of which those are taken that are columns of the run's results.
-    group : Metric
-        The column that rows are grouped by.
+    Of the columns those are taken that the run's results have.
     """
     cells = run.cells
     metrics = [metric.key for metric in columns if metric.key in cells]

@@ -39,18 +39,10 @@ def inline_bytes(runs: Sequence[Run]) -> int:
 
 @dataclass
 class AssetStore:
-    """Pictures, mesh previews and instance records of a page.
-
-    Parameters
-    ----------
-    page : Path
-        The page's file.
-    assets : Path, optional
-        A folder beside the page for them; without one they are inside the page.
-    """
+    """Pictures, mesh previews and instance records: inside the page, or in a folder ``assets``."""
 
     page: Path
-    assets: Path | None = None
+    assets: Path | None
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)

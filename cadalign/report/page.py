@@ -25,15 +25,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 @dataclass(frozen=True)
 class Report:
-    """A page that was written.
-
-    Parameters
-    ----------
-    path : Path
-        The page.
-    assets : Path, optional
-        The folder of its pictures, where they are not inside it.
-    """
+    """A page that was written, and the folder of its pictures where they are not inside it."""
 
     path: Path
     assets: Path | None

@@ -198,7 +198,9 @@ def test_estimates_say_what_the_fit_says(payload: dict[str, Any]) -> None:
     for exhibit in payload["exhibits"].values():
         camera = Camera(**exhibit["camera"])
         # The pixels are stored to 1e-4.
-        fitted = fit(exhibit["points_3d"], exhibit["points_2d"], camera, **fit_options("optimal"))
+        fitted = fit(
+            exhibit["points_3d"], exhibit["points_2d"], camera, **fit_options("optimal", sigma=1.0)
+        )
         estimate = exhibit["estimates"][0]
         assert estimate["sigma"] == fitted.sigma == 1.0
         assert fitted.std is not None

@@ -27,8 +27,8 @@ def cramer_rao_bound(
     camera: Camera,
     gt: Alignment,
     *,
-    sigma: Sigma = 1.0,
-    focal: str = "known",
+    sigma: Sigma,
+    focal: str,
 ) -> FloatArray:
     """The least covariance that any unbiased estimate of an alignment can have.
 
@@ -95,27 +95,12 @@ def limit_estimate(
     camera: Camera,
     gt: Alignment,
 ) -> Alignment:
-    """Estimate of an ideal estimator from these observations, to first order.
+    """Estimate of an ideal estimator from noisy observations (n, 2) [px], to first order.
 
     The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
     the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
-    the compared methods, so that no chance enters the comparison.
-
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points.
-    points_2d : (n, 2) float
-        Their noisy observations [px].
-    camera : Camera
-        Without lens distortion.
-    gt : Alignment
-        The truth, with the scale 1 along x.
-
-    Returns
-    -------
-    Alignment
-        exp(w) R, t + dt, s exp(ds): the truth, changed by the step.
+    the compared methods, so that no chance enters the comparison. The camera has no lens
+    distortion, and the truth the scale 1 along x.
     """
     jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()

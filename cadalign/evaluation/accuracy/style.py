@@ -53,13 +53,7 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class Look:
-    """Label and line of a method.
-
-    Parameters
-    ----------
-    label, color, marker, dash : str
-        The marker and the kind of line are matplotlib's.
-    """
+    """Label and line of a method; the marker and the dash are matplotlib's."""
 
     label: str
     color: str

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +19,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
-from cadalign.evaluation.summary import ALL, ConsoleTable, Summary
+from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, csv_text
 from cadalign.io.files import write_text
 
 METHOD = "optimal"
@@ -99,14 +97,13 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
     """Write ``results.csv`` with all rows, the seed and the seconds."""
-    text = io.StringIO()
-    names = [*(name for name, _ in COLUMNS), "seed", "seconds"]
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
+    names = [name for name, _ in COLUMNS]
     seconds = run.timings["seconds"].to_pylist()
-    for row, time in zip(run.results.to_pylist(), seconds, strict=True):
-        writer.writerow({**row, "seed": run.config["seed"], "seconds": time})
-    write_text(run.folder.path / "results.csv", text.getvalue())
+    rows = [
+        [*(row[name] for name in names), run.config["seed"], time]
+        for row, time in zip(run.results.to_pylist(), seconds, strict=True)
+    ]
+    write_text(run.folder.path / "results.csv", csv_text([[*names, "seed", "seconds"], *rows]))
 
 
 SPEC = Spec(

@@ -95,18 +95,10 @@ def make_instance(
     view_index: int,
     scene: Scene,
 ) -> Instance:
-    """Draw a view, a stretch and keypoint noise for an annotated model with a mesh.
+    """Draw a view, a stretch and keypoint noise [px] for an annotated model with a mesh.
 
-    Everything random follows from (seed, category, model id, view index).
-
-    Parameters
-    ----------
-    noise_px : float
-        Standard deviation of the Gaussian noise on each image coordinate [px].
-    min_visible : int
-        Least number of keypoints that a view must show.
-    scene : Scene
-        The model's, as `load_scene` gives it.
+    Everything random follows from (seed, category, model id, view index). The scene is the
+    model's, as `load_scene` gives it.
     """
     from cadalign.render import sample_view
 
@@ -136,20 +128,10 @@ def make_hull_instance(
     seed: int,
     view_index: int,
 ) -> Instance:
-    """Draw a view, a stretch and keypoint noise for an annotated model without a mesh.
+    """Draw a view, a stretch and keypoint noise, as `make_instance`, for a model without a mesh.
 
     Which keypoints are seen, and the model's box, follow from the keypoints alone; see
-    `cadalign.evaluation.instances.hull`.
-
-    Parameters
-    ----------
-    hull : KeypointHull
-        The model's keypoints.
-    semantic_ids : (k,) int
-    names : tuple of 2 str
-        Category and model id.
-    noise_px, min_visible, seed, view_index
-        As for `make_instance`.
+    `cadalign.evaluation.instances.hull`. ``names`` are category and model id.
     """
     rng = instance_rng(seed, *names, str(view_index))
     pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)

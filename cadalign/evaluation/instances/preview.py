@@ -59,14 +59,7 @@ class MeshPreview:
 def preview_of(
     mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
 ) -> MeshPreview:
-    """Simplify a mesh by merging the vertices in each cell of a grid.
-
-    The grid is fine enough to leave about as many triangles as may be; a mesh that has few is kept.
-
-    Parameters
-    ----------
-    max_faces, max_edges : int
-        Largest numbers of triangles and lines.
+    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
 
     Examples
     --------

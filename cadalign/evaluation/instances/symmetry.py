@@ -105,15 +105,7 @@ class SymmetryGroup:
 
 
 def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
-    """Find the rotations that map a model onto itself; the module says by which rule.
-
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        The model's keypoints.
-    symmetries : Symmetries
-        The annotated ones.
-    """
+    """Find the rotations that map a model's keypoints (k, 3) onto itself, by the module's rule."""
     trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
         return trivial

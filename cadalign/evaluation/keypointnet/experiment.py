@@ -76,13 +76,8 @@ COLUMNS: Columns = (
 class KeypointNetExperiment:
     """Evaluates methods on views of annotated models.
 
-    Parameters
-    ----------
-    options : KeypointNetOptions
-        Of which those on methods, noise, visible keypoints and the seed are used.
-    drawn_in : RunFolder, optional
-        Where the first method's alignment of every instance with a mesh is drawn; its folders for
-        pictures must exist.
+    The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
+    if one is given; its folders for pictures must exist.
     """
 
     columns = COLUMNS

@@ -31,10 +31,8 @@ class KeypointTask:
 
     Parameters
     ----------
-    view : int
     hull : KeypointHull
         Keypoints (k, 3), and what views without a mesh need to know of them.
-    semantic_ids : (k,) int
     model : AnnotatedModel, optional
         The model with its mesh; None where it is evaluated on its keypoints alone.
     problem : str
@@ -83,17 +81,7 @@ class KeypointTask:
 
 
 class KeypointTasks(Sequence[KeypointTask]):
-    """All views of all models of a dataset in the order of their names, made when asked for.
-
-    Parameters
-    ----------
-    dataset : KeypointNet
-    views : int
-        Number of views of each model.
-    visibility : {"auto", "rays", "hull"}
-    max_models : int, optional
-        Largest number of models of each category.
-    """
+    """All views of all models of a dataset in the order of their names, made when asked for."""
 
     def __init__(self, dataset: KeypointNet, options: KeypointNetOptions) -> None:
         self._dataset, self._visibility = dataset, options.visibility

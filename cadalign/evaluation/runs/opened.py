@@ -26,20 +26,10 @@ _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run with its tables.
+    """A run with its tables: the rows that there are, of so many tasks that are done.
 
-    Parameters
-    ----------
-    name : str
-        Its name beside others.
-    config : dict
-        Content of ``run.json``.
-    results : pyarrow.Table
-        The rows that there are.
-    timings : pyarrow.Table
-        The seconds of the same rows; empty where they were not kept.
-    done, total : int
-        Tasks.
+    ``name`` is its name beside others, ``config`` the content of ``run.json``; ``timings`` is empty
+    where times were not kept.
     """
 
     folder: RunFolder

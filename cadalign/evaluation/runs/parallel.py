@@ -118,18 +118,10 @@ def evaluate_on(
     window: int,
     deadly: tuple[type[BaseException], ...],
 ) -> Iterator[tuple[Chunk[T], Rows]]:
-    """Evaluate chunks on an executor.
+    """Evaluate chunks on an executor, ``window`` at a time.
 
-    Parameters
-    ----------
-    executor : callable
-        Gives an executor that works; asked again after every death.
-    chunks : iterable of Chunk
-        Asked for only as fast as they are evaluated.
-    window : int
-        Number of chunks under way at a time.
-    deadly : tuple of exception types
-        Raised by a future whose worker has died.
+    ``executor`` gives one that works, and is asked again after every death; ``deadly`` is raised by
+    a future whose worker has died. Chunks are asked for only as fast as they are evaluated.
     """
     _check_life(executor, experiment, deadly)
     source = iter(chunks)

@@ -15,21 +15,7 @@ from cadalign.evaluation.options import ExperimentOptions
 
 @dataclass(frozen=True)
 class SweepKind:
-    """The quantity that is varied, and those that are held.
-
-    Parameters
-    ----------
-    column : str
-        The column of the result table that is varied.
-    values : tuple of float
-        Its values.
-    points : int
-    noise_px : float
-        [px]
-    outlier_share : float
-    runs : int
-        Problems for each value.
-    """
+    """The quantity that is varied, a column of the result table, and those that are held."""
 
     name: str
     column: str

@@ -90,6 +90,12 @@ def command_of(
     )
 
 
+def one_of(commands: dict[str, Any]) -> Any:
+    """One of some commands, chosen by name."""
+    named: list[Any] = [Annotated[c, tyro.conf.subcommand(name)] for name, c in commands.items()]
+    return reduce(or_, named)
+
+
 @dataclass(frozen=True)
 class EvaluateShow:
     """Show a finished run again: its summary, and its figures drawn anew."""
@@ -123,15 +129,12 @@ def _commands() -> Any:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
     from cadalign.evaluation.registry import known_options
 
-    commands: list[Any] = [
-        Annotated[
-            command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}"),
-            tyro.conf.subcommand(options.experiment),
-        ]
+    commands = {
+        options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()
         if options.command == _COMMAND
-    ]
-    return reduce(or_, [*commands, Annotated[EvaluateShow, tyro.conf.subcommand("show")]])
+    }
+    return one_of({**commands, "show": EvaluateShow})
 
 
 @dataclass(frozen=True)

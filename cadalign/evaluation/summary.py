@@ -25,16 +25,9 @@ ALL = "all"
 class Summary:
     """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
 
-    Parameters
-    ----------
-    group : str
-        Name of the group in tables.
-    names : dict
-        Columns that name the row, the method among them.
-    values : dict
-        Numbers and `Quartiles` by column, in the metrics' own units; NaN for what is unknown.
-    tasks : int, optional
-        Number of tasks, for the headline's column of that name; by default ``instances``.
+    ``names`` are the columns that name the row, the method among them; ``values`` numbers and
+    `Quartiles` by column, in the metrics' own units, NaN for what is unknown. ``tasks`` is for the
+    headline's column of that name, by default ``instances``.
     """
 
     group: str
@@ -78,22 +71,12 @@ class Summary:
 
 @dataclass(frozen=True)
 class ConsoleTable:
-    """A table for the console.
+    """A table for the console, with a note beneath.
 
-    Parameters
-    ----------
-    labels : tuple of str
-        Heads of the columns of texts, which come first.
-    heads : tuple of str
-        Heads of the columns of numbers.
-    note : str
-        Text beneath.
-    narrow : bool
-        Without frame and with little room between columns.
-    grouped : bool
-        Set apart the rows that differ in the first column, which is not repeated.
-    wraps : bool
-        Heads may take several lines.
+    ``labels`` head the columns of texts, which come first, ``heads`` those of numbers. A narrow
+    table has no frame and little room between columns; a grouped one sets apart the rows that
+    differ in the first column, which is not repeated; the heads of one that wraps may take several
+    lines.
     """
 
     title: str

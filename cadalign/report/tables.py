@@ -70,12 +70,13 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
 
 def _csv(headline: Headline, names: Sequence[str]) -> str:
     runs = ["run"] if len(names) > 1 else []
-    lines = [[*runs, headline.group, "method", *(column.heading for column in headline.columns)]]
+    head = [*runs, headline.group, "method", *(column.heading for column in headline.columns)]
+    lines: list[list[object]] = []
     for row, name in _rows(headline, names):
         labels = [*([name] if runs else []), row.category, row.method]
         # A cell that is None is empty.
         lines.append([*labels, *(row.cells[column.key] for column in headline.columns)])
-    return csv_text(lines)
+    return csv_text([head, *lines])
 
 
 def _markdown(headline: Headline, names: Sequence[str]) -> str:

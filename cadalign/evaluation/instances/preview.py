@@ -24,15 +24,10 @@ _CREASE_DEG = 30.0
 
 @dataclass(frozen=True, eq=False)
 class MeshPreview:
-    """A simplified model.
+    """A simplified model [model units].
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        [model units]
-    faces : (m, 3) int
-    edges : (k, 2) int
-        Pairs of vertices for a wireframe: parts too thin for triangles, creases and borders.
+    ``edges`` are pairs of vertices for a wireframe: parts too thin for triangles, creases and
+    borders.
     """
 
     vertices: FloatArray

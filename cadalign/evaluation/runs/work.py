@@ -22,17 +22,10 @@ T_contra = TypeVar("T_contra", contravariant=True)
 
 @dataclass(frozen=True)
 class Rows:
-    """Table rows of some tasks.
+    """Table rows of some tasks: results, and what differs from run to run.
 
-    Parameters
-    ----------
-    rows : list of dict
-        Of the result table; the same in every run.
-    timings : list of dict
-        Of the table of what differs from run to run.
-    records : list of dict
-        Of the table of instance records, for experiments that keep some: they have
-        ``record_columns``, besides what `Experiment` asks for.
+    ``records`` are instance records, of experiments that have ``record_columns`` besides what
+    `Experiment` asks for.
     """
 
     rows: list[Row]

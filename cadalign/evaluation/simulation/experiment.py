@@ -106,24 +106,15 @@ class SweepExperiment:
             estimates = _estimates(method, problems, sigma)
             share = (time.perf_counter() - start) / len(problems)
             timed = [(estimate, share) for estimate in estimates]
-        return [
-            self._outcome(task, method, problem, est, seconds)
-            for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True)
-        ]
-
-    def _outcome(
-        self,
-        task: SweepTask,
-        method: str,
-        problem: Problem,
-        est: Alignment | CadalignError,
-        seconds: float | None,
-    ) -> Outcome:
-        names = self._names(task, method)
-        if isinstance(est, CadalignError):
-            return replace(Outcome.failure(str(est), names), seconds=seconds)
-        errors = alignment_errors(est=est, gt=problem.alignment)
-        return Outcome(names, errors, seconds=seconds)
+        outcomes = []
+        for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True):
+            names = self._names(task, method)
+            if isinstance(est, CadalignError):
+                outcome = Outcome.failure(str(est), names)
+            else:
+                outcome = Outcome(names, alignment_errors(est=est, gt=problem.alignment))
+            outcomes.append(replace(outcome, seconds=seconds))
+        return outcomes
 
     def _names(self, task: SweepTask, method: str) -> Row:
         return {**self._setting(task), "run": task.run, "method": method}

@@ -141,7 +141,7 @@ def _limit(
     for problem in problems:
         try:
             bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, sigma=noise
+                problem.points_3d, problem.camera, problem.alignment, sigma=noise, focal="known"
             )
         except CadalignError:
             continue

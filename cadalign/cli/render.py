@@ -52,6 +52,8 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from cadalign.io.images import write_image
+        from cadalign.render import write_movie
         from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
@@ -70,12 +72,11 @@ class Render:
                 renderer=self.renderer,
             )
         make_folder(self.out.absolute().parent)
-        if job.is_movie:
+        if self.out.suffix.lower() == ".mp4":
             frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
-            job.write_movie(
-                progress_over(frames, total=count, label="drawing", console=console), fps=self.fps
-            )
+            frames = progress_over(frames, total=count, label="drawing", console=console)
+            write_movie(self.out, frames, fps=self.fps)
         else:
-            job.write_picture(draw_picture(job))
+            write_image(self.out, draw_picture(job))
         console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)
         return 0

@@ -31,23 +31,13 @@ class PyrenderRenderer:
 
     A model with transparent parts, which OpenGL would need sorted, is drawn by ray casting wholly.
     A process has one OpenGL context, however many of these there are; a forked process must not
-    use its parent's, so start pools with "spawn" (or use loky).
-
-    Parameters
-    ----------
-    studio : Studio, optional
-        The lights.
-
-    Raises
-    ------
-    RenderError
-        If OpenGL does not start. Where its libraries are broken the whole process may die:
-        `make_renderer` tries it in another one first.
+    use its parent's, so start pools with "spawn" (or use loky). Where OpenGL's libraries are broken
+    the whole process may die: `make_renderer` tries it in another one first.
     """
 
     name = "pyrender"
 
-    def __init__(self, *, studio: Studio | None = None) -> None:
+    def __init__(self, *, studio: Studio | None) -> None:
         self.studio = studio or Studio()
         self._context = shared_context()
         self._context.check_process()
@@ -72,14 +62,6 @@ class PyrenderRenderer:
         """Draw a scene; see `RaycastRenderer.render`.
 
         OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
-
-        Raises
-        ------
-        RenderError
-            If the image is too large, OpenGL fails, or this process was forked from one that has
-            drawn with OpenGL.
-        InputError
-            If ``samples`` is not from 1 to 256.
         """
         if self.drawn_by(scene, samples=samples) != self.name:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)

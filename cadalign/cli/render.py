@@ -52,28 +52,16 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
-        from cadalign.render.job import RenderJob, draw_movie, draw_picture
 
         console = new_console()
         with named_as_flags(self):
-            job = RenderJob.prepare(
-                model=self.model,
-                out=self.out,
-                views=self.view,
-                size=self.size,
-                style=self.style,
-                background=self.background,
-                keypoints=self.keypoints,
-                scale=self.scale,
-                fov=self.fov,
-                samples=self.samples,
-                renderer=self.renderer,
-            )
+            job = RenderJob.prepare(self)
         make_folder(self.out.absolute().parent)
         if self.out.suffix.lower() == ".mp4":
-            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
+            frames, count = draw_movie(job)
             frames = progress_over(frames, total=count, label="drawing", console=console)
             write_movie(self.out, frames, fps=self.fps)
         else:

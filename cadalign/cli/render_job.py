@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.cli.render import Render
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
@@ -38,77 +39,61 @@ class RenderJob:
 
     scene: Scene
     renderer: Renderer
+    options: Render
     views: tuple[LabelledView, ...]
     camera: Camera
-    style: str
     background: tuple[int, int, int] | None
     """None is transparent."""
     keypoints: FloatArray | None
     scale: FloatArray
-    samples: int
 
     @classmethod
-    def prepare(
-        cls,
-        *,
-        model: Path,
-        out: Path,
-        views: tuple[str, ...],
-        size: str,
-        style: str,
-        background: str,
-        keypoints: Path | None,
-        scale: tuple[float, float, float],
-        fov: float,
-        samples: int,
-        renderer: str,
-    ) -> RenderJob:
-        """Check the arguments of the command line and read the files that they name."""
-        width, height = parse_size(size)
-        camera = Camera.from_fov(width, height, fov_x=fov)
+    def prepare(cls, options: Render) -> RenderJob:
+        """Check the options of the command line and read the files that they name."""
+        width, height = parse_size(options.size)
+        camera = Camera.from_fov(width, height, fov_x=options.fov)
         check_image_size(camera)
-        ending = out.suffix.lower()
+        ending = options.out.suffix.lower()
         if ending not in (".png", ".mp4"):
             raise InputError(
-                f"{out.name} is neither a PNG nor an MP4 file",
+                f"{options.out.name} is neither a PNG nor an MP4 file",
                 where="--out",
                 fix="give such a name",
             )
-        color = parse_background(background)
-        factors = as_floats(scale, name="--scale", shape=(3,))
-        if (factors <= 0).any():
-            raise InputError(f"{scale} is not positive", where="--scale")
-        chosen = tuple(view for word in views for view in _views(word, factors))
-        if not chosen:
+        background = parse_background(options.background)
+        scale = as_floats(options.scale, name="--scale", shape=(3,))
+        if (scale <= 0).any():
+            raise InputError(f"{options.scale} is not positive", where="--scale")
+        views = tuple(view for word in options.view for view in _views(word, scale))
+        if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
-        if color is None and (ending == ".mp4" or len(chosen) > 1 or keypoints is not None):
+        file = options.keypoints
+        if background is None and (ending == ".mp4" or len(views) > 1 or file is not None):
             raise InputError(
                 "only a still without keypoints can be transparent", where="--background"
             )
-        mesh = load_mesh(model)
+        mesh = load_mesh(options.model)
         return cls(
             scene=Scene(mesh),
             # Depth, normals, triangles and lines are cast in any case.
-            renderer=make_renderer(renderer if style == "color" else "raycast"),
-            views=chosen,
+            renderer=make_renderer(options.renderer if options.style == "color" else "raycast"),
+            options=options,
+            views=views,
             camera=camera,
-            style=style,
-            background=color,
-            keypoints=None if keypoints is None else read_keypoints(keypoints, model, mesh),
-            scale=factors,
-            samples=samples,
+            background=background,
+            keypoints=None if file is None else read_keypoints(file, options.model, mesh),
+            scale=scale,
         )
 
     @property
     def drawn_by(self) -> str:
         """Name of the renderer that really draws the model."""
-        return self.renderer.drawn_by(self.scene, samples=self.samples)
+        return self.renderer.drawn_by(self.scene, samples=self.options.samples)
 
     def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
         """One picture, (h, w, 3) uint8, or (h, w, 4) on a transparent background."""
-        color = draw_still(
-            self.renderer, self.scene, camera, pose, style=self.style, samples=self.samples
-        )
+        style, samples = self.options.style, self.options.samples
+        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
         if self.background is None:
             return color
         image = composite(color, self.background)
@@ -134,8 +119,9 @@ def draw_picture(job: RenderJob) -> ByteImage:
     return contact_sheet(images, [label for label, _ in job.views], background=background)
 
 
-def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[ByteImage], int]:
+def draw_movie(job: RenderJob) -> tuple[Iterator[ByteImage], int]:
     """Draw a turntable that starts in the first view: its frames, and their number."""
+    seconds, fps = job.options.seconds, job.options.fps
     frames = seconds * fps
     if not 1 <= frames <= _MAX_FRAMES:
         raise InputError(

@@ -54,29 +54,19 @@ class Render:
         """Draw and write; returns the exit code."""
         from rich.progress import track
 
-        from cadalign.render.job import RenderJob, draw_movie, draw_picture
+        from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
+        from cadalign.io.images import write_image
+        from cadalign.render import write_movie
 
         console = new_console()
         with named_as_flags(self):
-            job = RenderJob.prepare(
-                model=self.model,
-                out=self.out,
-                views=self.view,
-                size=self.size,
-                style=self.style,
-                background=self.background,
-                keypoints=self.keypoints,
-                scale=self.scale,
-                fov=self.fov,
-                samples=self.samples,
-                renderer=self.renderer,
-            )
+            job = RenderJob.prepare(self)
         make_folder(self.out.absolute().parent)
-        if job.is_movie:
-            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
+        if self.out.suffix.lower() == ".mp4":
+            frames, count = draw_movie(job)
             shown = track(frames, "drawing", total=count, console=console, transient=True)
-            job.write_movie(shown, fps=self.fps)
+            write_movie(self.out, shown, fps=self.fps)
         else:
-            job.write_picture(draw_picture(job))
+            write_image(self.out, draw_picture(job))
         console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)
         return 0

@@ -290,7 +290,7 @@ class ModelKeypoints:
         """
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
-    def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
+    def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
         """Content of the file, the model's path relative to ``folder``."""
         data: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         if self.model is not None:

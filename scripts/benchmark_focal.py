@@ -83,7 +83,7 @@ def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
             row = alignment_errors(est=batch.alignment(b), gt=problem.alignment)
             row["focal_error"] = abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1)
         errors.append(row)
-    ideal = ideal_errors(problems, rng, focal="estimate")
+    ideal = ideal_errors(problems, rng, sigma=1.0, focal="estimate")
     limit = {error: float(np.median(ideal[error])) for error in ERRORS}
     return {
         "points": points,

@@ -79,7 +79,7 @@ def _accuracy(arguments: Arguments, console: Console) -> Iterator[dict[str, obje
     for name, noise, draw in sources:
         rng = np.random.default_rng(arguments.seed)
         problems = [draw(rng) for _ in range(arguments.problems)]
-        limit = ideal_errors(problems, rng, sigma=noise)
+        limit = ideal_errors(problems, rng, sigma=noise, focal="known")
         for method in METHODS:
             row = _accuracy_row(problems, noise, method, limit) | {"problems": name}
             table.add_row(

@@ -11,7 +11,7 @@ import tyro
 from common import write_row
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.instance import make_instance
+from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.fitting.fit import fit
 from cadalign.geometry.box import Box
 from cadalign.render import RaycastRenderer, draw_overlay
@@ -38,7 +38,10 @@ def main(arguments: Arguments) -> None:
 
 
 def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
-    instance = make_instance(dataset[category, f"sample_{category}_{number}"], seed=0)
+    model = dataset[category, f"sample_{category}_{number}"]
+    instance = make_instance(
+        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
+    )
     result = fit(instance.points_3d, instance.points_2d, instance.camera)
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
     return draw_overlay(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 from cadalign.errors import CadalignError, InputError
@@ -12,17 +12,25 @@ from cadalign.errors import CadalignError, InputError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+    from cadalign.fitting.options import Sigma
+    from cadalign.io.observation import Observation
+
 
 class OptionError(CadalignError):
     """A command line option has an invalid value.
 
-    It is no ValueError, which the parser would report without the option's name.
+    Other than InputError it is no ValueError, which the parser would report without the name.
     """
 
 
 @contextmanager
-def named_as_flags(*options: DataclassInstance) -> Iterator[None]:
-    """Let errors about fields of dataclasses of options name the command line's options."""
+def named_as_flags(
+    *options: DataclassInstance, kind: type[CadalignError] = InputError
+) -> Iterator[None]:
+    """Let errors about fields of dataclasses of options name the command line's options.
+
+    Their kind is `OptionError` while the command line is parsed.
+    """
     try:
         yield
     except InputError as error:
@@ -30,4 +38,20 @@ def named_as_flags(*options: DataclassInstance) -> Iterator[None]:
         if error.where not in names:
             raise
         flag = "--" + str(error.where).replace("_", "-")
-        raise OptionError(error.what, where=flag, fix=error.fix) from None
+        raise kind(error.what, where=flag, fix=error.fix) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationCommand:
+    """Options of the commands on an observation file."""
+
+    json: bool = False
+    """Print the result as JSON."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+
+    def sigma_of(self, observation: Observation) -> Sigma:
+        """Standard deviation of the keypoints: the given one, the file's, or 1."""
+        if self.sigma is not None:
+            return self.sigma
+        return 1.0 if observation.sigma is None else observation.sigma

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.output import make_folder, new_console, progress_over
+from cadalign.cli.output import make_folder, new_console
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from rich.progress import track
+
         from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
@@ -62,8 +64,8 @@ class Render:
         make_folder(self.out.absolute().parent)
         if self.out.suffix.lower() == ".mp4":
             frames, count = draw_movie(job)
-            frames = progress_over(frames, total=count, label="drawing", console=console)
-            write_movie(self.out, frames, fps=self.fps)
+            shown = track(frames, "drawing", total=count, console=console, transient=True)
+            write_movie(self.out, shown, fps=self.fps)
         else:
             write_image(self.out, draw_picture(job))
         console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)

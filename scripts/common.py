@@ -50,14 +50,14 @@ def new_table(title: str, *columns: str) -> Table:
 
 
 def ideal_errors(
-    problems: Iterable[Problem], rng: np.random.Generator, **options: Any
+    problems: Iterable[Problem], rng: np.random.Generator, *, sigma: float, focal: str
 ) -> dict[str, np.ndarray]:
     """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
     draws = []
     for problem in problems:
         try:
             bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, **options
+                problem.points_3d, problem.camera, problem.alignment, sigma=sigma, focal=focal
             )
         except CadalignError:
             continue

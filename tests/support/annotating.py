@@ -16,6 +16,7 @@ import uvicorn
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.server import listen, make_app
 from cadalign.annotate.session import Session
@@ -65,7 +66,7 @@ class Case:
             "camera": self.camera,
             "keypoints": self.keypoints,
         }
-        session = open_session(**(defaults | options))
+        session = open_session(SessionOptions(**(defaults | options)))
         session.warm_up()
         return session
 

@@ -114,7 +114,7 @@ def run(
     folder: RunFolder,
     *,
     workers: int | None,
-    dask: str | None = None,
+    dask: str | None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
     """Do the run that the options describe in a folder, or what is left of it.

@@ -39,7 +39,7 @@ def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
     tmp_path: Path, cluster: Any
 ) -> None:
     calm, hit = RunFolder(tmp_path / "calm"), RunFolder(tmp_path / "hit")
-    run(KIND, calm, workers=0)
+    run(KIND, calm, workers=0, dask=None)
     killed: list[int] = []
 
     def kill_one(progress: Progress) -> None:
@@ -48,7 +48,7 @@ def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
             killed.append(worker.pid)
             os.kill(worker.pid, signal.SIGKILL)
 
-    run(KIND, hit, dask=cluster.scheduler_address, on_progress=kill_one)
+    run(KIND, hit, workers=None, dask=cluster.scheduler_address, on_progress=kill_one)
     assert killed
     assert hit.results.read_bytes() == calm.results.read_bytes()
 

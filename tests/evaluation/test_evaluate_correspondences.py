@@ -119,7 +119,7 @@ def run(
     root: Path, out: Path, options: CorrespondenceOptions = QUICK, *, workers: int = 0
 ) -> list[dict[str, object]]:
     """Do a run; its rows."""
-    do_run(replace(options, path=root), RunFolder(out), workers=workers)
+    do_run(replace(options, path=root), RunFolder(out), workers=workers, dask=None)
     return read_table(RunFolder(out).results).to_pylist()
 
 

@@ -53,7 +53,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def finished(library: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
-    run(replace(QUICK, root=library), folder, workers=0)
+    run(replace(QUICK, root=library), folder, workers=0, dask=None)
     return folder
 
 
@@ -208,21 +208,21 @@ class TestRuns:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            run(replace(QUICK, root=library), folder, workers=0, on_progress=stop)
+            run(replace(QUICK, root=library), folder, workers=0, dask=None, on_progress=stop)
         assert not folder.is_finished
-        run(replace(QUICK, root=library), folder, workers=2)
+        run(replace(QUICK, root=library), folder, workers=2, dask=None)
         assert folder.results.read_bytes() == finished.results.read_bytes()
 
     def test_another_library_or_configuration_is_refused(
         self, finished: RunFolder, library: Path, tmp_path: Path
     ) -> None:
         with pytest.raises(DataError, match="another configuration: seed is 0 there and 1 now"):
-            run(replace(QUICK, root=library, seed=1), finished)
+            run(replace(QUICK, root=library, seed=1), finished, workers=None, dask=None)
         other = tmp_path / "other"
         Library.from_models([make_model(number) for number in range(10)]).save(other)
         before = (finished.path / "library.cadalign").read_bytes()
         with pytest.raises(DataError, match="another configuration: library is"):
-            run(replace(QUICK, root=other), finished)
+            run(replace(QUICK, root=other), finished, workers=None, dask=None)
         assert (finished.path / "library.cadalign").read_bytes() == before
 
     def test_a_library_left_by_a_run_that_never_began_is_not_evaluated(
@@ -238,9 +238,9 @@ class TestRuns:
         with monkeypatch.context() as patch:
             patch.setattr(RunFolder, "claim", die)
             with pytest.raises(KeyboardInterrupt):
-                run(replace(QUICK, root=other), folder, workers=0)
+                run(replace(QUICK, root=other), folder, workers=0, dask=None)
         options = replace(QUICK, max_models=2, methods=("epnp",), keypoints=(8,))
-        run(replace(options, root=library), folder, workers=0)
+        run(replace(options, root=library), folder, workers=0, dask=None)
         evaluated = Library.open(folder.path / "library.cadalign")
         assert evaluated.fingerprint == Library.open(library).fingerprint
         config = folder.read_config()
@@ -253,7 +253,7 @@ class TestRuns:
             QUICK, categories=("chair",), whole_library=True, keypoints=(8,), methods=("optimal",)
         )
         folder = RunFolder(tmp_path / "run")
-        run(replace(options, root=sample_root), folder, workers=0)
+        run(replace(options, root=sample_root), folder, workers=0, dask=None)
         assert len(Library.open(folder.path / "library.cadalign").categories) == 4
         inside, outside = rows_of(folder)
         assert inside["rank"] == 1
@@ -290,7 +290,12 @@ class TestRuns:
             ({"keypoints": (13,)}, "keypoints: no model has 13 keypoints"),
         ):
             with pytest.raises(InputError, match=message):
-                run(replace(QUICK, root=library, **change), RunFolder(tmp_path / "run"))
+                run(
+                    replace(QUICK, root=library, **change),
+                    RunFolder(tmp_path / "run"),
+                    workers=None,
+                    dask=None,
+                )
         assert not (tmp_path / "run").exists()
 
 
@@ -383,7 +388,7 @@ def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path:
         max_models=60,
     )
     folder = RunFolder(tmp_path / "run")
-    run(options, folder)
+    run(options, folder, workers=None, dask=None)
     found = {(s["protocol"], s.method): s for s in summarize(Run.open(folder.path))}
     assert found["leave-in", "optimal"]["rank_1"] > 0.93
     assert found["leave-in", "epnp"]["rank_1"] < 0.4

@@ -165,23 +165,23 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_an_interrupted_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
     options = MiddleOptions(root)
     whole, cut = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "cut")
-    run(options, whole, workers=0)
+    run(options, whole, workers=0, dask=None)
 
     def stop(progress: Progress) -> None:
         if progress.done >= 8:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(options, cut, workers=0, on_progress=stop)
+        run(options, cut, workers=0, dask=None, on_progress=stop)
     assert not cut.is_finished
     unfinished = write_report([cut.path], tmp_path / "unfinished.html").path
     assert "8 of 18 tasks are done" in unfinished.read_text()
     seen: list[int] = []
-    run(options, cut, workers=0, on_progress=lambda progress: seen.append(progress.done))
+    run(options, cut, workers=0, dask=None, on_progress=lambda progress: seen.append(progress.done))
     assert seen[0] == 8
     assert cut.results.read_bytes() == whole.results.read_bytes()
     with pytest.raises(DataError, match="draws is 5 there and 6 now"):
-        run(MiddleOptions(root, draws=6), cut, workers=0)
+        run(MiddleOptions(root, draws=6), cut, workers=0, dask=None)
 
 
 def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Pa
 
 def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    run(MiddleOptions(root), RunFolder(out), workers=0)
+    run(MiddleOptions(root), RunFolder(out), workers=0, dask=None)
     assert main(["evaluate", "show", str(out)]) == 3
     assert "spoon" in capsys.readouterr().out
     assert main(["evaluate", "show", str(out), "--json"]) == 3

@@ -290,7 +290,7 @@ def test_a_real_run_makes_a_page(opened: Opened, sample_root: Path, tmp_path: Pa
     options = KeypointNetOptions(
         sample_root, render="overlay", max_models=1, methods=("optimal", "limit")
     )
-    do_run(options, folder, workers=0)
+    do_run(options, folder, workers=0, dask=None)
     for assets in (False, True):
         written = write_report([folder.path], tmp_path / "page.html", assets=assets)
         page = opened(written.path.as_uri())

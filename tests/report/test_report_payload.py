@@ -42,7 +42,7 @@ HOSTILE = "<img src=x onerror=alert(1)>&amp;\u2028</script><!--"
 
 
 def evaluate(root: Path, out: Path, **options: Any) -> Path:
-    do_run(KeypointNetOptions(root, **options), RunFolder(out), workers=0)
+    do_run(KeypointNetOptions(root, **options), RunFolder(out), workers=0, dask=None)
     return out
 
 
@@ -474,7 +474,7 @@ def test_compared_runs_share_pictures(drawn: Path, tmp_path: Path) -> None:
 
 def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
     options = SweepOptions("noise", values=(1, 4), runs=12, methods=("optimal", "aepnp", "limit"))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0)
+    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     found = report(tmp_path, tmp_path / "run")
     assert found["tables"] is None
     assert found["title"] == "Simulation: noise"
@@ -500,7 +500,7 @@ def test_a_simulation_has_lines_and_no_gallery(tmp_path: Path) -> None:
 
 def test_running_time_is_shown_where_it_is_what_was_measured(tmp_path: Path) -> None:
     options = SweepOptions("runtime", values=(8,), runs=2, methods=("aepnp",))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0)
+    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     found = report(tmp_path, tmp_path / "run")
     assert found["plots"][0]["id"] == "microseconds"
     assert found["headline"]["rows"][0]["cells"]["microseconds"] > 0
@@ -513,7 +513,7 @@ def test_correspondences_have_success_against_outliers(real_data: Path, tmp_path
         draws=1,
         methods=("ransac-optimal", "epnp"),
     )
-    do_run(options, RunFolder(tmp_path / "run"), workers=0)
+    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     found = report(tmp_path, tmp_path / "run")
     assert found["headline"]["group"] == "outliers [%]"
     assert [row["category"] for row in found["headline"]["rows"]] == ["0", "0", "50", "50"]
@@ -537,7 +537,7 @@ def test_retrieval_has_rates_against_keypoints(tmp_path: Path) -> None:
             keypoint["xyz"] = point
     file.write_text(json.dumps(entries))
     options = RetrievalRunOptions(root, keypoints=(8, 10), noises_px=(1.0,), methods=("optimal",))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0)
+    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     found = report(tmp_path, tmp_path / "run")
     assert found["title"] == "Retrieval on data"
     assert "One method of finding 4 models of data again" in found["summary"]
@@ -568,7 +568,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
 
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(KeyboardInterrupt):
-        do_run(options, folder, workers=0, on_progress=stop)
+        do_run(options, folder, workers=0, dask=None, on_progress=stop)
     found = report(tmp_path, folder.path)
     (run,) = found["runs"]
     assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
@@ -579,7 +579,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
     assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
     assert rows[0]["milliseconds"] > 0
     assert found["plots"][0]["traces"][0]["y"] == [rows[0]["rank_1"]]
-    do_run(options, folder, workers=0)
+    do_run(options, folder, workers=0, dask=None)
     folder.timings.unlink()  # what was not kept is not shown
     found = report(tmp_path, folder.path)
     assert found["runs"][0]["state"] == "finished"
@@ -642,7 +642,7 @@ def test_what_is_no_run_is_refused(
 def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -> None:
     for name in ("noise", "points"):
         options = SweepOptions(name, values=(8,), runs=1, methods=("aepnp",))
-        do_run(options, RunFolder(tmp_path / name), workers=0)
+        do_run(options, RunFolder(tmp_path / name), workers=0, dask=None)
     page = tmp_path / "report.html"
     with pytest.raises(InputError, match="none is given"):
         write_report([], page)

@@ -38,7 +38,7 @@ def headline(category: str = "chair") -> Headline:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "a_run"
     options = SweepOptions("noise", values=(1, 4), runs=4, methods=("optimal", "aepnp", "limit"))
-    do_run(options, RunFolder(out), workers=0)
+    do_run(options, RunFolder(out), workers=0, dask=None)
     return out
 
 
@@ -101,7 +101,7 @@ def test_names_cannot_break_a_table() -> None:
 def test_several_runs_are_told_apart_in_every_format(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "b_run"
     options = SweepOptions("noise", values=(1,), runs=4, methods=("aepnp",))
-    do_run(options, RunFolder(other), workers=0)
+    do_run(options, RunFolder(other), workers=0, dask=None)
     for format, names in (("md", "a\\_run"), ("csv", "a_run"), ("latex", "a\\_run")):
         text = headline_text([run, other], format=format)
         assert text.count(names) == 6
@@ -134,7 +134,7 @@ def test_the_page_of_several_runs_goes_where_one_is(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = SweepOptions("noise", values=(1,), runs=4, methods=("aepnp",))
-    do_run(options, RunFolder(tmp_path / "b"), workers=0)
+    do_run(options, RunFolder(tmp_path / "b"), workers=0, dask=None)
     monkeypatch.chdir(tmp_path)
     assert main(["report", str(run), "b"]) == 0
     assert (tmp_path / "report.html").is_file()

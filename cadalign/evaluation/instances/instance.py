@@ -45,7 +45,6 @@ class Instance:
         The visible keypoints of the stretched model.
     points_2d : (n, 2) float
         Their noisy observations [px].
-    semantic_ids : (n,) int
     bounds : (2, 3) float
         Lowest and highest coordinates of the stretched model; of its keypoints without a mesh.
     gt : Alignment

@@ -50,8 +50,6 @@ def simulate_problem(
     ----------
     rng : numpy.random.Generator
         The only source of randomness.
-    points : int
-        Number of points.
     noise_px : float
         Standard deviation of the Gaussian noise on each image coordinate [px].
     outlier_share : float

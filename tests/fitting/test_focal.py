@@ -74,7 +74,9 @@ def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
     errors, limits = [], []
     for b, problem in enumerate(problems):
         gt = problem.alignment
-        bound = cramer_rao_bound(problem.points_3d, SIMULATION_CAMERA, gt, focal="estimate")
+        bound = cramer_rao_bound(
+            problem.points_3d, SIMULATION_CAMERA, gt, sigma=1.0, focal="estimate"
+        )
         limits.append(sample_limit(bound, gt, rng=rng, draws=20))
         est = batch.alignment(b)
         errors.append(

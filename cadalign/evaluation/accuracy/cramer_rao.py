@@ -27,8 +27,8 @@ def cramer_rao_bound(
     camera: Camera,
     gt: Alignment,
     *,
-    sigma: Sigma = 1.0,
-    focal: str = "known",
+    sigma: Sigma,
+    focal: str,
 ) -> FloatArray:
     """The least covariance that any unbiased estimate of an alignment can have.
 
@@ -39,7 +39,6 @@ def cramer_rao_bound(
     ----------
     points_3d : (n, 3) float
         Model points.
-    camera : Camera
     gt : Alignment
         The truth, with the scale 1 along x.
     sigma : float, (n,) float or (n, 2, 2) float
@@ -52,11 +51,6 @@ def cramer_rao_bound(
     (8, 8) or (9, 9) float
         Rotation vector in the camera frame [rad], translation [model units], log s_y and log s_z,
         and, where it is estimated, the logarithm of the focal length.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
     """
     in_camera = gt.apply(points_3d)
     rays = perspective(in_camera)
@@ -100,40 +94,16 @@ def limit_estimate(
     points_2d: FloatArray,
     camera: Camera,
     gt: Alignment,
-    *,
-    sigma: float = 1.0,
 ) -> Alignment:
-    """Estimate of an ideal estimator from these observations, to first order.
+    """Estimate of an ideal estimator from noisy observations (n, 2) [px], to first order.
 
     The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
     the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
-    the compared methods, so that no chance enters the comparison.
-
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points.
-    points_2d : (n, 2) float
-        Their noisy observations [px].
-    camera : Camera
-        Without lens distortion.
-    gt : Alignment
-        The truth, with the scale 1 along x.
-    sigma : float
-        Standard deviation of the noise [px]; cancels out as long as it is the same for all.
-
-    Returns
-    -------
-    Alignment
-        exp(w) R, t + dt, s exp(ds): the truth, changed by the step.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
+    the compared methods, so that no chance enters the comparison. The camera has no lens
+    distortion, and the truth the scale 1 along x.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS) / sigma
-    noise = (points_2d - camera.project(gt.apply(points_3d))).ravel() / sigma
+    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS)
+    noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
     norms = np.linalg.norm(jacobian, axis=0)
     if len(noise) < UNKNOWNS or not (norms > 0).all():
         raise DegenerateError("the points do not determine the alignment", where="points_3d")

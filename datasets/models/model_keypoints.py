@@ -204,11 +204,7 @@ class ModelKeypoints:
 
     @classmethod
     def load(
-        cls,
-        path: str | os.PathLike[str],
-        *,
-        mesh: Mesh | None = None,
-        model: Path | None = None,
+        cls, path: str | os.PathLike[str], *, mesh: Mesh | None = None, model: Path | None = None
     ) -> ModelKeypoints:
         """Read a file of model keypoints, or one model's of KeypointNet's annotations.
 

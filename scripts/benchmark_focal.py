@@ -87,9 +87,9 @@ def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
     errors, limits = [], []
     for b, problem in enumerate(problems):
         bound = cramer_rao_bound(
-            problem.points_3d, SIMULATION_CAMERA, problem.alignment, focal="estimate"
+            problem.points_3d, SIMULATION_CAMERA, problem.alignment, sigma=1.0, focal="estimate"
         )
-        draws = sample_limit(bound, problem.alignment, rng=rng, draws=LIMIT_DRAWS)
+        draws = sample_limit(bound, rng=rng, draws=LIMIT_DRAWS)
         limits.append([draws[error] for error in ERRORS])
         errors.append(_errors(problem, batch, b) if batch.solved[b] else [np.inf] * len(ERRORS))
     limit = np.median(np.concatenate(limits, axis=1), axis=1)

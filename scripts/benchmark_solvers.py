@@ -141,11 +141,11 @@ def _limit(
     for problem in problems:
         try:
             bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, sigma=noise
+                problem.points_3d, problem.camera, problem.alignment, sigma=noise, focal="known"
             )
         except CadalignError:
             continue
-        draws.append(sample_limit(bound, problem.alignment, rng=rng, draws=LIMIT_DRAWS))
+        draws.append(sample_limit(bound, rng=rng, draws=LIMIT_DRAWS))
     return {error: np.concatenate([draw[error] for draw in draws]) for error in ERRORS}
 
 

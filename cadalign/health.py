@@ -15,30 +15,19 @@ from cadalign.render.select import best_renderer
 
 @dataclass(frozen=True)
 class Health:
-    """Findings of `examine`.
-
-    Parameters
-    ----------
-    renderers : tuple of Probe
-        All renderers, ray casting last.
-    best : str
-        The renderer that "auto" selects.
-    remedies : dict of str to str
-        For each renderer that does not work, the command that would enable it.
-    cores, usable_cores : int
-        Cores of the machine, and cores that this process may use.
-    cache : str
-        Location and state of the cache of compiled solvers.
-    python, numpy, numba : str
-        Versions.
-    """
+    """Findings of `examine`."""
 
     renderers: tuple[Probe, ...]
+    """All of them, ray casting last."""
     best: str
+    """The renderer that "auto" selects."""
     remedies: dict[str, str]
+    """For each renderer that does not work, the command that would enable it."""
     cores: int
     usable_cores: int
+    """Those that this process may use."""
     cache: str
+    """Location and state of the cache of compiled solvers."""
     python: str
     numpy: str
     numba: str

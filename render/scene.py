@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.raycast.caster import RayCaster
+from cadalign.render.raycast.caster import EmbreeEngine, RayCaster
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.raycast.normals import corner_normals
 from cadalign.render.raycast.surface import Surface
@@ -57,17 +58,21 @@ class Scene:
         """The length of the bounding box's diagonal [model units]."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
 
+    def stretched_diagonal(self, alignment: Alignment) -> float:
+        """The same of the stretched model."""
+        return float(np.linalg.norm((self.bounds[1] - self.bounds[0]) * alignment.scale))
+
     @cached_property
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
-        return RayCaster(self.mesh.vertices, self.mesh.faces)
+        return RayCaster(self.mesh, self.face_normals, engine=EmbreeEngine)
 
     @cached_property
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
         from cadalign.render.open3d.engine import Open3DEngine
 
-        return RayCaster(self.mesh.vertices, self.mesh.faces, engine=Open3DEngine)
+        return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     @cached_property
     def gl_meshes(self) -> tuple[Any, Any]:
@@ -98,10 +103,7 @@ class Scene:
     def corner_normals(self) -> FloatArray:
         """Smooth normals at the triangles' corners, (m, 3, 3) float, on their face's side."""
         return corner_normals(
-            self.mesh.vertices,
-            self.mesh.faces,
-            self.face_normals,
-            crease_angle=self.crease_angle,
+            self.mesh.vertices, self.mesh.faces, self.face_normals, crease_angle=self.crease_angle
         )
 
     @cached_property

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tyro
+from common import write_row
 
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.wireframe import Wireframe
@@ -21,7 +22,7 @@ from cadalign.fitting.fit import fit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.io.images import write_image
+from cadalign.io.images import read_image, write_image
 from cadalign.io.observation import Observation
 from cadalign.render import (
     Angles,
@@ -71,7 +72,7 @@ def main(arguments: Arguments) -> None:
         print(result)
 
         scene = Scene(model.load_mesh())
-        image = still(Scene(seen.load_mesh()))
+        image = read_image(photo, CAMERA)
         aligned = draw_overlay(
             with_wireframe(image, CadModel(scene.mesh), result.alignment),
             CAMERA,
@@ -80,11 +81,7 @@ def main(arguments: Arguments) -> None:
             reprojected=CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
         )
-        row = np.hstack([image, still(scene), aligned])
-    height = round(row.shape[0] * arguments.width / row.shape[1])
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    small = cv2.resize(row, (arguments.width, height), interpolation=cv2.INTER_AREA)
-    write_image(arguments.out, np.asarray(small, dtype=np.uint8))
+        write_row(arguments.out, [image, still(scene), aligned], width=arguments.width)
 
 
 def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
@@ -93,20 +90,15 @@ def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observa
     pose = pose_in_view(scene, CAMERA, VIEW)
     write_image(photo, still(scene))
     visible = visible_keypoints(scene, seen.keypoints.xyz, CAMERA, pose)
-    in_photo = dict(
-        zip(
-            seen.keypoints.semantic_ids[visible].tolist(),
-            CAMERA.project(pose.apply(seen.keypoints.xyz[visible])),
-            strict=True,
-        )
+    in_photo = seen.keypoints.xyz[visible]
+    shared, rows, model_rows = np.intersect1d(
+        seen.keypoints.semantic_ids[visible], model.keypoints.semantic_ids, return_indices=True
     )
-    on_model = dict(zip(model.keypoints.semantic_ids.tolist(), model.keypoints.xyz, strict=True))
-    shared = sorted(in_photo.keys() & on_model.keys())
     return Observation(
-        points_3d=np.array([on_model[number] for number in shared]),
-        points_2d=np.array([in_photo[number] for number in shared]),
+        points_3d=model.keypoints.xyz[model_rows],
+        points_2d=CAMERA.project(pose.apply(in_photo[rows])),
         camera=CAMERA,
-        semantic_ids=np.array(shared),
+        semantic_ids=shared,
         image=photo,
         model=model.mesh_path,
     )

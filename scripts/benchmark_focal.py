@@ -6,19 +6,17 @@ Prints tables and writes a JSON file.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import tyro
+from common import Benchmark, ideal_errors, new_table, write_results
 from rich.console import Console
-from rich.table import Table
 
 import cadalign
-from cadalign import Camera, RansacOptions, metrics
+from cadalign import Camera, RansacOptions
 from cadalign.errors import CadalignError
-from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
-from cadalign.io.files import write_json
+from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, simulate_problem
 
 UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 ERRORS = (
@@ -31,15 +29,12 @@ ERRORS = (
 SIZES = (10, 20, 50, 200)
 WRONG_SHARES = (0.0, 0.3, 0.5, 0.7, 0.8)
 ROBUST_POINTS = 100
-LIMIT_DRAWS = 20
 
 
 @dataclass
-class Arguments:
+class Arguments(Benchmark):
     """Measure fits with an unknown focal length."""
 
-    out: Path = Path("bench/focal.json")
-    """JSON file to write."""
     problems: int = 1000
     """Random problems per row of accuracy."""
     robust_problems: int = 40
@@ -51,9 +46,8 @@ class Arguments:
 def main(arguments: Arguments) -> None:
     """Run all measurements."""
     console = Console(width=130)
-    table = Table(title="1 px: median errors over the Cramer-Rao limit's of 9 unknowns")
-    for column in ("points", "limit f %", "R", "t", "s_y", "s_z", "f", "failed"):
-        table.add_column(column, justify="right")
+    title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
+    table = new_table(title, "points", "limit f %", "R", "t", "s_y", "s_z", "f", "failed")
     accuracy = [_accuracy(arguments, points) for points in SIZES]
     for row in accuracy:
         ratios = [f"{row['ratios'][error]:.2f}" for error in ERRORS]
@@ -66,9 +60,7 @@ def main(arguments: Arguments) -> None:
             f"{ROBUST_POINTS} points, {100 * row['wrong']:.0f} % wrong: in "
             f"{100 * row['found']:.1f} % none of these was kept and over 90 % of the others"
         )
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(arguments.out, {"accuracy": accuracy, "robust": robust})
-    console.print(f"written to {arguments.out}")
+    write_results(arguments.out, {"accuracy": accuracy, "robust": robust})
 
 
 def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
@@ -84,34 +76,24 @@ def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
         focal="estimate",
         workers=-1,
     )
-    errors, limits = [], []
+    errors = []
     for b, problem in enumerate(problems):
-        bound = cramer_rao_bound(
-            problem.points_3d, SIMULATION_CAMERA, problem.alignment, sigma=1.0, focal="estimate"
-        )
-        draws = sample_limit(bound, rng=rng, draws=LIMIT_DRAWS)
-        limits.append([draws[error] for error in ERRORS])
-        errors.append(_errors(problem, batch, b) if batch.solved[b] else [np.inf] * len(ERRORS))
-    limit = np.median(np.concatenate(limits, axis=1), axis=1)
-    ratios = np.median(errors, axis=0) / limit
+        row = dict.fromkeys(ERRORS, np.inf)
+        if batch.solved[b]:
+            row = alignment_errors(est=batch.alignment(b), gt=problem.alignment)
+            row["focal_error"] = abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1)
+        errors.append(row)
+    ideal = ideal_errors(problems, rng, sigma=1.0, focal="estimate")
+    limit = {error: float(np.median(ideal[error])) for error in ERRORS}
     return {
         "points": points,
-        "limit_focal": float(limit[-1]),
-        "ratios": dict(zip(ERRORS, ratios.tolist(), strict=True)),
+        "limit_focal": limit["focal_error"],
+        "ratios": {
+            error: float(np.median([row[error] for row in errors])) / limit[error]
+            for error in ERRORS
+        },
         "failed": float(1 - batch.solved.mean()),
     }
-
-
-def _errors(problem: Problem, batch: cadalign.BatchResult, b: int) -> list[float]:
-    est, gt = batch.alignment(b), problem.alignment
-    _, scale_y, scale_z = metrics.scale_error(est=est, gt=gt)
-    return [
-        metrics.rotation_error(est=est, gt=gt),
-        metrics.translation_error(est=est, gt=gt),
-        scale_y,
-        scale_z,
-        abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1),
-    ]
 
 
 def _robust(arguments: Arguments, share: float) -> dict[str, float]:

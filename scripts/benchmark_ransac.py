@@ -17,28 +17,25 @@ import cv2
 import numpy as np
 import poselib
 import tyro
+from common import Benchmark, new_table, write_results
 from rich.console import Console
-from rich.table import Table
 
 import cadalign
 from cadalign import Alignment, RansacOptions, metrics
 from cadalign.datasets import Bundler, Colmap, Correspondences
-from cadalign.io.files import write_json
 
 OPTIONS = {"max_reproj_error": 4.0, "success_prob": 0.9999}
 OPENCV_DRAWS = 2  # it takes the better part of a second
 
 
-@dataclass
-class Arguments:
+@dataclass(kw_only=True)
+class Arguments(Benchmark):
     """Measure the robust search on real correspondences."""
 
     colmap: Path
     """Folder of a COLMAP model."""
     bundler: Path
     """Folder of a Bundler model."""
-    out: Path = Path("bench/ransac.json")
-    """JSON file to write."""
     draws: int = 20
     """Draws of scales and outliers for each image."""
     outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
@@ -48,14 +45,12 @@ class Arguments:
 def main(arguments: Arguments) -> None:
     """Run all measurements."""
     console = Console(width=110)
-    table = Table(title="Robust search: success (R < 0.5 deg, scales within 1 %), median times")
-    for column in ("model", "outliers", "success", "ms", "over PoseLib", "over cv2 RANSAC EPNP"):
-        table.add_column(column, justify="right")
+    title = "Robust search: success (R < 0.5 deg, scales within 1 %), median times"
+    columns = ("model", "outliers", "success", "ms", "over PoseLib", "over cv2 RANSAC EPNP")
+    table = new_table(title, *columns)
     rows = []
-    for name, images in (
-        ("COLMAP", list(Colmap(arguments.colmap))),
-        ("Bundler", list(Bundler(arguments.bundler))),
-    ):
+    models = {"COLMAP": list(Colmap(arguments.colmap)), "Bundler": list(Bundler(arguments.bundler))}
+    for name, images in models.items():
         for share in arguments.outliers:
             row = {"model": name, **_measure(images, share, arguments.draws)}
             rows.append(row)
@@ -68,8 +63,7 @@ def main(arguments: Arguments) -> None:
                 f"{row['over_opencv']:.3f}",
             )
     console.print(table)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(arguments.out, rows)
+    write_results(arguments.out, rows)
 
 
 def _measure(images: list[Correspondences], share: float, draws: int) -> dict[str, float]:

@@ -7,20 +7,18 @@ programs may share the machine.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from timeit import repeat
 from typing import Any
 
 import numpy as np
 import tyro
+from common import Benchmark, new_table, write_results
 from rich.console import Console
-from rich.table import Table
 
 from cadalign import Alignment, Camera
 from cadalign.errors import RenderError
-from cadalign.io.files import write_json
 from cadalign.render import (
     RaycastRenderer,
     Renderer,
@@ -45,11 +43,9 @@ LIMITS = {
 
 
 @dataclass
-class Arguments:
+class Arguments(Benchmark):
     """Measure the renderers' speed at 640 x 480 px on 20,480 triangles."""
 
-    out: Path = Path("bench/render.json")
-    """JSON file to write."""
     repetitions: int = 15
     """Timed frames per figure; the median counts."""
 
@@ -65,16 +61,13 @@ def main(arguments: Arguments) -> None:
         for name, task in tasks(scene, camera, pose).items()
     ]
     share = float(cast_geometry(scene, camera, pose).mask.mean())
-    table = Table(title=f"640 x 480 px, 20,480 triangles on {100 * share:.0f} % of the image")
-    table.add_column("task")
-    for name in ("median ms", "smallest ms", "limit ms"):
-        table.add_column(name, justify="right")
+    title = f"640 x 480 px, 20,480 triangles on {100 * share:.0f} % of the image"
+    table = new_table(title, "task", "median ms", "smallest ms", "limit ms")
     for row in rows:
         limit = "" if row["limit"] is None else f"{row['limit']:g}"
         table.add_row(row["task"], f"{row['median']:.2f}", f"{row['smallest']:.2f}", limit)
     Console(width=100).print(table)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_json(arguments.out, {"cores": os.cpu_count(), "timings": rows})
+    write_results(arguments.out, {"cores": os.cpu_count(), "timings": rows})
 
 
 def tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[], object]]:
@@ -110,11 +103,7 @@ def tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[
 def timed(name: str, task: Callable[[], object], repetitions: int) -> dict[str, Any]:
     """Times [ms] of a task, after a first run that prepares what is prepared once."""
     task()
-    times = []
-    for _ in range(repetitions):
-        begin = time.perf_counter()
-        task()
-        times.append(1000 * (time.perf_counter() - begin))
+    times = [1000 * seconds for seconds in repeat(task, number=1, repeat=repetitions)]
     median = float(np.median(times))
     return {"task": name, "median": median, "smallest": min(times), "limit": LIMITS.get(name)}
 

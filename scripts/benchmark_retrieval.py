@@ -1,31 +1,42 @@
 """Measure retrieval: time of a query and memory, for real and for 50,000 synthetic models.
 
-    python scripts/benchmark_retrieval.py KEYPOINTNET
-
 The synthetic models are the real ones with their keypoints moved by 3 % of the extent. Times are
 the least of three calls with as many threads as there are cores, after warm-up.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from cadalign import Library
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
+from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.retrieval import LibraryModel
 
 KEYPOINTS = 8
 CALLS = 3
+
+
+@dataclass
+class Arguments:
+    """Measure retrieval: time of a query and memory."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder in KeypointNet's layout."""
+    queries: int = 20
+    """Timed queries per size of the library and noise."""
+    made: int = 50_000
+    """Models of the library that is filled up with synthetic ones."""
 
 
 def jittered(models: Sequence[LibraryModel], count: int) -> Library:
@@ -41,14 +52,22 @@ def jittered(models: Sequence[LibraryModel], count: int) -> Library:
     return Library.from_models(made)
 
 
+def observed(
+    models: Sequence[LibraryModel], noise_px: float, *, seed: int
+) -> Iterator[tuple[LibraryModel, RetrievalQuery]]:
+    """The models that show enough keypoints, each with an observation of it."""
+    for model in models:
+        try:
+            seen = observe_model(model, RetrievalTask(*model.key, noise_px, KEYPOINTS), seed=seed)
+        except DegenerateError:
+            continue
+        yield model, seen
+
+
 def measure(library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int) -> str:
     """Text on the times of queries for some of the models."""
     wall, busy, found = [], [], 0
-    for model in models:
-        try:
-            seen = observe_model(model, RetrievalTask(*model.key, noise_px, KEYPOINTS), seed=0)
-        except DegenerateError:
-            continue
+    for model, seen in islice(observed(models, noise_px, seed=0), queries):
         least_wall, least_busy = np.inf, np.inf
         for _ in range(CALLS):
             start, start_busy = time.perf_counter(), time.process_time()
@@ -60,8 +79,6 @@ def measure(library: Library, models: Sequence[LibraryModel], noise_px: float, q
         wall.append(1e3 * least_wall)
         busy.append(1e3 * least_busy)
         found += (matches[0].category, matches[0].model_id) == model.key
-        if len(wall) == queries:
-            break
     return (
         f"{noise_px:g} px: median {np.median(wall):.0f} ms, longest {max(wall):.0f} ms "
         f"(processor time {np.median(busy):.0f} ms, {max(busy):.0f} ms); "
@@ -69,12 +86,8 @@ def measure(library: Library, models: Sequence[LibraryModel], noise_px: float, q
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("root", type=Path, help="folder in KeypointNet's layout")
-    parser.add_argument("--queries", type=int, default=20)
-    parser.add_argument("--made", type=int, default=50_000)
-    arguments = parser.parse_args()
+def main(arguments: Arguments) -> None:
+    """Measure both libraries."""
     real = Library.from_dataset(KeypointNet(arguments.root))
     rng = np.random.default_rng(0)
     models = [model for model in real if len(model.xyz) >= KEYPOINTS]
@@ -91,21 +104,14 @@ def main() -> None:
                 f"{len(opened):,} models: {path.stat().st_size / 1e6:.1f} MB, "
                 f"opened in {seconds:.3f} s"
             )
-            opened.retrieve(*_first_query(models), sigma=1.0)
+            warm_up = next(observed(models, 1.0, seed=1), None)
+            if warm_up is None:
+                raise SystemExit("no model shows enough keypoints")
+            seen = warm_up[1]
+            opened.retrieve(seen.points_2d, seen.semantic_ids, seen.camera, sigma=1.0)
             for noise_px in (1.0, 3.0, 5.0):
                 print(f"  {measure(opened, models, noise_px, arguments.queries)}")
 
 
-def _first_query(models: Sequence[LibraryModel]) -> tuple:
-    """A query to warm up with."""
-    for model in models:
-        try:
-            seen = observe_model(model, RetrievalTask(*model.key, 1.0, KEYPOINTS), seed=1)
-        except DegenerateError:
-            continue
-        return seen.points_2d, seen.semantic_ids, seen.camera
-    raise SystemExit("no model shows enough keypoints")
-
-
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Arguments))

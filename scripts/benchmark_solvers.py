@@ -6,23 +6,23 @@ differ and are noisy. Prints tables and writes a JSON file.
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from timeit import repeat
 
 import cv2
 import numpy as np
 import tyro
+from common import Benchmark, ideal_errors, new_table, write_results
 from rich.console import Console
-from rich.table import Table
 
 import cadalign
-from cadalign import metrics
+from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
-from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.outcome import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
 from cadalign.fitting.noise import whitening_of
 from cadalign.solvers.linear import aepnp
@@ -34,16 +34,16 @@ ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.
 SPEED_SIZES = (10, 100, 1024, 4096)
 METHODS = ("optimal", "aepnp", "aepnp-paper")
 ERRORS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
-LIMIT_DRAWS = 20
 CALLS_PER_TURN = 10
+
+Source = tuple[str, float, Callable[[np.random.Generator], Problem]]
+"""Name, noise [px], and a function that draws a problem."""
 
 
 @dataclass
-class Arguments:
+class Arguments(Benchmark):
     """Measure the solvers' accuracy and speed."""
 
-    out: Path = Path("bench/solvers.json")
-    """JSON file to write."""
     problems: int = 2000
     """Random problems per row."""
     repetitions: int = 300
@@ -62,30 +62,24 @@ def main(arguments: Arguments) -> None:
         "minimal": _minimal(arguments, console),
         "speed": list(_speed(arguments, console)),
     }
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    arguments.out.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-    console.print(f"written to {arguments.out}")
+    write_results(arguments.out, results)
 
 
 def _accuracy(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
     """Rows of errors over those of the limit."""
-    table = Table(title="Errors over the Cramer-Rao limit's: median (90th percentile)")
-    for column in ("problems", "limit R deg", "method", "R", "t", "s_y", "s_z", "failed", "missed"):
-        table.add_column(column, justify="right")
-    sources: list[tuple[str, float, Callable[[np.random.Generator], Problem]]] = [
-        (
-            f"{points} points, {noise:g} px",
-            noise,
-            lambda rng, n=points, s=noise: simulate_problem(rng, points=n, noise_px=s),
-        )
-        for points, noise in ACCURACY_ROWS
+    title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
+    columns = ("problems", "limit R deg", "method", "R", "t", "s_y", "s_z", "failed", "missed")
+    table = new_table(title, *columns)
+    sources: list[Source] = [
+        (f"{n} points, {noise:g} px", noise, partial(simulate_problem, points=n, noise_px=noise))
+        for n, noise in ACCURACY_ROWS
     ]
     if arguments.keypointnet is not None:
         sources += _keypointnet_sources(arguments.keypointnet)
     for name, noise, draw in sources:
         rng = np.random.default_rng(arguments.seed)
         problems = [draw(rng) for _ in range(arguments.problems)]
-        limit = _limit(problems, noise, rng)
+        limit = ideal_errors(problems, rng, sigma=noise, focal="known")
         for method in METHODS:
             row = _accuracy_row(problems, noise, method, limit) | {"problems": name}
             table.add_row(
@@ -100,30 +94,22 @@ def _accuracy(arguments: Arguments, console: Console) -> Iterator[dict[str, obje
     console.print(table)
 
 
-def _keypointnet_sources(
-    root: Path,
-) -> list[tuple[str, float, Callable[[np.random.Generator], Problem]]]:
-    from cadalign.datasets import KeypointNet
-
+def _keypointnet_sources(root: Path) -> Iterator[Source]:
     dataset = KeypointNet(root)
-
-    def draw(rng: np.random.Generator, models: list[np.ndarray]) -> Problem:
-        points = models[rng.integers(len(models))]
-        chosen = points[rng.choice(len(points), 7, replace=False)]
-        scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
-        alignment = cadalign.Alignment(random_rotation(rng), [0.0, 0.0, rng.uniform(1.5, 3)], scale)
-        pixels = KEYPOINT_CAMERA.project(alignment.apply(chosen / scale))
-        pixels += rng.standard_normal(pixels.shape)
-        return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment)
-
-    sources = []
     for category in ("chair", "bottle", "airplane"):
         if category in dataset.categories:
             models = [m.keypoints.xyz for m in dataset[category] if _spans_volume(m.keypoints.xyz)]
-            sources.append(
-                (f"{category}, 7 keypoints", 1.0, lambda rng, models=models: draw(rng, models))
-            )
-    return sources
+            yield f"{category}, 7 keypoints", 1.0, partial(_keypointnet_problem, models)
+
+
+def _keypointnet_problem(models: list[np.ndarray], rng: np.random.Generator) -> Problem:
+    points = models[rng.integers(len(models))]
+    chosen = points[rng.choice(len(points), 7, replace=False)]
+    scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
+    alignment = cadalign.Alignment(random_rotation(rng), [0.0, 0.0, rng.uniform(1.5, 3)], scale)
+    pixels = KEYPOINT_CAMERA.project(alignment.apply(chosen / scale))
+    pixels += rng.standard_normal(pixels.shape)
+    return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment)
 
 
 def _spans_volume(points: np.ndarray) -> bool:
@@ -131,22 +117,6 @@ def _spans_volume(points: np.ndarray) -> bool:
         return False
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[2] > 0.05 * spread[0])
-
-
-def _limit(
-    problems: list[Problem], noise: float, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Errors of an ideal estimator on these problems."""
-    draws = []
-    for problem in problems:
-        try:
-            bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, sigma=noise, focal="known"
-            )
-        except CadalignError:
-            continue
-        draws.append(sample_limit(bound, rng=rng, draws=LIMIT_DRAWS))
-    return {error: np.concatenate([draw[error] for draw in draws]) for error in ERRORS}
 
 
 def _accuracy_row(
@@ -164,17 +134,9 @@ def _accuracy_row(
             failed += 1
             errors.append([180.0, np.inf, np.inf, np.inf])
             continue
-        est, gt = result.alignment, problem.alignment
-        _, scale_y, scale_z = metrics.scale_error(est=est, gt=gt)
-        errors.append(
-            [
-                metrics.rotation_error(est=est, gt=gt),
-                metrics.translation_error(est=est, gt=gt),
-                scale_y,
-                scale_z,
-            ]
-        )
-        missed += method == "optimal" and _is_missed(problem, noise, est)
+        found = alignment_errors(est=result.alignment, gt=problem.alignment)
+        errors.append([found[error] for error in ERRORS])
+        missed += method == "optimal" and _is_missed(problem, noise, result.alignment)
     levels = (50, 90)
     table = np.array(errors)
     ratios = {
@@ -206,17 +168,11 @@ def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
     found = solutions = 0
     for _ in range(arguments.problems):
         problem = simulate_problem(rng, points=4, noise_px=0.0)
-        gt = problem.alignment
-        rotations, translations, scales = ap4p(
-            problem.points_3d, problem.camera.normalize(problem.points_2d)
-        )
-        solutions += len(rotations)
-        found += any(
-            np.abs(rotation - gt.rotation).max() < 1e-4
-            and np.abs(translation - gt.translation).max() < 1e-4
-            and np.abs(scale - gt.scale).max() < 1e-4
-            for rotation, translation, scale in zip(rotations, translations, scales, strict=True)
-        )
+        rays = problem.camera.normalize(problem.points_2d)
+        rotations, translations, scales = ap4p(problem.points_3d, rays)
+        poses = np.concatenate([rotations.reshape(-1, 9), translations, scales], axis=1)
+        solutions += len(poses)
+        found += (np.abs(poses - problem.alignment.packed) < 1e-4).all(axis=1).any()
     result = {
         "truth_found": found / arguments.problems,
         "mean_solutions": solutions / arguments.problems,
@@ -230,9 +186,8 @@ def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
 
 def _speed(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
     """Medians of running times as ratios to OpenCV's."""
-    table = Table(title="Time over OpenCV's (which does not stretch): ratios of medians")
-    for column in ("points", "what", "microseconds", "over", "ratio"):
-        table.add_column(column, justify="right")
+    title = "Time over OpenCV's (which does not stretch): ratios of medians"
+    table = new_table(title, "points", "what", "microseconds", "over", "ratio")
     rng = np.random.default_rng(arguments.seed)
     for points in SPEED_SIZES:
         problem = simulate_problem(rng, points=points, noise_px=1.0)
@@ -264,37 +219,21 @@ def _speed_rows(problem: Problem, points: int, repetitions: int) -> Iterator[dic
     if points == 10:
         count = 10_000
         xs, uvs = np.tile(x, (count, 1, 1)), np.tile(uv, (count, 1, 1))
-        batch = {
-            "fit_batch aepnp, 1 thread": 1,
-            "fit_batch aepnp, all cores": -1,
-        }
-        for name, workers in batch.items():
-            run = {
-                name: lambda w=workers: cadalign.fit_batch(
-                    xs, uvs, camera, method="aepnp", workers=w
-                )
-            }
-            medians[name] = _interleaved_medians(run, 9)[name] / count
-    for name, seconds in medians.items():
-        if name.startswith("cv2"):
-            continue
+        for name, workers in {"1 thread": 1, "all cores": -1}.items():
+            run = partial(cadalign.fit_batch, xs, uvs, camera, method="aepnp", workers=workers)
+            name = f"fit_batch aepnp, {name}"
+            medians[name] = _interleaved_medians({name: run}, 9)[name] / count
+    ours = [name for name in medians if not name.startswith("cv2")]
+    for name in (*ours, "cv2 SQPNP"):
         peer = "cv2 ITERATIVE" if name == "fit optimal" else "cv2 EPNP"
         yield {
             "points": points,
             "what": name,
-            "microseconds": 1e6 * seconds,
+            "microseconds": 1e6 * medians[name],
             "peer": peer,
             "peer_microseconds": 1e6 * medians[peer],
-            "ratio": seconds / medians[peer],
+            "ratio": medians[name] / medians[peer],
         }
-    yield {
-        "points": points,
-        "what": "cv2 SQPNP",
-        "microseconds": 1e6 * medians["cv2 SQPNP"],
-        "peer": "cv2 EPNP",
-        "peer_microseconds": 1e6 * medians["cv2 EPNP"],
-        "ratio": medians["cv2 SQPNP"] / medians["cv2 EPNP"],
-    }
 
 
 def _interleaved_medians(
@@ -309,10 +248,7 @@ def _interleaved_medians(
         function()
     for _ in range(-(-repetitions // CALLS_PER_TURN)):
         for name, function in timed.items():
-            for _ in range(CALLS_PER_TURN):
-                start = time.perf_counter()
-                function()
-                times[name].append(time.perf_counter() - start)
+            times[name] += repeat(function, number=1, repeat=CALLS_PER_TURN)
     return {name: float(np.median(values)) for name, values in times.items()}
 
 

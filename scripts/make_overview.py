@@ -6,15 +6,14 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import tyro
+from common import write_row
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.instance import make_instance
+from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.fitting.fit import fit
 from cadalign.geometry.box import Box
-from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
@@ -35,15 +34,14 @@ def main(arguments: Arguments) -> None:
     with tempfile.TemporaryDirectory() as folder:
         dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
         pictures = [_overlay(dataset, *model) for model in MODELS]
-    row = np.hstack(pictures)
-    height = round(row.shape[0] * arguments.width / row.shape[1])
-    small = cv2.resize(row, (arguments.width, height), interpolation=cv2.INTER_AREA)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_image(arguments.out, small)
+    write_row(arguments.out, pictures, width=arguments.width)
 
 
 def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
-    instance = make_instance(dataset[category, f"sample_{category}_{number}"], seed=0)
+    model = dataset[category, f"sample_{category}_{number}"]
+    instance = make_instance(
+        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
+    )
     result = fit(instance.points_3d, instance.points_2d, instance.camera)
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)
     return draw_overlay(

@@ -30,13 +30,13 @@ def main() -> int:
 
 def _announce(what: str) -> Callable[[Progress], None]:
     start = time.monotonic()
-    shown = [0.0]
+    shown = 0.0
 
     def show(progress: Progress) -> None:
+        nonlocal shown
         now = time.monotonic()
-        finished = progress.done == progress.total
-        if finished or now - shown[0] > 5:
-            shown[0] = now
+        if progress.done == progress.total or now - shown > 5:
+            shown = now
             print(f"{what}: {progress.done} of {progress.total}, {now - start:.0f} s", flush=True)
 
     return show

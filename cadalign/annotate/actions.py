@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,18 +19,10 @@ _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of an action beside the changed document.
+    """Outcome of an action beside the changed document, for the user."""
 
-    Parameters
-    ----------
-    selected : int, optional
-        Number of the pair that was placed or changed.
-    message : str
-        Message for the user, such as that the click missed the model.
-    """
-
-    selected: int | None = None
-    message: str = ""
+    selected: int | None = None  # number of the pair that was placed or changed
+    message: str = ""  # such as that the click missed the model
 
 
 class Action(ForeignDocument):
@@ -41,11 +33,16 @@ class Action(ForeignDocument):
         raise NotImplementedError
 
 
-class PlaceUv(Action):
-    """Place a photo half, by preference of the given pair."""
+class _Placing(Action, kw_only=True):
+    """Place a half, by preference of the given pair."""
+
+    pair: Index | None = None
+
+
+class PlaceUv(_Placing):
+    """Place a photo half."""
 
     uv: Point2
-    pair: Index | None = None
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
         document, pair = state.document.place_uv(_inside(self.uv, state), self.pair)
@@ -53,24 +50,22 @@ class PlaceUv(Action):
         return Outcome(pair)
 
 
-class PlaceKeypoint(Action):
+class PlaceKeypoint(_Placing):
     """Place a model half: a keypoint of the registry."""
 
     keypoint: Index
-    pair: Index | None = None
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
         session.registry[self.keypoint]  # refuses an unknown one
         return _place(self.keypoint, self.pair, state)
 
 
-class Pick(Action):
+class Pick(_Placing):
     """Place a model half by a ray, or the keypoint ``near`` the click if it is visible."""
 
     origin: Point3
     direction: Point3
     near: Index | None = None
-    pair: Index | None = None
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
         model, registry = session.model, session.registry
@@ -83,10 +78,8 @@ class Pick(Action):
         return _place(registry.add(point), self.pair, state)
 
 
-class PlaceSuggested(Action):
+class PlaceSuggested(_Placing):
     """Place the suggested keypoint."""
-
-    pair: Index | None = None
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
         _, suggestion = session.live(state)
@@ -165,7 +158,8 @@ class Focal(Action):
                     where="pixels",
                     fix=f"give {low:.0f} to {high:.0f} px",
                 )
-        state.history.record(state.document.choose_focal(FocalChoice(self.known, self.pixels)))
+        focal = FocalChoice(self.known, self.pixels)
+        state.history.record(replace(state.document, focal=focal))
         return Outcome()
 
 

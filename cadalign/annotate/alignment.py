@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.intrinsics import Intrinsics
 from cadalign.annotate.outliers import Rows, find_outliers
+from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit
@@ -23,26 +23,15 @@ _LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, if the pairs leave
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
-    """Alignment of the pairs placed so far.
+    """Alignment of the pairs placed so far, as `cadalign fit` finds it.
 
-    Parameters
-    ----------
-    result : FitResult, optional
-        As `cadalign fit` finds it; None without enough pairs, or if they are degenerate.
-    message : str
-        Reason for a missing result, or an assumption that was made; may be empty.
-    outliers : dict of int to float
-        See `find_outliers`.
-    sigma : float
-        Standard deviation of the pairs: 1 px, or more if the residuals are larger.
-    provisional : bool
-        True if the pairs alone did not suffice: the stretch or the focal length was assumed.
+    It is provisional if the pairs alone did not suffice: stretch or focal length were assumed.
     """
 
-    result: FitResult | None = None
-    message: str = ""
-    outliers: dict[int, float] = field(default_factory=dict)
-    sigma: float = _LEAST_SIGMA
+    result: FitResult | None = None  # None without enough pairs, or if they are degenerate
+    message: str = ""  # reason for a missing result, or an assumption that was made
+    outliers: dict[int, float] = field(default_factory=dict)  # see `find_outliers`
+    sigma: float = _LEAST_SIGMA  # of the pairs [px], larger if the residuals are
     provisional: bool = False
 
     @property
@@ -63,25 +52,14 @@ def align(
     intrinsics: Intrinsics,
     choice: FocalChoice,
 ) -> LiveAlignment:
-    """Fit the model to the complete pairs.
-
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-    points_2d : (n, 2) float
-        [px]
-    sigma : (n,) float, optional
-        Standard deviations [px]; by default 1 px each.
-    intrinsics : Intrinsics
-    choice : FocalChoice
-    """
+    """Fit the model to the complete pairs: (n, 3), (n, 2) [px] and (n,) [px], by default 1."""
     count = len(points_3d)
     if count < LEAST_PAIRS:
         missing = LEAST_PAIRS - count
         return LiveAlignment(
             message=f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
-    fitter = _Fitter(points_3d, points_2d, sigma, intrinsics, choice)
+    fitter = _Fitter(points_3d, points_2d, sigma, intrinsics, choice, None)
     message = ""
     if not choice.known and count <= LEAST_PAIRS:
         fitter = replace(fitter, choice=replace(choice, known=True))
@@ -97,7 +75,7 @@ def align(
             return LiveAlignment(message=f"No alignment yet: {error.what}.")
     except CadalignError as error:
         return LiveAlignment(message=f"No alignment: {error}.")
-    unknowns = len(result.covariance) if result.covariance is not None else 8
+    unknowns = 8 if result.covariance is None else len(result.covariance)
     whitened = result.residuals if sigma is None else result.residuals / sigma[:, None]
     redundancy = 2 * count - unknowns
     estimated = np.sqrt(float((whitened**2).sum()) / redundancy) if redundancy > 0 else 0.0
@@ -119,24 +97,25 @@ class _Fitter:
     sigma: FloatArray | None
     intrinsics: Intrinsics
     choice: FocalChoice
-    scale_prior_sigma: float | None = None
+    scale_prior_sigma: float | None
 
     def fit(self) -> FitResult:
         """Fit all pairs as `cadalign fit` does."""
-        return self._fit(np.arange(len(self.points_3d)), 1.0 if self.sigma is None else self.sigma)
+        sigma = 1.0 if self.sigma is None else self.sigma
+        return self._fit(np.arange(len(self.points_3d)), sigma, "linear")
 
     def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
         """Fit some pairs; see `cadalign.annotate.outliers.FitRows`."""
-        result = self._fit(rows, _LEAST_SIGMA)
+        result = self._fit(rows, _LEAST_SIGMA, "linear")
         if robust:
             # sigma=None iterates until nothing changes, which takes ten times as long.
             for _ in range(_ROBUST_ROUNDS):
                 median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
                 sigma = max(_LEAST_SIGMA, median / _ROBUST_SHARE)
-                result = self._fit(rows, sigma, loss="cauchy")
+                result = self._fit(rows, sigma, "cauchy")
         return result
 
-    def _fit(self, rows: Rows, sigma: float | FloatArray, *, loss: str = "linear") -> FitResult:
+    def _fit(self, rows: Rows, sigma: float | FloatArray, loss: str) -> FitResult:
         return fit(
             self.points_3d[rows],
             self.points_2d[rows],

@@ -1,40 +1,27 @@
 """Annotation document of one photo: pairs of a photo point and a keypoint of the model.
 
-Documents are immutable; every edit makes a new one, which undo keeps.
+Documents are immutable; every edit makes a new one, which the history keeps for undo and redo.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from cadalign.errors import InputError
 
 Pixel = tuple[float, float]
+_LONGEST = 1000  # of a history
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One keypoint; either half may be placed first.
+    """One keypoint; either half may be placed first."""
 
-    Parameters
-    ----------
-    number : int
-        Identifier, unique in a document.
-    uv : (float, float), optional
-        The photo half [px].
-    keypoint : int, optional
-        The model half: a semantic id.
-    sigma : float, optional
-        Standard deviation of ``uv`` [px], if the observation file gives one.
-    confidence : float, optional
-        Confidence in the observation file.
-    """
-
-    number: int
-    uv: Pixel | None = None
-    keypoint: int | None = None
-    sigma: float | None = None
-    confidence: float | None = None
+    number: int  # unique in a document
+    uv: Pixel | None = None  # the photo half [px]
+    keypoint: int | None = None  # the model half: a semantic id
+    sigma: float | None = None  # of ``uv`` [px], if the observation file gives one
+    confidence: float | None = None  # in the observation file
 
     @property
     def complete(self) -> bool:
@@ -44,35 +31,18 @@ class Pair:
 
 @dataclass(frozen=True)
 class FocalChoice:
-    """The user's choice of a known or estimated focal length.
-
-    Parameters
-    ----------
-    known : bool
-        False to estimate it from the pairs.
-    pixels : float, optional
-        Typed focal length [px]; None for that of the camera.
-    """
+    """The user's choice of a known focal length, or of one estimated from the pairs."""
 
     known: bool
-    pixels: float | None = None
+    pixels: float | None = None  # as typed [px]; None for the camera's
 
 
 @dataclass(frozen=True)
 class Document:
-    """All annotations of one photo; ``next_number`` is the number of the next pair.
-
-    Examples
-    --------
-    >>> empty = Document(focal=FocalChoice(known=True))
-    >>> placed, pair = empty.place_uv((3.0, 4.0))
-    >>> placed, pair = placed.place_keypoint(7, pair)
-    >>> placed.complete_pairs
-    (Pair(number=1, uv=(3.0, 4.0), keypoint=7, sigma=None, confidence=None),)
-    """
+    """All annotations of one photo; ``next_number`` is the number of the next pair."""
 
     pairs: tuple[Pair, ...] = ()
-    focal: FocalChoice = field(default_factory=lambda: FocalChoice(known=False))
+    focal: FocalChoice = FocalChoice(known=False)
     next_number: int = 1
 
     @property
@@ -97,29 +67,15 @@ class Document:
         return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
 
     def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Document, int]:
-        """Place the photo half of a pair that lacks it, or of a new one.
+        """Place the photo half of a pair that lacks it, by preference of the pair of that number.
 
-        Parameters
-        ----------
-        uv : (float, float)
-            [px]
-        preferred : int, optional
-            Number of the pair to complete, if it lacks this half.
-
-        Returns
-        -------
-        Document
-        int
-            The pair's number.
+        If none lacks it, a new pair is begun. The second value is the pair's number.
         """
-        lacking = [pair.number for pair in self.pairs if pair.uv is None]
-        return self._fill(lacking, preferred, Pair(self.next_number, uv=uv))
+        pair = self._lacking("uv", preferred)
+        return self._with(replace(pair, uv=uv)), pair.number
 
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Document, int]:
-        """Place the model half of a pair that lacks it, or of a new one; as `place_uv`.
-
-        Raises InputError if the keypoint is already placed in the photo.
-        """
+        """Place the model half of a pair, as `place_uv`; it must not be placed already."""
         for position, pair in enumerate(self.pairs, start=1):
             if pair.keypoint == keypoint:
                 raise InputError(
@@ -127,8 +83,8 @@ class Document:
                     where="keypoint",
                     fix="move or delete that pair: a keypoint occurs once in a photo",
                 )
-        lacking = [pair.number for pair in self.pairs if pair.keypoint is None]
-        return self._fill(lacking, preferred, Pair(self.next_number, keypoint=keypoint))
+        pair = self._lacking("keypoint", preferred)
+        return self._with(replace(pair, keypoint=keypoint)), pair.number
 
     def move(self, number: int, uv: Pixel) -> Document:
         """Move the photo half of a pair."""
@@ -146,23 +102,63 @@ class Document:
         gone = self.pair(number)
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
 
-    def choose_focal(self, focal: FocalChoice) -> Document:
-        """Choose a known or an estimated focal length."""
-        return replace(self, focal=focal)
-
-    def _fill(self, lacking: list[int], preferred: int | None, half: Pair) -> tuple[Document, int]:
-        """Merge half a pair into one that lacks it, or append it."""
-        if not lacking:
-            return self.append(half), half.number
-        number = preferred if preferred in lacking else lacking[0]
-        pair = self.pair(number)
-        merged = replace(
-            pair,
-            uv=half.uv if pair.uv is None else pair.uv,
-            keypoint=half.keypoint if pair.keypoint is None else pair.keypoint,
-        )
-        return self._with(merged), number
+    def _lacking(self, half: str, preferred: int | None) -> Pair:
+        """The preferred pair if it lacks this half, otherwise the first that does, or a new one."""
+        lacking = [pair for pair in self.pairs if getattr(pair, half) is None]
+        wanted = [pair for pair in lacking if pair.number == preferred]
+        return (wanted + lacking + [Pair(self.next_number)])[0]
 
     def _with(self, changed: Pair) -> Document:
+        if changed.number == self.next_number:
+            return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
         return replace(self, pairs=pairs)
+
+
+class History:
+    """The current document, those before it, and those that were undone."""
+
+    def __init__(self, document: Document) -> None:
+        self.document = document
+        self._before: list[Document] = []
+        self._after: list[Document] = []
+        self._step: object = None
+
+    @property
+    def can_undo(self) -> bool:
+        """True if there is a change to undo."""
+        return bool(self._before)
+
+    @property
+    def can_redo(self) -> bool:
+        """True if there is a change to redo."""
+        return bool(self._after)
+
+    def record(self, document: Document, *, step: object = None) -> None:
+        """Go on to another document.
+
+        Consecutive changes with the same ``step`` are undone together, such as the positions of a
+        point while it is dragged.
+        """
+        if step is None or step != self._step or not self._before:
+            self._before.append(self.document)
+            del self._before[:-_LONGEST]
+        self._after.clear()
+        self.document = document
+        self._step = step
+
+    def undo(self) -> bool:
+        """Go back by one change; returns False if there is none."""
+        return self._go(self._before, self._after)
+
+    def redo(self) -> bool:
+        """Redo the last undone change; returns False if there is none."""
+        return self._go(self._after, self._before)
+
+    def _go(self, source: list[Document], target: list[Document]) -> bool:
+        self._step = None
+        if not source:
+            return False
+        target.append(self.document)
+        self.document = source.pop()
+        return True

@@ -60,15 +60,7 @@ class _Unfinished(JsonDocument):
 
 @dataclass(frozen=True)
 class AnnotationFiles:
-    """Files of one photo.
-
-    Parameters
-    ----------
-    observation : Path
-        The observation file; it need not exist yet.
-    image, model : Path
-        Photo and mesh, which the observation names.
-    """
+    """Files of one photo; the observation, which names photo and mesh, need not exist yet."""
 
     observation: Path
     image: Path
@@ -84,26 +76,17 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(
-        self, empty: Document, registry: KeypointRegistry, diagonal: float
-    ) -> tuple[Document, Camera | None]:
-        """Read an earlier session's annotation into the ``empty`` document.
+    def read(self, registry: KeypointRegistry, diagonal: float) -> tuple[Document, Camera | None]:
+        """Read an earlier session's annotation.
 
-        New model points are added to the registry; ``diagonal`` is that of the model's box.
-
-        Returns
-        -------
-        Document
-        Camera or None
-            The observation's camera, if the file exists.
-
-        Raises DataError if a file is malformed or belongs to another model.
+        New model points are added to the registry; ``diagonal`` is that of the model's box. The
+        second value is the observation's camera, if the file exists.
         """
-        document, camera = empty, None
+        document, camera = Document(), None
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
-            document = _with_pairs(document, observation, registry, diagonal)
+            document = _document_of(observation, registry, diagonal)
         if self.unfinished.exists():
             document = _with_halves(document, self.unfinished, registry)
         return document, camera
@@ -116,10 +99,10 @@ class AnnotationFiles:
             points_3d=registry.xyz(keypoints),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=camera,
-            sigma=sigmas_of(pairs),
+            sigma=filled(pair.sigma for pair in pairs),
             semantic_ids=np.array(keypoints, dtype=np.int64),
             names=tuple(registry[keypoint].name for keypoint in keypoints),
-            confidences=_filled([pair.confidence for pair in pairs]),
+            confidences=filled(pair.confidence for pair in pairs),
             image=self.image,
             model=self.model,
         )
@@ -159,9 +142,12 @@ class AnnotationFiles:
         return observation
 
 
-def sigmas_of(pairs: Iterable[Pair]) -> FloatArray | None:
-    """Standard deviations (n,) of complete pairs, 1 px by default; None if no pair has one."""
-    return _filled([pair.sigma for pair in pairs])
+def filled(values: Iterable[float | None]) -> FloatArray | None:
+    """The values (n,), 1 where one is missing; None if all are missing."""
+    listed = list(values)
+    if all(value is None for value in listed):
+        return None
+    return np.array([1.0 if value is None else value for value in listed])
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
@@ -191,16 +177,8 @@ def write_keypoints(
     ModelKeypoints(kept, model).save(path)
 
 
-def _filled(values: list[float | None]) -> FloatArray | None:
-    """The values, 1 where one is missing; None if all are missing."""
-    if all(value is None for value in values):
-        return None
-    return np.array([1.0 if value is None else value for value in values])
-
-
-def _with_pairs(
-    document: Document, observation: Observation, registry: KeypointRegistry, diagonal: float
-) -> Document:
+def _document_of(observation: Observation, registry: KeypointRegistry, diagonal: float) -> Document:
+    document = Document()
     ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)

@@ -17,10 +17,7 @@ _LONGEST_NAME = 80
 class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
-    Parameters
-    ----------
-    given : iterable of ModelKeypoint
-        Keypoints given with the model; the attribute ``given`` holds their semantic ids.
+    The attribute ``given`` holds the semantic ids of those given with the model.
     """
 
     def __init__(self, given: Iterable[ModelKeypoint] = ()) -> None:

@@ -1,7 +1,8 @@
-"""CAD model in the annotator: exact points on its full mesh, independent of what is displayed."""
+"""CAD model in the annotator: exact points on its full mesh, and its simplified display."""
 
 from __future__ import annotations
 
+import json
 from functools import cached_property
 
 import numpy as np
@@ -11,8 +12,12 @@ from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import simplify
+from cadalign.render.drawing.color import bytes_from_linear
+from cadalign.render.raycast.caster import FaceArray
 from cadalign.render.scene import Scene
 
+MOST_FACES = 150_000  # that are displayed
 _SAMPLES = 96
 _SAMPLED_FROM = 20_000
 _NEAREST_SAMPLES = 2e-3  # in diagonals
@@ -23,22 +28,7 @@ _EXACT = 1e-6
 
 
 class CadModel:
-    """A mesh that can be clicked on.
-
-    Parameters
-    ----------
-    mesh : Mesh
-
-    Attributes
-    ----------
-    scene : Scene
-    center : (3,) float
-        The middle of its bounding box [model units].
-    diagonal : float
-        The length of the box's diagonal [model units].
-
-    Raises InputError if the mesh is a single point.
-    """
+    """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.scene = Scene(mesh)
@@ -57,20 +47,7 @@ class CadModel:
         return np.asarray(np.asarray(xyz, dtype=float) * self.diagonal + self.center)
 
     def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> ModelKeypoint | None:
-        """Intersect a ray with the surface.
-
-        Parameters
-        ----------
-        origin, direction : (3,) float
-            In model coordinates.
-
-        Returns
-        -------
-        ModelKeypoint or None
-            The first intersection; None if the ray misses.
-
-        Raises InputError if the ray is not made of finite numbers, or its direction is zero.
-        """
+        """Intersect a ray, in model coordinates, with the surface; None if it misses."""
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))
         if not along.any():
@@ -134,3 +111,29 @@ class CadModel:
             return ModelKeypoint(name="", xyz=(x, y, z))
         a, b, c = weights.tolist()
         return ModelKeypoint(name="", xyz=(x, y, z), face_index=face, barycentric=(a, b, c))
+
+
+def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
+    """Encode the model for display, simplified to at most ``max_faces`` triangles.
+
+    First the length of a JSON header (uint32, little-endian, a multiple of 4 with padding), and the
+    header with ``shown`` and ``all``, the numbers of faces; then positions (faces, 3, 3) float32 in
+    display coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
+    """
+    mesh = model.scene.mesh
+    small = simplify(mesh, max_faces=max_faces)
+    shown = Mesh(model.to_display(small.vertices), small.faces)
+    header = json.dumps({"shown": len(small.faces), "all": len(mesh.faces)}).encode()
+    header += b" " * (-len(header) % 4)
+    weights = np.full((len(small.faces), 3), 1 / 3, dtype=np.float32)
+    triangles: FaceArray = small.source.astype(np.int32)
+    color = model.scene.surface.color(triangles, weights)
+    return b"".join(
+        [
+            len(header).to_bytes(4, "little"),
+            header,
+            shown.triangles.astype("<f4").tobytes(),
+            Scene(shown).corner_normals.astype("<f4").tobytes(),
+            bytes_from_linear(color[:, :3]).tobytes(),
+        ]
+    )

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
-from cadalign.annotate.document import Document, FocalChoice
-from cadalign.annotate.files import (
-    SAME_PLACE,
-    AnnotationFiles,
-    keypoints_file,
-    refuse_other_model,
-)
-from cadalign.annotate.history import History
-from cadalign.annotate.intrinsics import intrinsics_of, read_camera
+from cadalign.annotate.document import FocalChoice, History
+from cadalign.annotate.files import SAME_PLACE, AnnotationFiles, keypoints_file, refuse_other_model
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.photos import Photo, find_photos, intrinsics_of, read_camera
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
@@ -26,23 +21,11 @@ from cadalign.geometry.camera import Camera
 logger = logging.getLogger("cadalign")
 
 
-def open_session(
-    *,
-    image: Path,
-    model: Path,
-    observation: Path | None = None,
-    camera: Path | None = None,
-    keypoints: Path | None = None,
-    out: Path | None = None,
-) -> Session:
-    """Open an annotation session.
-
-    The parameters are the options of `cadalign annotate`.
-
-    Raises CadalignError if a file is missing or malformed, or the arguments contradict each other.
-    """
+def open_session(options: SessionOptions) -> Session:
+    """Open an annotation session."""
+    image, model, observation = options.image, options.model, options.observation
     paths = find_photos(image)
-    if observation is not None and (image.is_dir() or out is not None):
+    if observation is not None and (image.is_dir() or options.out is not None):
         raise InputError(
             "names the file of a single photo, but a folder is given too",
             where="--observation",
@@ -50,18 +33,16 @@ def open_session(
         )
     photos = [Photo.open(paths[0])] if not image.is_dir() else _readable(paths)
     photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
-    if observation is None:
-        files = _observation_files(photos, out or paths[0].parent)
-    else:
-        files = [observation]
+    out = options.out or paths[0].parent
+    files = [observation] if observation is not None else _observation_files(photos, out)
     folder = files[0].parent
-    given_camera = None if camera is None else read_camera(camera)
+    camera = None if options.camera is None else read_camera(options.camera)
     cad = CadModel(load_mesh(model))
     registry_file = keypoints_file(model, folder)
-    source = keypoints or keypoints_file(model, model.parent)
+    source = options.keypoints or keypoints_file(model, model.parent)
     registry = _open_registry(registry_file, source, model, cad)
     photo_states = [
-        _open_photo_state(photo, file, model, given_camera, registry, cad.diagonal)
+        _open_photo_state(photo, file, model, camera, registry, cad.diagonal)
         for photo, file in zip(photos, files, strict=True)
     ]
     return Session(cad, registry, photo_states, registry_file)
@@ -90,7 +71,7 @@ def _open_photo_state(
     diagonal: float,
 ) -> PhotoState:
     files = AnnotationFiles(file, photo.path, model)
-    document, own = files.read(Document(), registry, diagonal)
+    document, own = files.read(registry, diagonal)
     if own is not None and not own.focal_known:
         # The file leaves it to be estimated; the given camera's is kept for the user to choose.
         intrinsics = intrinsics_of(photo, camera or own)
@@ -98,7 +79,7 @@ def _open_photo_state(
     else:
         intrinsics = intrinsics_of(photo, own or camera)
         known = intrinsics.calibrated
-    document = document.choose_focal(FocalChoice(known=known))
+    document = replace(document, focal=FocalChoice(known=known))
     return PhotoState(photo, files, intrinsics, History(document))
 
 

@@ -34,21 +34,8 @@ def find_outliers(
     changes, so that several outliers do not mask each other. The noise is estimated from the
     inliers, since all pairs of a model that is only similar to the object are some pixels off.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-    points_2d : (n, 2) float
-        [px]
-    fit_rows : callable
-    unknowns : int
-        Number of unknowns of a fit.
-
-    Returns
-    -------
-    dict of int to float
-        By row, the distance of the outlier from the prediction of the fit to the inliers [px].
-        Empty with too few pairs: without one of them, at least two more equations than unknowns
-        must be left.
+    Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
+    with too few pairs: without one, at least two more equations than unknowns must be left.
     """
     count = len(points_3d)
     least = unknowns // 2 + 1

@@ -17,24 +17,21 @@ from cadalign.arrays import FloatArray
 
 
 def page_state(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
-    """Collect everything that the page shows of a photo.
-
-    Parameters
-    ----------
-    session : Session
-    number : int
-        Number of the photo, counted from 0.
-    outcome : Outcome, optional
-        Outcome of the last action.
-
-    Raises InputError if there is no such photo.
-    """
+    """Collect everything that the page shows of a photo, after an action of that outcome."""
     outcome = outcome or Outcome()
     with session.lock:
         state = session.photo_state(number)
         live, suggestion = session.live(state)
+        focal = state.document.focal
         return {
-            "image": _image(session, number, state),
+            "image": {
+                "number": number,
+                "count": len(session.photos),
+                "name": state.photo.path.name,
+                "width": state.photo.width,
+                "height": state.photo.height,
+                "model": state.files.model.name,
+            },
             "saved": {
                 "path": state.files.observation.name,
                 "at": state.saved_at,
@@ -44,7 +41,12 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
             "message": outcome.message,
             "can_undo": state.history.can_undo,
             "can_redo": state.history.can_redo,
-            "focal": _focal(state),
+            "focal": {
+                "known": focal.known,
+                "pixels": round(state.intrinsics.with_focal(focal).fx, 2),
+                "typed": focal.pixels,
+                "note": state.intrinsics.note,
+            },
             "pairs": _pairs(session, state, live),
             "keypoints": _keypoints(session, state),
             "alignment": _alignment(session, live),
@@ -52,46 +54,24 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
         }
 
 
-def _image(session: Session, number: int, state: PhotoState) -> dict[str, Any]:
-    photo = state.photo
-    return {
-        "number": number,
-        "count": len(session.photos),
-        "name": photo.path.name,
-        "width": photo.width,
-        "height": photo.height,
-        "model": state.files.model.name,
-    }
-
-
-def _focal(state: PhotoState) -> dict[str, Any]:
-    choice = state.document.focal
-    return {
-        "known": choice.known,
-        "pixels": round(state.intrinsics.with_focal(choice).fx, 2),
-        "typed": choice.pixels,
-        "note": state.intrinsics.note,
-    }
-
-
 def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
     pairs, row = [], 0
     for position, pair in enumerate(state.document.pairs, start=1):
+        point = None if pair.keypoint is None else session.registry[pair.keypoint]
         entry: dict[str, Any] = {
             "pair": pair.number,
             "position": position,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
-            "name": "" if pair.keypoint is None else session.registry[pair.keypoint].name,
-            "xyz": None,
+            "name": "" if point is None else point.name,
+            "xyz": None if point is None else session.model.to_display(point.xyz).tolist(),
             "residual": None,
             "off": None,
         }
-        if pair.keypoint is not None:
-            entry["xyz"] = session.model.to_display(session.registry[pair.keypoint].xyz).tolist()
         if pair.complete:
             if live.result is not None:
-                entry["residual"] = _finite(live.result.residuals[row])
+                residual = live.result.residuals[row]
+                entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
                 entry["off"] = live.outliers.get(row)
             row += 1
         pairs.append(entry)
@@ -134,17 +114,12 @@ def _suggestion(session: Session, suggestion: Suggestion | None) -> dict[str, An
     if suggestion is None:
         return None
     point = suggestion.point
-    name = point.name or "The marked corner"
     return {
         "keypoint": point.semantic_id,
         "xyz": session.model.to_display(point.xyz).tolist(),
         "uv": suggestion.uv,
-        "text": next_best_text(suggestion.next_best, name),
+        "text": next_best_text(suggestion.next_best, point.name or "The marked corner"),
     }
-
-
-def _finite(residual: FloatArray) -> list[float] | None:
-    return residual.tolist() if np.isfinite(residual).all() else None
 
 
 def _flat(lines: FloatArray) -> list[float]:

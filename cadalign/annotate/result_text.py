@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.next_best import NextBest, unknown_name
+from cadalign.annotate.suggestion import NextBest
 from cadalign.fitting.result import FitResult
 
+UNKNOWNS = (
+    *["the rotation"] * 3,
+    *("the position sideways", "the height", "the distance"),
+    *("the stretch along y", "the stretch along z", "the focal length"),
+)
+"""Names of the unknowns of a covariance, for a sentence."""
 _ROTATIONS = 3
 _UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
 _UNDETERMINED = "not determined", "these pairs leave it open"
@@ -22,7 +28,7 @@ class Fact:
 
     label: str
     value: str
-    note: str = ""
+    note: str
 
 
 def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
@@ -32,7 +38,7 @@ def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
         return ()
     facts = [_stretch(result, axis) for axis in result.stretched_axes]
     if result.std is not None:
-        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°"))
+        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°", ""))
     facts += [_distance(result), _focal(result)]
     if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
         note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
@@ -60,7 +66,7 @@ def next_best_text(next_best: NextBest, name: str) -> str:
     """Name of the next-best keypoint, and the uncertainty that it would leave."""
     factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
     before, after = (_short(factor * std) + unit for std in (next_best.before, next_best.after))
-    unknown = unknown_name(next_best.unknown)
+    unknown = UNKNOWNS[next_best.unknown]
     return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
 
 
@@ -86,7 +92,7 @@ def _distance(result: FitResult) -> Fact:
     translation = result.alignment.translation
     distance = float(np.linalg.norm(translation))
     if result.covariance is None or not distance > 0:
-        return Fact("Distance", f"{distance:.3g} model units")
+        return Fact("Distance", f"{distance:.3g} model units", "")
     along = translation / distance
     std = math.sqrt(max(float(along @ result.covariance[3:6, 3:6] @ along), 0.0))
     return Fact("Distance", f"{distance:.3g} ± {_short(std)}", "model units")

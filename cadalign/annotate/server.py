@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+from functools import partial
 from typing import Any
 
 from starlette.applications import Starlette
@@ -13,8 +14,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from cadalign.annotate.display import display_bytes
 from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.model import display_bytes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError
@@ -29,8 +30,8 @@ def make_app(session: Session, access: Access) -> ASGIApp:
     app = Starlette(
         routes=[
             Route("/", routes.page),
-            Route("/annotate.js", routes.script),
-            Route("/annotate.css", routes.style),
+            Route("/annotate.js", partial(_send, "annotate.js", "text/javascript")),
+            Route("/annotate.css", partial(_send, "annotate.css", "text/css")),
             Route("/model", routes.model),
             Route("/photo/{number:int}", routes.photo),
             Route("/state/{number:int}", routes.state),
@@ -42,10 +43,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
 
 
 def listen(port: int) -> socket.socket:
-    """Open a socket on the loopback interface; port 0 chooses a free one.
-
-    Raises InputError if the port is in use or invalid.
-    """
+    """Open a socket on the loopback interface; port 0 chooses a free one."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -87,12 +85,6 @@ class _Routes:
         )
         return response
 
-    async def script(self, request: Request) -> Response:
-        return Response(asset("annotate.js"), media_type="text/javascript")
-
-    async def style(self, request: Request) -> Response:
-        return Response(asset("annotate.css"), media_type="text/css")
-
     async def model(self, request: Request) -> Response:
         data = await run_in_threadpool(self._display)
         return Response(data, media_type="application/octet-stream")
@@ -130,6 +122,10 @@ class _Routes:
             if self._model is None:
                 self._model = display_bytes(self._session.model)
             return self._model
+
+
+async def _send(name: str, media_type: str, request: Request) -> Response:
+    return Response(asset(name), media_type=media_type)
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -13,13 +13,11 @@ import numpy as np
 
 from cadalign.annotate.actions import ACTIONS, Outcome
 from cadalign.annotate.alignment import LiveAlignment, align
-from cadalign.annotate.document import Document, FocalChoice
-from cadalign.annotate.files import AnnotationFiles, sigmas_of, write_keypoints
-from cadalign.annotate.history import History
-from cadalign.annotate.intrinsics import Intrinsics
+from cadalign.annotate.document import Document, FocalChoice, History
+from cadalign.annotate.files import AnnotationFiles, filled, write_keypoints
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.photos import Photo
+from cadalign.annotate.photos import Intrinsics, Photo
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError
@@ -49,37 +47,19 @@ class PhotoState:
         return self.history.document
 
 
+@dataclass(eq=False)
 class Session:
-    """All state of an annotator; safe to use from several threads.
+    """All state of an annotator; safe to use from several threads."""
 
-    Parameters
-    ----------
-    model : CadModel
-    registry : KeypointRegistry
-    photos : list of PhotoState
-    keypoints_path : Path
-        File to which the model's keypoints are written.
-    """
+    model: CadModel
+    registry: KeypointRegistry
+    photos: list[PhotoState]
+    keypoints_path: Path  # file to which the model's keypoints are written
+    ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 
-    def __init__(
-        self,
-        model: CadModel,
-        registry: KeypointRegistry,
-        photos: list[PhotoState],
-        keypoints_path: Path,
-    ) -> None:
-        self.model = model
-        self.registry = registry
-        self.photos = photos
-        self.keypoints_path = keypoints_path
-        self.wireframe = Wireframe(model)
+    def __post_init__(self) -> None:
+        self.wireframe = Wireframe(self.model)
         self.lock = threading.RLock()
-        self._ready = threading.Event()
-
-    @property
-    def ready(self) -> bool:
-        """True once the solvers are compiled and loaded, so that a fit is instant."""
-        return self._ready.is_set()
 
     def warm_up(self) -> None:
         """Compile or load the solvers by aligning a synthetic problem, and prepare the model."""
@@ -93,14 +73,14 @@ class Session:
             # Takes seconds on a model of millions of faces, which the first click would wait for.
             _ = self.model.scene.caster, self.model.samples
         finally:  # an error here occurs again, and is reported, when the user aligns
-            self._ready.set()
+            self.ready = True
             with self.lock:
                 for state in self.photos:
                     if state.fit_pending:
                         self.save(state)
 
     def photo_state(self, number: int) -> PhotoState:
-        """The photo of a number, counted from 0; raises InputError if there is none."""
+        """The photo of a number, counted from 0."""
         if not 0 <= number < len(self.photos):
             raise InputError(f"there is no photo {number + 1}", where="image")
         return self.photos[number]
@@ -116,7 +96,7 @@ class Session:
         live = align(
             self.registry.xyz(pair.keypoint for pair in pairs if pair.keypoint is not None),
             np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
-            sigmas_of(pairs),
+            filled(pair.sigma for pair in pairs),
             state.intrinsics,
             document.focal,
         )
@@ -125,17 +105,7 @@ class Session:
         return live, suggestion
 
     def act(self, number: int, action: Mapping[str, Any]) -> Outcome:
-        """Do an action on a photo and save its changes.
-
-        Parameters
-        ----------
-        number : int
-            Number of the photo, counted from 0.
-        action : mapping
-            ``do``, the name of the action, and its arguments.
-
-        Raises CadalignError if the action is unknown or invalid.
-        """
+        """Do an action, its name ``do`` and its arguments, on a photo and save its changes."""
         with self.lock:
             state = self.photo_state(number)
             name = action.get("do")

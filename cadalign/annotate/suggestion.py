@@ -1,4 +1,4 @@
-"""Suggestion of the next keypoint to mark."""
+"""Suggestion of the next keypoint to mark: the one that reduces the uncertainty most."""
 
 from __future__ import annotations
 
@@ -10,28 +10,35 @@ import numpy as np
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
-from cadalign.annotate.next_best import NextBest, find_next_best
+from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.fitting.prediction import predicted_covariances, projection_jacobian
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.render.views.visibility import visible_keypoints
 
 _APART = 0.02  # least distance of a corner from marked points [diagonals]
 
 
 @dataclass(frozen=True)
-class Suggestion:
-    """The next-best keypoint of the model.
+class NextBest:
+    """The candidate to measure next, and its effect on the most uncertain unknown.
 
-    Parameters
-    ----------
-    point : ModelKeypoint
-        Without a semantic id if it is a corner of the surface instead of a keypoint.
-    uv : (float, float)
-        Its predicted place in the photo [px].
-    next_best : NextBest
+    The standard deviations are in radians, shares of the distance, or relative (0.02 is 2 %).
     """
 
+    row: int
+    unknown: int  # its index in `FitResult.covariance`
+    before: float  # standard deviation without the measurement
+    after: float
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """The next-best keypoint of the model, or a corner of the surface without a semantic id."""
+
     point: ModelKeypoint
-    uv: tuple[float, float]
+    uv: tuple[float, float]  # its predicted place in the photo [px]
     next_best: NextBest
 
 
@@ -42,26 +49,66 @@ def suggest(
     result = live.cautious
     if result is None or result.covariance is None:
         return None
+    camera, alignment = result.camera, result.alignment
     own = [point for number, point in registry if number not in used]
     gaps = np.linalg.norm(model.sample_points[:, None] - registry.xyz(used), axis=2)
     apart = (gaps > _APART * model.diagonal).all(axis=1)
     corners = [point for point, far in zip(model.samples, apart.tolist(), strict=True) if far]
-    camera = result.camera
     for candidates in (own, corners):
         if not candidates:
             continue
         points = np.array([point.xyz for point in candidates])
-        seen = np.flatnonzero(visible_keypoints(model.scene, points, camera, result.alignment))
-        next_best = find_next_best(
-            points[seen],
-            camera,
-            result.alignment,
-            result.covariance,
-            sigma=live.sigma,
-            known_axis=result.known_axis,
-        )
+        seen = np.flatnonzero(visible_keypoints(model.scene, points, camera, alignment))
+        next_best = find_next_best(points[seen], camera, alignment, result.covariance, live.sigma)
         if next_best is not None:
             chosen = seen[next_best.row]
-            ((u, v),) = camera.project(result.alignment.apply(points[chosen : chosen + 1])).tolist()
+            ((u, v),) = camera.project(alignment.apply(points[chosen : chosen + 1])).tolist()
             return Suggestion(candidates[chosen], (u, v), next_best)
     return None
+
+
+def find_next_best(
+    points_3d: FloatArray,
+    camera: Camera,
+    alignment: Alignment,
+    covariance: FloatArray,
+    sigma: float,
+) -> NextBest | None:
+    """Choose the visible keypoint (n, 3) whose measurement shrinks the most uncertain unknown most.
+
+    To be comparable, rotations count in radians, translations as shares of the distance, scales and
+    focal length by their logarithms. Of equally good candidates the first is chosen; None if there
+    are none, or nothing is uncertain.
+    """
+    weights = np.ones(len(covariance))
+    weights[3:6] = 1 / max(float(np.linalg.norm(alignment.translation)), 1e-300)
+    spread = np.sqrt(np.maximum(covariance.diagonal(), 0.0)) * weights
+    worst = int(np.argmax(spread))
+    if not len(points_3d) or not spread[worst] > 0:
+        return None
+    variances = updated_variances(points_3d, camera, alignment, covariance, sigma)[:, worst]
+    # Rounded, so that candidates that are equal but for rounding are told apart by their order.
+    row = int(np.argmin(np.round(variances / covariance[worst, worst], 9)))
+    after = float(np.sqrt(max(variances[row], 0.0)) * weights[worst])
+    return NextBest(row, worst, float(spread[worst]), after)
+
+
+def updated_variances(
+    points_3d: FloatArray,
+    camera: Camera,
+    alignment: Alignment,
+    covariance: FloatArray,
+    sigma: float,
+) -> FloatArray:
+    """The unknowns' variances (n, k) if one of n candidates is measured with this sigma [px].
+
+    A measurement with the derivatives J turns the covariance C into
+    C - C J' (J C J' + sigma^2)^-1 J C.
+    """
+    jacobian = projection_jacobian(
+        points_3d, camera, alignment, known_axis="x", unknowns=len(covariance)
+    )
+    innovation = predicted_covariances(jacobian, covariance) + sigma**2 * np.eye(2)
+    gain = covariance @ jacobian.transpose(0, 2, 1)
+    shrunk = np.einsum("nka,nab,nkb->nk", gain, np.linalg.inv(innovation), gain)
+    return np.asarray(covariance.diagonal() - shrunk)

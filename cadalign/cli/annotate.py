@@ -5,16 +5,16 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
+from cadalign.annotate.options import SessionOptions
 from cadalign.cli.output import make_folder, new_console
 from cadalign.io.files import writing
 
 
 @dataclass(frozen=True)
-class Annotate:
+class Annotate(SessionOptions):
     """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
 
     Serves a page on this machine only. Every change is saved at once: an observation beside each
@@ -22,19 +22,6 @@ class Annotate:
     (model.keypoints.json).
     """
 
-    image: Path
-    """A photo, or a folder of photos."""
-    model: Path
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""
-    observation: Path | None = None
-    """Observation file of a single photo, continued if it exists; by default beside the photo."""
-    out: Path | None = None
-    """Folder for the observations; by default the photos'."""
-    camera: Path | None = None
-    """JSON file of the calibrated camera (COLMAP's form, Open3D's or NeRF's). Without one the focal
-    length is estimated."""
-    keypoints: Path | None = None
-    """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -57,14 +44,7 @@ class Annotate:
                 with writing(self.observation):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
             with console.status("reading photos and model"):
-                session = open_session(
-                    image=self.image,
-                    model=self.model,
-                    observation=self.observation,
-                    camera=self.camera,
-                    keypoints=self.keypoints,
-                    out=self.out,
-                )
+                session = open_session(self)
             access = Access(listener.getsockname()[1])
             threading.Thread(target=session.warm_up, daemon=True).start()
             new_console(stderr=False).print(access.url, markup=False, soft_wrap=True)

@@ -37,15 +37,18 @@ class Doctor:
 
 
 def _print(health: Health) -> None:
-    from rich.table import Table
+    from rich.table import Column, Table
 
     console = new_console(stderr=False)
-    table = Table(title="Renderers", caption="ms: a frame of 640 x 480 px, 20,480 triangles")
-    table.add_column("renderer")
-    table.add_column("works")
-    table.add_column("ms", justify="right")
-    table.add_column("versions")
-    table.add_column("drawn by / what is wrong")
+    heads = (
+        "renderer",
+        "works",
+        Column("ms", justify="right"),
+        "versions",
+        "drawn by / what is wrong",
+    )
+    caption = "ms: a frame of 640 x 480 px, 20,480 triangles"
+    table = Table(*heads, title="Renderers", caption=caption)
     for renderer in health.renderers:
         table.add_row(
             renderer.name,

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 
 if TYPE_CHECKING:
@@ -48,13 +49,7 @@ class RunCommand(RunOptions):
         return code
 
     def do_run(self) -> tuple[Spec, Run]:
-        """Do the run, showing its progress; gives its specification and its tables.
-
-        Raises
-        ------
-        InputError
-            Which names options as flags, the way in which they were typed.
-        """
+        """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.registry import spec_named
         from cadalign.evaluation.runs.folder import RunFolder
         from cadalign.evaluation.runs.opened import Run
@@ -62,17 +57,12 @@ class RunCommand(RunOptions):
 
         kind = self.options_type
         spec = spec_named(kind.experiment)
-        try:
+        with named_as_flags(self):
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             count = options.default_workers if self.workers is None else self.workers
-            workers = workers_of(count, dask=self.dask)
+            workers = workers_of(count, self.dask)
             out = self.out or Path("runs") / options.run_name
             plan = spec.plan(options, RunFolder(out))
-        except InputError as error:
-            if error.where not in {field.name for field in fields(self)}:
-                raise
-            flag = f"--{error.where.replace('_', '-')}"
-            raise InputError(error.what, where=flag, fix=error.fix) from None
         with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
             execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
         return spec, Run.open(out)
@@ -85,18 +75,10 @@ def command_of(
     about: str | None = None,
     **defaults: Any,
 ) -> Any:
-    """The command of an experiment: its options, and those of every run.
+    """The command of an experiment: its options, those of every run, and those of its ``base``.
 
-    Parameters
-    ----------
-    options : type
-        The experiment's options.
-    base : type
-        The command's own options, and what it does.
-    about : str, optional
-        Its help; by default that of the options.
-    **defaults
-        Options that it gives and that cannot be typed.
+    ``about`` is its help, by default that of the options; ``defaults`` are options that it gives
+    and that cannot be typed.
     """
     given = [
         (name, Annotated[str, tyro.conf.Suppress], field(default=value))
@@ -106,6 +88,12 @@ def command_of(
     return make_dataclass(
         options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
     )
+
+
+def one_of(commands: dict[str, Any]) -> Any:
+    """One of some commands, chosen by name."""
+    named: list[Any] = [Annotated[c, tyro.conf.subcommand(name)] for name, c in commands.items()]
+    return reduce(or_, named)
 
 
 @dataclass(frozen=True)
@@ -141,15 +129,12 @@ def _commands() -> Any:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
     from cadalign.evaluation.registry import known_options
 
-    commands: list[Any] = [
-        Annotated[
-            command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}"),
-            tyro.conf.subcommand(options.experiment),
-        ]
+    commands = {
+        options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()
         if options.command == _COMMAND
-    ]
-    return reduce(or_, [*commands, Annotated[EvaluateShow, tyro.conf.subcommand("show")]])
+    }
+    return one_of({**commands, "show": EvaluateShow})
 
 
 @dataclass(frozen=True)

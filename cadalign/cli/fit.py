@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags
+from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
@@ -43,7 +43,7 @@ class _RansacOptions(RansacOptions):
 
 
 @dataclass(frozen=True)
-class Fit:
+class Fit(ObservationCommand):
     """Align a model to one image's keypoints and draw the result.
 
     Prints the alignment; writes fit.json and overlay.png.
@@ -53,10 +53,6 @@ class Fit:
     """JSON file with camera and keypoints, optionally image and model."""
     out: Path | None = None
     """Folder to write to; by default <observation>_fit beside the file."""
-    json: bool = False
-    """Print the result as JSON."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object."""
     robust: bool = False
@@ -79,7 +75,9 @@ class Fit:
         observation = Observation.load(self.observation)
         console = new_console()
         focal = self.focal or ("known" if observation.camera.focal_known else "estimate")
-        prior = self._focal_prior(observation) if focal == "estimate" else None
+        prior = None
+        if focal == "estimate" and self.exif and observation.image is not None:
+            prior = FocalPrior.from_exif(observation.image)
         if prior is not None:
             share = 100 * prior.relative_sigma
             text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
@@ -120,11 +118,4 @@ class Fit:
                     fix="give one of the two options",
                 )
             return None
-        if self.sigma is not None:
-            return self.sigma
-        return FitOptions.sigma if observation.sigma is None else observation.sigma
-
-    def _focal_prior(self, observation: Observation) -> FocalPrior | None:
-        if not self.exif or observation.image is None:
-            return None
-        return FocalPrior.from_exif(observation.image)
+        return self.sigma_of(observation)

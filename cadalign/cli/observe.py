@@ -74,13 +74,7 @@ class Observe:
         return 0
 
     def _camera(self, found: ImageKeypoints) -> Camera:
-        """Read the camera, or make one of the photo's size without focal length.
-
-        Raises
-        ------
-        DataError
-            If the photo, the camera and the file of keypoints don't agree on the image's size.
-        """
+        """Read the camera, or make one of the photo's size without focal length."""
         from cadalign.errors import DataError
         from cadalign.geometry.camera import Camera
         from cadalign.io.documents import in_file, read_json
@@ -99,9 +93,7 @@ class Observe:
             sizes[found.source] = found.size
         if not sizes:
             raise DataError(
-                "the photo's size is unknown",
-                where=found.source,
-                fix="give --image or --camera",
+                "the photo's size is unknown", where=found.source, fix="give --image or --camera"
             )
         (first, size), *others = sizes.items()
         for name, other in others:

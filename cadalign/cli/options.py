@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 from cadalign.errors import CadalignError, InputError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+
+    from cadalign.fitting.options import Sigma
+    from cadalign.io.observation import Observation
 
 
 class OptionError(CadalignError):
@@ -26,12 +29,7 @@ def named_as_flags(
 ) -> Iterator[None]:
     """Let errors about fields of dataclasses of options name the command line's options.
 
-    Parameters
-    ----------
-    *options : dataclass
-        Their fields are names of options.
-    kind : type of error
-        `OptionError` while the command line is parsed.
+    Their kind is `OptionError` while the command line is parsed.
     """
     try:
         yield
@@ -41,3 +39,19 @@ def named_as_flags(
             raise
         flag = "--" + str(error.where).replace("_", "-")
         raise kind(error.what, where=flag, fix=error.fix) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationCommand:
+    """Options of the commands on an observation file."""
+
+    json: bool = False
+    """Print the result as JSON."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+
+    def sigma_of(self, observation: Observation) -> Sigma:
+        """Standard deviation of the keypoints: the given one, the file's, or 1."""
+        if self.sigma is not None:
+            return self.sigma
+        return 1.0 if observation.sigma is None else observation.sigma

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.output import make_folder, new_console, progress_over
+from cadalign.cli.output import make_folder, new_console
 
 
 @dataclass(frozen=True)
@@ -52,30 +52,21 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
-        from cadalign.render.job import RenderJob, draw_movie, draw_picture
+        from rich.progress import track
+
+        from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
+        from cadalign.io.images import write_image
+        from cadalign.render import write_movie
 
         console = new_console()
         with named_as_flags(self):
-            job = RenderJob.prepare(
-                model=self.model,
-                out=self.out,
-                views=self.view,
-                size=self.size,
-                style=self.style,
-                background=self.background,
-                keypoints=self.keypoints,
-                scale=self.scale,
-                fov=self.fov,
-                samples=self.samples,
-                renderer=self.renderer,
-            )
+            job = RenderJob.prepare(self)
         make_folder(self.out.absolute().parent)
-        if job.is_movie:
-            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
-            job.write_movie(
-                progress_over(frames, total=count, label="drawing", console=console), fps=self.fps
-            )
+        if self.out.suffix.lower() == ".mp4":
+            frames, count = draw_movie(job)
+            shown = track(frames, "drawing", total=count, console=console, transient=True)
+            write_movie(self.out, shown, fps=self.fps)
         else:
-            job.write_picture(draw_picture(job))
+            write_image(self.out, draw_picture(job))
         console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)
         return 0

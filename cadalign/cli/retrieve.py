@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags
+from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
-from cadalign.cli.runs import print_json
+from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
 from cadalign.fitting.options import Sigma
 from cadalign.retrieval.options import RetrievalOptions
 
 if TYPE_CHECKING:
-    from cadalign.io.observation import Observation
     from cadalign.retrieval import Match
 
 
@@ -33,7 +32,7 @@ class _RetrievalOptions(RetrievalOptions):
 
 
 @dataclass(frozen=True)
-class Retrieve:
+class Retrieve(ObservationCommand):
     """Find the models of a library that explain an image's keypoints best.
 
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
@@ -47,10 +46,6 @@ class Retrieve:
     """File that `cadalign library build` wrote."""
     out: Path | None = None
     """Folder to write to."""
-    json: bool = False
-    """Print the matches as JSON."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     robust: bool = False
     """Not available here: use --loss cauchy against outliers."""
     mask: Path | None = None
@@ -65,9 +60,8 @@ class Retrieve:
         """Run the retrieval; returns the exit code."""
         from cadalign.io.images import read_image
         from cadalign.retrieval import Library
-        from cadalign.retrieval.mask_files import read_mask, read_opacity
         from cadalign.retrieval.page import write_retrieval
-        from cadalign.retrieval.query import read_query
+        from cadalign.retrieval.query import read_mask, read_opacity, read_query
 
         if self.robust:
             raise InputError(
@@ -92,7 +86,7 @@ class Retrieve:
                 query.points_2d,
                 query.semantic_ids,
                 camera,
-                **vars(replace(self.ranking, sigma=self._sigma(query))),
+                **vars(replace(self.ranking, sigma=self.sigma_of(query))),
                 mask=mask,
                 image=image,
                 workers=self.workers,
@@ -114,30 +108,16 @@ class Retrieve:
             console.print(f"Page: {page}", markup=False)
         return 0
 
-    def _sigma(self, query: Observation) -> Sigma:
-        """Choose the standard deviation: the given one, the file's, or 1."""
-        if self.sigma is not None:
-            return self.sigma
-        return RetrievalOptions.sigma if query.sigma is None else query.sigma
-
 
 def _print_table(matches: Sequence[Match]) -> None:
-    from rich import box
-    from rich.table import Table
-
+    from cadalign.evaluation.summary import ConsoleTable
     from cadalign.retrieval.page import score_text
 
-    with_masks = any(match.silhouette_iou is not None for match in matches)
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("", justify="right", no_wrap=True)
-    for name in ("category", "model"):
-        table.add_column(name, no_wrap=True)
-    for name in ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z", *["IoU"][: int(with_masks)]):
-        table.add_column(name, justify="right", no_wrap=True)
-    for rank, match in enumerate(matches, start=1):
-        overlap = match.silhouette_iou
-        table.add_row(
-            str(rank),
+    labels = ("", "category", "model")
+    heads: tuple[str, ...] = ("score", "log-lik.", "rms px", "kpts", "s_y", "s_z")
+    rows: list[tuple[str, ...]] = [
+        (
+            str(rank).rjust(len(str(len(matches)))),
             match.category,
             match.model_id + (" (mirrored)" if match.mirrored else ""),
             score_text(match.score),
@@ -146,6 +126,12 @@ def _print_table(matches: Sequence[Match]) -> None:
             f"{match.shared}/{match.shared + len(match.missing_ids)}",
             f"{match.alignment.scale[1]:.3f}",
             f"{match.alignment.scale[2]:.3f}",
-            *(["-" if overlap is None else f"{overlap:.3f}"] if with_masks else []),
         )
-    new_console(stderr=False).print(table)
+        for rank, match in enumerate(matches, start=1)
+    ]
+    overlaps = [match.silhouette_iou for match in matches]
+    if any(overlap is not None for overlap in overlaps):
+        heads += ("IoU",)
+        shown = ["-" if overlap is None else f"{overlap:.3f}" for overlap in overlaps]
+        rows = [(*row, overlap) for row, overlap in zip(rows, shown, strict=True)]
+    print_table(ConsoleTable("", labels, heads, rows, narrow=True, grouped=False))

@@ -57,7 +57,9 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
         note = f", {found.note}" if found.note else ""
         text = f"Run: {run.folder.path} ({found.failed} of {found.rows} rows failed{note})"
         new_console().print(text, markup=False)
-    return exit_code(found.rows, found.failed)
+    if found.failed == found.rows:
+        return NOTHING_WORKED
+    return SOME_FAILED if found.failed else SUCCESS
 
 
 def print_table(table: ConsoleTable) -> None:
@@ -88,18 +90,16 @@ def print_table(table: ConsoleTable) -> None:
 
 
 class _Rate(ProgressColumn):
-    """Tasks a second, since the run was started this time."""
+    """Tasks a second, lately."""
 
     def render(self, task: Task) -> Text:
-        rate = task.fields.get("rate", 0.0)
+        rate = task.speed or 0.0
         return Text(f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s")
 
 
 @contextmanager
-def run_progress(label: str, *, quiet: bool = False) -> Iterator[Callable[[RunProgress], None]]:
+def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
     """Show a progress bar with rate and time left; gives what a run is to tell its progress to."""
-    import time
-
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -110,27 +110,9 @@ def run_progress(label: str, *, quiet: bool = False) -> Iterator[Callable[[RunPr
         TimeRemainingColumn(),
         console=new_console(),
         transient=True,
-        disable=quiet,
     ) as progress:
         bar = progress.add_task(label, total=None)
-        first: list[tuple[float, int]] = []
-
-        def show(state: RunProgress) -> None:
-            now = time.monotonic()
-            if not first:
-                first.append((now, state.done))
-            start, done_before = first[0]
-            rate = (state.done - done_before) / max(now - start, 1e-9)
-            progress.update(bar, total=state.total, completed=state.done, rate=rate)
-
-        yield show
-
-
-def exit_code(rows: int, failed: int) -> int:
-    """The exit code of a finished run."""
-    if failed == rows:
-        return NOTHING_WORKED
-    return SOME_FAILED if failed else SUCCESS
+        yield lambda state: progress.update(bar, total=state.total, completed=state.done)
 
 
 def print_json(value: Any) -> None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
-from operator import or_
 from typing import Annotated, Any
 
 import tyro
 
-from cadalign.cli.evaluate import command_of
+from cadalign.cli.evaluate import command_of, one_of
 from cadalign.evaluation.simulation.options import SweepOptions
 
 _ABOUT = {
@@ -22,11 +20,10 @@ _ABOUT = {
 
 def _commands() -> Any:
     """The command of every sweep."""
-    commands: list[Any] = [
-        Annotated[command_of(SweepOptions, about=about, sweep=name), tyro.conf.subcommand(name)]
-        for name, about in _ABOUT.items()
-    ]
-    return reduce(or_, commands)
+    commands = {
+        name: command_of(SweepOptions, about=about, sweep=name) for name, about in _ABOUT.items()
+    }
+    return one_of(commands)
 
 
 @dataclass(frozen=True)

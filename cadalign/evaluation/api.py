@@ -113,31 +113,15 @@ def run(
     options: ExperimentOptions,
     folder: RunFolder,
     *,
-    workers: int | None = None,
+    workers: int | None,
     dask: str | None = None,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
     """Do the run that the options describe in a folder, or what is left of it.
 
-    Parameters
-    ----------
-    options : ExperimentOptions
-        Of the experiment to run.
-    folder : RunFolder
-    workers, dask
-        See `evaluate`.
-    on_progress : callable
-        Told of every chunk.
-
-    Raises
-    ------
-    InputError
-        If an option does not fit the data.
-    DataError
-        If there are no data, or the folder holds another run.
+    ``workers`` and ``dask`` are those of `evaluate`; ``on_progress`` is told of every chunk.
     """
-    count = options.default_workers if workers is None else workers
-    pool = workers_of(count, dask=dask)
+    pool = workers_of(options.default_workers if workers is None else workers, dask)
     plan = spec_named(options.experiment).plan(options, folder)
     execute(plan, folder, workers=pool, on_progress=on_progress)
 

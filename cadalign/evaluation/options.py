@@ -40,26 +40,14 @@ class ExperimentOptions:
         return -1
 
     def check_least(self, **bounds: float) -> None:
-        """Check that options, if they are given, are not less than their bounds.
-
-        Raises
-        ------
-        InputError
-            If one is.
-        """
+        """Check that options, if they are given, are not less than their bounds."""
         for name, least in bounds.items():
             value = getattr(self, name)
             if value is not None and not value >= least:
                 raise InputError(f"{value} is less than {least}", where=name)
 
     def check_known(self, **choices: tuple[str, ...]) -> None:
-        """Check that options are among those that are known.
-
-        Raises
-        ------
-        InputError
-            If one is not.
-        """
+        """Check that options are among those that are known."""
         for name, known in choices.items():
             value = getattr(self, name)
             if value not in known:

@@ -19,18 +19,10 @@ FAILED = "failed"
 class Outcome:
     """Result of one method on one task.
 
-    Parameters
-    ----------
-    names : dict
-        Columns that name the row, such as category, model id and method.
-    values : dict
-        Columns of facts and metrics, as far as they are known.
-    status : str
-        ``ok``, ``failed``, or another one of the experiment's own.
-    reason : str
-        Why it is not ok; empty otherwise.
-    seconds : float, optional
-        Time taken; not part of a result table, since no two runs agree on it.
+    ``names`` are the columns that name the row, such as category, model id and method; ``values``
+    those of facts and metrics, as far as they are known. ``status`` is ``ok``, ``failed`` or one of
+    the experiment's own, ``reason`` why it is not ok. ``seconds`` are not part of a result table,
+    since no two runs agree on them.
     """
 
     names: Row
@@ -63,15 +55,7 @@ class Outcome:
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
-    """Errors of pose and stretch by column.
-
-    Parameters
-    ----------
-    est, gt : Alignment
-    length : float
-        Unit of the translation error [model units]: the diagonal of the model's bounding box,
-        for example.
-    """
+    """Errors of pose and stretch by column, the translation's over a length [model units]."""
     _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
     return {
         "rotation_error_deg": rotation_error(est=est, gt=gt),

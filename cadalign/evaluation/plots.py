@@ -27,17 +27,10 @@ _THINNEST, _SMALLEST, _STEP = 1.5, 4.5, 0.35
 
 @dataclass(frozen=True)
 class Trace:
-    """A line of a plot, in the units of its axes.
+    """A line of a plot, in the units of its axes, with the ends of a band if it has one.
 
-    Parameters
-    ----------
-    run : int
-        Place of the run among those that are compared.
-    method : str
-    x, y : list of float
-        None where there is no value.
-    low, high : list of float, optional
-        Ends of a band.
+    ``run`` is the place of the run among those that are compared. Values are None where there is
+    none.
     """
 
     run: int
@@ -70,21 +63,9 @@ class Trace:
 class Plot:
     """A plot of lines.
 
-    Parameters
-    ----------
-    id : str
-    x, y : Metric
-        The axes.
-    traces : list of Trace
-    note : str
-    caption : str
-        Quantities that are held, and the number of problems; for the figure.
-    figure : str
-        Name of the figure; plots of the same name are drawn into one.
-    variant : str
-        Text that sets it apart from others in the same figure.
-    title : str
-        By default made of the axes' labels.
+    Plots with the same ``figure`` are drawn into one, in which ``variant`` sets them apart, under a
+    ``caption`` of the quantities that are held and the number of problems. The title is by default
+    made of the axes' labels.
     """
 
     id: str

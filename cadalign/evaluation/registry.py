@@ -41,14 +41,8 @@ def known_options() -> Iterator[type[ExperimentOptions]]:
     yield from (spec.options for spec in _REGISTERED.values())
 
 
-def spec_named(name: str, *, where: str = "experiment") -> Spec:
-    """The specification of an experiment.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+def spec_named(name: str) -> Spec:
+    """The specification of an experiment."""
     if name in _REGISTERED:
         return _REGISTERED[name]
     for folder in _FOLDERS:
@@ -56,19 +50,12 @@ def spec_named(name: str, *, where: str = "experiment") -> Spec:
             spec: Spec = import_module(f"{__package__}.{folder}.spec").SPEC
             return spec
     names = [options.experiment for options in known_options()]
-    raise InputError(
-        f"unknown experiment {name!r}", where=where, fix=f"known are {', '.join(names)}"
-    )
+    what, fix = f"unknown experiment {name!r}", f"known are {', '.join(names)}"
+    raise InputError(what, where="experiment", fix=fix)
 
 
 def spec_of(run: Run) -> Spec:
-    """The specification of a run's experiment.
-
-    Raises
-    ------
-    DataError
-        If it is unknown.
-    """
+    """The specification of a run's experiment."""
     return spec_of_config(run.config, run.folder.path)
 
 

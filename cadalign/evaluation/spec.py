@@ -23,13 +23,13 @@ Summaries = Sequence[Summary]
 class Reference:
     """Published numbers beside a headline table, and a note on them."""
 
-    lines: tuple[Summary, ...] = ()
-    note: str = ""
+    lines: tuple[Summary, ...]
+    note: str
 
 
 def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
     statuses = run.results["status"].to_pylist()
-    return Conclusion(len(statuses), statuses.count(FAILED))
+    return Conclusion(len(statuses), statuses.count(FAILED), {}, "")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Spec:
     describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
     about: str = ""
     note: str = ""
-    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda runs, groups: Reference()
+    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: Reference((), "")
 
     @property
     def name(self) -> str:
@@ -119,13 +119,7 @@ class Spec:
         return [c for c in self.columns if any(line.number(c.key) is not None for line in lines)]
 
     def write(self, run: Run) -> Summaries:
-        """Write ``summary.csv`` and ``figures`` of a finished run.
-
-        Raises
-        ------
-        DataError
-            If the files cannot be written.
-        """
+        """Write ``summary.csv`` and ``figures`` of a finished run."""
         summaries = self.summarize(run)
         write_text(
             run.folder.summary, summary_csv(summaries, rename={"value": self.group(run).key})

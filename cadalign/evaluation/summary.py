@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,16 +25,9 @@ ALL = "all"
 class Summary:
     """Numbers of one method on one group of tasks: a row of ``summary.csv``, a line of a headline.
 
-    Parameters
-    ----------
-    group : str
-        Name of the group in tables.
-    names : dict
-        Columns that name the row, the method among them.
-    values : dict
-        Numbers and `Quartiles` by column, in the metrics' own units; NaN for what is unknown.
-    tasks : int, optional
-        Number of tasks, for the headline's column of that name; by default ``instances``.
+    ``names`` are the columns that name the row, the method among them; ``values`` numbers and
+    `Quartiles` by column, in the metrics' own units, NaN for what is unknown. ``tasks`` is for the
+    headline's column of that name, by default ``instances``.
     """
 
     group: str
@@ -78,24 +71,12 @@ class Summary:
 
 @dataclass(frozen=True)
 class ConsoleTable:
-    """A table for the console.
+    """A table for the console, with a note beneath.
 
-    Parameters
-    ----------
-    title : str
-    labels : tuple of str
-        Heads of the columns of texts, which come first.
-    heads : tuple of str
-        Heads of the columns of numbers.
-    rows : list of tuple of str
-    note : str
-        Text beneath.
-    narrow : bool
-        Without frame and with little room between columns.
-    grouped : bool
-        Set apart the rows that differ in the first column, which is not repeated.
-    wraps : bool
-        Heads may take several lines.
+    ``labels`` head the columns of texts, which come first, ``heads`` those of numbers. A narrow
+    table has no frame and little room between columns; a grouped one sets apart the rows that
+    differ in the first column, which is not repeated; the heads of one that wraps may take several
+    lines.
     """
 
     title: str
@@ -110,31 +91,17 @@ class ConsoleTable:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Numbers of rows, and of failed ones, that a finished run ends with.
-
-    Parameters
-    ----------
-    rows, failed : int
-    counts : dict
-        More numbers to be told.
-    note : str
-        Remark on the failed rows.
-    """
+    """Numbers of rows and of failed ones, and a note on these, that a finished run ends with."""
 
     rows: int
     failed: int
-    counts: dict[str, int] = field(default_factory=dict)
-    note: str = ""
+    counts: dict[str, int]
+    note: str
 
 
 @dataclass(frozen=True)
 class Quartiles:
-    """Quartiles, NaN where there are none.
-
-    Parameters
-    ----------
-    lower, median, upper : float
-    """
+    """Quartiles, NaN where there are none."""
 
     lower: float
     median: float
@@ -172,23 +139,22 @@ class Quartiles:
 def summary_csv(summaries: Sequence[Summary], *, rename: Mapping[str, str]) -> str:
     """The summaries as a CSV file, some columns by another name; unknown cells are empty."""
     rows = [summary.cells() for summary in summaries]
+    head = [rename.get(name, name) for name in rows[0]]
+    cells = [["" if value != value else value for value in row.values()] for row in rows]
+    return csv_text([head, *cells])
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows as a CSV file."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([rename.get(name, name) for name in rows[0]])
-    writer.writerows(["" if value != value else value for value in row.values()] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 
 def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Summary]:
     """Numbers of rows, of failures, and medians of the others, for every group and method.
 
-    Parameters
-    ----------
-    run : Run
-    columns : sequence of Metric
-        Of which those are taken that are columns of the run's results.
-    group : Metric
-        The column that rows are grouped by.
+    Of the columns those are taken that the run's results have.
     """
     cells = run.cells
     metrics = [metric.key for metric in columns if metric.key in cells]

@@ -34,13 +34,19 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     >>> rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 1.0])).round(12).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    from scipy.spatial.transform import Rotation
-
-    length = np.linalg.norm(quat_wxyz)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quat_wxyz)
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"{quat_wxyz.tolist()} is not a rotation", where="quaternion")
+    # Written out, since runs are told apart by the bits of the poses they were given.
     w, x, y, z = quat_wxyz / length
-    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:

@@ -52,76 +52,40 @@ class ForeignDocument(Struct):
 
 
 def read_document(path: Path, kind: type[T]) -> T:
-    """Read a JSON file of a declared type.
-
-    Raises
-    ------
-    DataError
-        If it is missing, cannot be read, is not JSON, or not of this type; names file and field.
-    """
+    """Read a JSON file of a declared type; errors name the file and the field."""
     data = read_json(path)
     with in_file(path):
         return convert(data, kind)
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of any content.
-
-    Raises
-    ------
-    DataError
-        If it is missing, cannot be read or is not JSON; names the line.
-    """
+    """Read a JSON file of any content; errors name the file and the line."""
     with reading(path):
         text = path.read_text(encoding="utf-8")
-    with in_file(path):
-        return parse_json(text)
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON text.
-
-    Raises
-    ------
-    DataError
-        If it is not JSON; names the line.
-    """
+    where, reason = str(path), "nested too deeply"
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise DataError(f"not valid JSON: {error.msg}", where=f"line {error.lineno}") from None
+        where, reason = f"{path}, line {error.lineno}", error.msg
     except ValueError as error:  # a whole number of thousands of digits
-        raise DataError(f"not valid JSON: {str(error)[:200]}") from None
+        reason = str(error)[:200]
     except RecursionError:
-        raise DataError("not valid JSON: nested too deeply") from None
+        pass
+    raise DataError(f"not valid JSON: {reason}", where=where)
 
 
-def convert(
-    data: Any, kind: type[T] | Any, *, where: str | None = None, strict: bool = True
-) -> T | Any:
-    """Convert parsed JSON to a declared type.
+def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | Any:
+    """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
 
-    Parameters
-    ----------
-    data : object
-    kind : type
-        A `Document`, or any type of which its fields can be.
-    where : str, optional
-        The place of ``data``, which the fields' paths are appended to.
-    strict : bool
-        False reads numbers out of text, as in CSV files.
-
-    Raises
-    ------
-    DataError
-        If a field is missing, unknown or invalid; ``where`` is its path, as ``keypoints[3].uv``.
+    ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
+    ``keypoints[3].uv``.
     """
     try:
-        return msgspec.convert(data, kind, strict=strict)
+        return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         plain = _plain(data)
         if plain is not data:
-            return convert(plain, kind, where=where, strict=strict)
+            return convert(plain, kind, where=where)
         raise _located(error, data, kind, where or "") from None
 
 
@@ -143,8 +107,12 @@ def within(place: str) -> Iterator[None]:
     try:
         yield
     except CadalignError as error:
-        where = ".".join(part for part in (place, error.where) if part)
-        raise DataError(error.what, where=where or None, fix=error.fix) from None
+        raise _below(place, error) from None
+
+
+def _below(place: str, error: CadalignError) -> DataError:
+    where = ".".join(part for part in (place, error.where) if part)
+    return DataError(error.what, where=where or None, fix=error.fix)
 
 
 def path_from(text: str, folder: Path | None) -> Path:
@@ -209,8 +177,7 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
         value = _entry(value, step)
     cause = error.__cause__
     if isinstance(cause, InputError):
-        place = ".".join(part for part in (where, cause.where) if part)
-        return DataError(cause.what, where=place or None, fix=cause.fix)
+        return _below(where, cause)
     field = _FIELD.fullmatch(text)
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])

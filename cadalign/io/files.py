@@ -18,16 +18,7 @@ _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file such that, killed at any moment, it is there whole or as it was.
 
-    Parameters
-    ----------
-    path : Path
-    write : callable
-        Writes the file that it is given the name of, in the same folder.
-
-    Raises
-    ------
-    DataError
-        If that is not possible.
+    ``write`` writes the file that it is given the name of, in the same folder.
     """
     # The true ending stays last: some writers go by it.
     name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
@@ -52,13 +43,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def dense_json(value: Any) -> str:
-    """JSON without blanks; numbers that are not finite become null.
-
-    Examples
-    --------
-    >>> dense_json({"a": [1.0, float("inf")]})
-    '{"a":[1.0,null]}'
-    """
+    """JSON without blanks; numbers that are not finite become null."""
     try:
         return json.dumps(value, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -71,6 +56,12 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def damaged(what: str, where: object) -> DataError:
+    """The error of a file whose content cannot be that of a whole file."""
+    fix = "the file is cut short or damaged; get it again"
+    return DataError(what, where=str(where), fix=fix)
 
 
 @contextmanager

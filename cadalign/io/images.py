@@ -27,14 +27,8 @@ _ON_ITS_SIDE = frozenset((5, 6, 7, 8))
 
 @contextmanager
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
-    """Open a photo; its pixels are read when they are asked for.
-
-    Raises
-    ------
-    DataError
-        If it is missing or is not an image, now or while its pixels are read.
-    """
-    from PIL import Image, UnidentifiedImageError
+    """Open a photo; its pixels are read when they are asked for, errors then named as well."""
+    from PIL import Image
 
     path = Path(path)
     if not path.exists():
@@ -45,24 +39,13 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
             raise OSError("not a regular file")
         with Image.open(path) as image:
             yield image
-    except (
-        OSError,
-        ValueError,  # a NUL in the path
-        SyntaxError,  # Pillow's word for a broken PNG
-        UnidentifiedImageError,
-        Image.DecompressionBombError,
-    ) as error:
+    # ValueError: a NUL in the path; SyntaxError: Pillow's word for a broken PNG.
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
 
 
-def read_photo(path: str | os.PathLike[str]) -> npt.NDArray[np.uint8]:
-    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
-
-    Raises
-    ------
-    DataError
-        If it is missing or is not an image.
-    """
+def read_photo(path: str | os.PathLike[str]) -> ByteImage:
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held."""
     from PIL import ImageOps
 
     with open_photo(path) as image:
@@ -70,13 +53,7 @@ def read_photo(path: str | os.PathLike[str]) -> npt.NDArray[np.uint8]:
 
 
 def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height [px] of a photo turned upright; its pixels are not read.
-
-    Raises
-    ------
-    DataError
-        If it is missing or is not an image.
-    """
+    """Width and height [px] of a photo turned upright; its pixels are not read."""
     with open_photo(Path(path)) as image:
         width, height = image.size
         is_on_its_side = image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
@@ -84,13 +61,7 @@ def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 def read_image(path: Path, camera: Camera) -> ByteImage:
-    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
-
-    Raises
-    ------
-    DataError
-        If it is missing, is not an image, or has another size than the camera.
-    """
+    """Read a photo as `read_photo` does and require the camera's size of it."""
     pixels = read_photo(path)
     height, width = pixels.shape[:2]
     if (width, height) != (camera.width, camera.height):
@@ -103,13 +74,7 @@ def read_image(path: Path, camera: Camera) -> ByteImage:
 
 
 def write_image(path: Path, image: ByteImage) -> None:
-    """Write an RGB image (h, w, 3) uint8, or RGBA (h, w, 4), as PNG, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    """
+    """Write an RGB image (h, w, 3) uint8, or RGBA (h, w, 4), as PNG, whole or not at all."""
     import cv2  # on first use: it takes longer to import than all the rest
 
     colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA

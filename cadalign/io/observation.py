@@ -113,8 +113,7 @@ class Observation:
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
         for name in ("sigma", "confidences"):
-            value = getattr(self, name)
-            if value is not None:
+            if (value := getattr(self, name)) is not None:
                 checked = as_floats(value, name=name, shape=(len(points_3d),))
                 object.__setattr__(self, name, checked)
 

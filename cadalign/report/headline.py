@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from cadalign.evaluation.accuracy.methods import LIMIT
@@ -20,19 +20,10 @@ OTHER_REASONS = "other reasons"
 
 @dataclass(frozen=True)
 class HeadlineRow:
-    """Numbers of one method on one group of tasks.
+    """Numbers of one method on one group of tasks of a run.
 
-    Parameters
-    ----------
-    run : int
-        Place of the run.
-    category : str
-        The group: a category, or the value that was varied.
-    method : str
-    cells : dict of str to float
-        By column, as displayed; None where there is none.
-    best : tuple of str
-        The columns in which no method did better on the same.
+    ``cells`` are as displayed, None where there is none; ``best`` are the columns in which no
+    method did better on the same group.
     """
 
     run: int
@@ -61,26 +52,14 @@ class Failure:
 
 @dataclass(frozen=True)
 class Headline:
-    """The headline table.
-
-    Parameters
-    ----------
-    group : str
-        Name of the groups, which is the head of their column.
-    columns : tuple of Metric
-    rows : list of HeadlineRow
-    failures : list of Failure
-    paper : list of HeadlineRow
-        Published numbers on the same groups.
-    note : str
-    """
+    """The headline table; ``paper`` are published numbers on the same groups."""
 
     group: str
     columns: tuple[Metric, ...]
     rows: list[HeadlineRow]
-    failures: list[Failure] = field(default_factory=list)
-    paper: list[HeadlineRow] = field(default_factory=list)
-    note: str = ""
+    failures: list[Failure]
+    paper: list[HeadlineRow]
+    note: str
 
     def to_dict(self) -> dict[str, Any]:
         """The table for the page."""

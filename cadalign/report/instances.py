@@ -20,16 +20,8 @@ _TEXTS = ("category", "model", "visibility", "symmetry")
 class InstanceTable:
     """Columns of instances, one for each run that has it, and of their rows.
 
-    Parameters
-    ----------
-    strings : list of str
-        All texts, each once; other columns hold their places.
-    instances : dict of str to list
-        ``id`` is the same for the same instance of several runs.
-    rows : dict of str to list
-        One for each instance and method.
-    places : dict
-        Where the instance of a run, by (run, name), stands.
+    ``strings`` are all texts, each once; other columns hold their places. The column ``id`` is the
+    same for the same instance of several runs. ``places`` are those of instances by (run, name).
     """
 
     strings: list[str]

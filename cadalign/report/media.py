@@ -39,18 +39,10 @@ def inline_bytes(runs: Sequence[Run]) -> int:
 
 @dataclass
 class AssetStore:
-    """Pictures, mesh previews and instance records of a page.
-
-    Parameters
-    ----------
-    page : Path
-        The page's file.
-    assets : Path, optional
-        A folder beside the page for them; without one they are inside the page.
-    """
+    """Pictures, mesh previews and instance records: inside the page, or in a folder ``assets``."""
 
     page: Path
-    assets: Path | None = None
+    assets: Path | None
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)
@@ -58,13 +50,7 @@ class AssetStore:
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
-        """Take in the pictures and records of runs, and enter their keys in the table.
-
-        Raises
-        ------
-        DataError
-            If a file cannot be read or written.
-        """
+        """Take in the pictures and records of runs, and enter their keys in the table."""
         if self.assets is not None:
             with writing(self.assets):
                 self.assets.mkdir(parents=True, exist_ok=True)
@@ -88,13 +74,7 @@ class AssetStore:
                 self.records[str(place)] = f"{dense_json(keys)[:-1]},{row['exhibit'][1:]}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The page's part of it; writes the files that are beside the page.
-
-        Raises
-        ------
-        DataError
-            If a file cannot be written.
-        """
+        """The page's part of it; writes the files that are beside the page."""
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
             exhibits = {key: json.loads(text) for key, text in self.records.items()}

@@ -25,15 +25,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 @dataclass(frozen=True)
 class Report:
-    """A page that was written.
-
-    Parameters
-    ----------
-    path : Path
-        The page.
-    assets : Path, optional
-        The folder of its pictures, where they are not inside it.
-    """
+    """A page that was written, and the folder of its pictures where they are not inside it."""
 
     path: Path
     assets: Path | None
@@ -59,17 +51,6 @@ def write_report(
         the page were larger than 60 MB.
     title : str, optional
         By default it says what was run on what.
-
-    Returns
-    -------
-    Report
-
-    Raises
-    ------
-    InputError
-        If there are no runs, one is given twice, or they are of different kinds.
-    DataError
-        If a folder is not a run's, nothing of a run is finished, or the page cannot be written.
 
     Examples
     --------

@@ -69,19 +69,10 @@ def payload_of(
     *,
     title: str,
 ) -> dict[str, Any]:
-    """Put a page's payload together.
+    """Put the payload of a page on runs of one kind together.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-        Of one kind.
-    headline : Headline
-    table : InstanceTable, optional
-        For runs that have instances.
-    media : dict
-        Pictures, thumbs, instance records and mesh previews; see
-        `cadalign.report.media.AssetStore`.
-    title : str
+    ``table`` is None for runs without instances; ``media`` is from
+    `cadalign.report.media.AssetStore`.
     """
     spec = spec_of(runs[0])
     return {

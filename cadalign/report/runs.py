@@ -13,19 +13,7 @@ from cadalign.evaluation.runs.opened import Run
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
-    """Read runs that go into one report.
-
-    Parameters
-    ----------
-    folders : sequence of path-like
-
-    Raises
-    ------
-    InputError
-        If there are none, one is given twice, or they are of different kinds.
-    DataError
-        If a folder is not a run's, or nothing of a run is finished.
-    """
+    """Read runs that go into one report."""
     paths = [Path(folder) for folder in folders]
     if not paths:
         raise InputError(

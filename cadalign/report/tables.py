@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from dataclasses import dataclass
 from cadalign.errors import InputError
 from cadalign.evaluation.accuracy.style import look_of
 from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.summary import csv_text
 from cadalign.report.headline import Headline, HeadlineRow, headline_of
 from cadalign.report.runs import read_runs
 
@@ -40,7 +39,7 @@ class _Cell:
     is_best: bool = False
 
 
-def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str = "md") -> str:
+def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str:
     """The headline table of runs as text.
 
     Parameters
@@ -50,18 +49,6 @@ def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str = "md")
     format : {"md", "csv", "latex"}
         Best values are bold but in CSV, whose numbers are not rounded. LaTeX needs the packages
         booktabs and textcomp.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        If there are no runs, one is given twice, they are of different kinds, or the format is
-        unknown.
-    DataError
-        If a folder is not a run's, or nothing of a run is finished.
 
     Examples
     --------
@@ -82,18 +69,14 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
 
 
 def _csv(headline: Headline, names: Sequence[str]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     runs = ["run"] if len(names) > 1 else []
-    head = [column.heading for column in headline.columns]
-    writer.writerow([*runs, headline.group, "method", *head])
+    head = [*runs, headline.group, "method", *(column.heading for column in headline.columns)]
+    lines: list[list[object]] = []
     for row, name in _rows(headline, names):
-        cells = [row.cells[column.key] for column in headline.columns]
-        labels = [name] if runs else []
-        writer.writerow(
-            [*labels, row.category, row.method, *("" if cell is None else cell for cell in cells)]
-        )
-    return text.getvalue()
+        labels = [*([name] if runs else []), row.category, row.method]
+        # A cell that is None is empty.
+        lines.append([*labels, *(row.cells[column.key] for column in headline.columns)])
+    return csv_text([head, *lines])
 
 
 def _markdown(headline: Headline, names: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import DegenerateError, InputError
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import LOSSES
@@ -22,39 +22,18 @@ _LINEAR = LOSSES["linear"]
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """An image's keypoints, in the order of their semantic ids.
+    """An image's keypoints, in the order of their semantic ids."""
 
-    Parameters
-    ----------
-    points_2d : (n, 2) float
-        [px]
-    camera : Camera
-    query : Query
-        Semantic ids and rays of the keypoints, for the kernels.
-    spurious : float
-        Log-likelihood of the keypoints if all of them are spurious.
-    """
-
-    points_2d: FloatArray
+    points_2d: FloatArray  # (n, 2) [px]
     camera: Camera
-    query: Query
-    spurious: float
+    query: Query  # semantic ids and rays of the keypoints, for the kernels
+    spurious: float  # log-likelihood of the keypoints if all of them are spurious
 
 
 def observe(
-    points_2d: npt.ArrayLike,
-    semantic_ids: npt.ArrayLike,
-    camera: Camera,
-    options: RetrievalOptions,
+    points_2d: npt.ArrayLike, semantic_ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
 ) -> Observed:
-    """Check an image's keypoints and prepare them for the kernels.
-
-    Raises
-    ------
-    InputError
-        If shapes don't match, a value is NaN or infinite, a semantic id occurs twice, or the
-        keypoints' standard deviations are invalid.
-    """
+    """Check an image's keypoints and prepare them for the kernels."""
     if not isinstance(camera, Camera):
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
@@ -62,18 +41,18 @@ def observe(
     order = np.argsort(ids)
     pixels, ids = pixels[order], ids[order]
     covariances = _covariances(options, pixels, order)
-    rays = rays_of(pixels, camera)
+    rays = np.require(rays_of(pixels, camera), np.float64, ["C", "W"])
     fitting = options.fitting
-    off = np.log(options.spurious / (camera.width * camera.height))
     density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
+    off = np.log(options.spurious / (camera.width * camera.height))
     query = Query(
         ids=ids,
-        rays=np.require(rays, np.float64, ["C", "W"]),
+        rays=rays,
         whitening=whitening_of(covariances, rays, camera),
         loss=LOSSES[fitting.loss],
         loss_scale=float(fitting.loss_scale),
         prior_weight=fitting.prior_weight,
-        free=options.fitting.free,
+        free=fitting.free,
         max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
@@ -98,44 +77,19 @@ def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray)
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """The candidates of a query that share enough keypoints with it.
+    """The c candidates of a query that share enough keypoints with it."""
 
-    Parameters
-    ----------
-    keypoints : Candidates
-        Keypoints for the kernels.
-    models : (c,) int
-        Row of each candidate's model in the table.
-    mirrored : (c,) bool
-    base : (c,) float
-        Log-likelihood of a candidate that fits without error.
-    bounds : (c,) float
-        Lower bounds of the costs, twice the loss of log-likelihood.
-    """
-
-    keypoints: Candidates
-    models: IntArray
-    mirrored: npt.NDArray[np.bool_]
-    base: FloatArray
-    bounds: FloatArray
+    keypoints: Candidates  # for the kernels
+    models: IntArray  # (c,), rows of the models in the table
+    mirrored: BoolArray  # (c,)
+    base: FloatArray  # (c,), log-likelihood of a candidate that fits without error
+    bounds: FloatArray  # (c,), lower bounds of the costs, twice the loss of log-likelihood
 
 
 def gather_candidates(
-    table: ModelTable,
-    observed: Observed,
-    options: RetrievalOptions,
-    *,
-    exclude: Collection[ModelKey] = (),
+    table: ModelTable, observed: Observed, options: RetrievalOptions, exclude: Collection[ModelKey]
 ) -> CandidateSet:
-    """Gather the candidates of a query.
-
-    Raises
-    ------
-    InputError
-        If the library or the category is empty or unknown, or no model has one of the semantic ids.
-    DegenerateError
-        If no model shares at least 4 keypoints with the image.
-    """
+    """Gather the candidates of a query, without the models to ``exclude``."""
     chosen = _chosen_models(table, options.category, exclude)
     _check_known(table, observed.query.ids, chosen, options.category)
     models, candidates, labelings = _candidates(table, chosen, options.symmetries)
@@ -208,31 +162,21 @@ def _candidates(
 ) -> tuple[IntArray, Candidates, IntArray]:
     """List the candidates: models (c,), keypoints, and numbers of labelings of each model (c,)."""
     first, last = table.offsets[chosen], table.offsets[chosen + 1]
-    spans = np.stack([first, last, first], axis=1)
-    rows = table.places
-    if not symmetries:
-        candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
-        return chosen, candidates, np.ones(len(chosen), dtype=np.int64)
-    counts = last - first
-    start = len(table.xyz)
-    extra = (table.labeling_offsets[chosen + 1] - table.labeling_offsets[chosen]) // counts
-    models = np.repeat(chosen, 1 + extra)
-    number = np.arange(len(models)) - np.repeat(np.cumsum(1 + extra) - (1 + extra), 1 + extra)
-    spans = np.repeat(spans, 1 + extra, axis=0)
-    own = start + table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
-    spans[:, 2] = np.where(number > 0, own, spans[:, 0])
-    candidates = Candidates(table.xyz, table.semantic_ids, rows, spans)
-    return models, candidates, np.repeat(1 + extra, 1 + extra)
+    labelings = np.ones_like(chosen)
+    if symmetries:
+        starts, ends = table.labeling_offsets[chosen], table.labeling_offsets[chosen + 1]
+        labelings += (ends - starts) // (last - first)
+    models = np.repeat(chosen, labelings)
+    number = np.arange(len(models)) - np.repeat(np.cumsum(labelings) - labelings, labelings)
+    spans = np.repeat(np.stack([first, last, first], axis=1), labelings, axis=0)
+    mirrored = table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
+    spans[:, 2] = np.where(number > 0, len(table.xyz) + mirrored, spans[:, 0])
+    candidates = Candidates(table.xyz, table.semantic_ids, table.places, spans)
+    return models, candidates, np.repeat(labelings, labelings)
 
 
 def _ranges(ids: IntArray) -> str:
-    """Format ascending numbers as ranges.
-
-    Examples
-    --------
-    >>> _ranges(np.array([0, 1, 2, 5]))
-    '0-2, 5'
-    """
+    """Format ascending numbers as ranges: 0-2, 5."""
     runs = np.split(ids, np.flatnonzero(np.diff(ids) > 1) + 1)
     return ", ".join(
         str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run)

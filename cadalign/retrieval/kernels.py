@@ -34,55 +34,29 @@ _SAME_CHORD = 1e-3
 
 
 class Query(NamedTuple):
-    """Keypoints of an image, in the order of their semantic ids.
+    """Keypoints of an image, in the order of their semantic ids."""
 
-    Parameters
-    ----------
-    ids : (n,) int
-        Semantic ids, ascending.
-    rays : (n, 2) float
-        Normalised image coordinates.
-    whitening : (1 or n, 3) float
-        See `cadalign.solvers.evidence.Keypoints`, as the rest.
-    loss : int
-    loss_scale, prior_weight : float
-    free : (8,) float
-    max_stretch : float
-        Largest scale; its inverse is the smallest.
-    gains : (n,) float
-        Gain in log-likelihood of a candidate that shares the keypoint without error.
-    """
-
-    ids: IntArray
-    rays: FloatArray
-    whitening: FloatArray
+    ids: IntArray  # (n,), ascending
+    rays: FloatArray  # (n, 2), normalised image coordinates
+    whitening: FloatArray  # (1 or n, 3); see `cadalign.solvers.evidence.Keypoints`, as the next
     loss: int
     loss_scale: float
     prior_weight: float
-    free: FloatArray
-    max_stretch: float
-    gains: FloatArray
+    free: FloatArray  # (8,)
+    max_stretch: float  # its inverse is the smallest scale
+    gains: FloatArray  # (n,), in log-likelihood, of a candidate that shares it without error
 
 
 class Candidates(NamedTuple):
     """Keypoints of the candidates.
 
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        Keypoints of the whole library.
-    ids : (k,) int
-        Their semantic ids.
-    rows : (r,) int
-        Rows of ``xyz`` in the order of a candidate's labels: ascending unless labels are mirrored.
-    spans : (c, 3) int
-        For each candidate: start and end of its labels in ``ids``, and start of its ``rows``.
+    A candidate's ``rows`` of ``xyz`` are in the order of its labels: ascending unless mirrored.
     """
 
-    xyz: FloatArray
-    ids: IntArray
-    rows: IntArray
-    spans: IntArray
+    xyz: FloatArray  # (k, 3), of the whole library
+    ids: IntArray  # (k,), semantic ids
+    rows: IntArray  # (r,)
+    spans: IntArray  # (c, 3): start and end of its labels in ``ids``, and start of its ``rows``
 
 
 @kernel

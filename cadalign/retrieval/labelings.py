@@ -16,20 +16,8 @@ def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) 
 
     All pairs that mirror each other across a plane x = const swap labels together; so do those
     across y = const and z = const, and any combination of these. Pairs along no axis, and planes
-    that give a keypoint two labels, are left out.
-
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        The model's keypoints.
-    reflections : iterable of pairs of int
-        Rows of ``xyz`` that mirror each other.
-
-    Returns
-    -------
-    list of (k,) int
-        For each permutation, the row of ``xyz`` that takes each row's label; the identity is left
-        out.
+    that give a keypoint two labels, are left out; so is the identity. A permutation names, for
+    each row of ``xyz``, the row that takes its label.
 
     Examples
     --------

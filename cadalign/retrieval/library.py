@@ -202,7 +202,8 @@ class Library:
         max_stretch, symmetries, missing_prob, spurious, exhaustive
             Options, described at `cadalign.retrieval.options.RetrievalOptions`.
         mask : (h, w) bool, optional
-            The object's pixels: reranks the best matches that have a mesh by their silhouettes; see
+            The object's pixels (of numbers, those above half of the largest possible one): reranks
+            the best matches that have a mesh by their silhouettes; see
             `cadalign.retrieval.silhouettes`.
         image : (h, w, 3) or (h, w, 4) uint8, optional
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
@@ -242,9 +243,9 @@ class Library:
             exhaustive=exhaustive,
         )
         observed = observe(points_2d, semantic_ids, camera, options)
-        candidates = gather_candidates(self._table, observed, options, exclude=exclude)
-        ranking = rank(candidates, observed, options, workers=workers)
-        matches = make_matches(self._table, candidates, observed, ranking, top=top)
+        candidates = gather_candidates(self._table, observed, options, exclude)
+        ranking = rank(candidates, observed, options, workers)
+        matches = make_matches(self._table, candidates, observed, ranking, top)
         if mask is None and image is None:
             return matches
         from cadalign.retrieval.silhouettes import mask_of, rerank

@@ -35,23 +35,14 @@ _AGAIN = "build it with: cadalign library build"
 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
-    """Write a library's file atomically; raises DataError on failure."""
+    """Write a library's file atomically."""
     payload = _payload(models)
     header = _HEADER.pack(_MAGIC, VERSION, 0, payload.size, _checksum(payload))
-
-    def write(unfinished: Path) -> None:
-        with unfinished.open("wb") as file:
-            file.write(header)
-            file.write(payload)
-
-    write_whole(Path(path), write)
+    write_whole(Path(path), lambda unfinished: unfinished.write_bytes(header + payload))
 
 
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
-    """Map a library's file into memory.
-
-    Raises DataError if the file is missing, truncated, damaged, or of another version or format.
-    """
+    """Map a library's file into memory and check it."""
     where = str(path)
     try:
         with pa.memory_map(where) as source:
@@ -95,13 +86,7 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
 
 
 def _check_table(table: pa.Table) -> None:
-    """Refuse a table whose indices could lead out of its memory, whatever its checksum.
-
-    Raises
-    ------
-    ValueError or pyarrow.ArrowException
-        If columns, offsets, row numbers or coordinates are invalid.
-    """
+    """Refuse a table whose indices could lead out of its memory, whatever its checksum."""
     if not table.schema.equals(SCHEMA):
         raise ValueError("it has other columns")
     table.validate(full=True)

@@ -244,10 +244,16 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     reflections = [(int(place[a]), int(place[b])) for a, b in symmetries.reflections]
     xyz = model.xyz[order]
     labelings = mirrored_labelings(xyz, reflections)
-    rotations = [
-        {"keypoints": [int(place[row]) for row in each.keypoints], "circle": _written(each.circle)}
-        for each in symmetries.rotations
-    ]
+    rotations = []
+    for each in symmetries.rotations:
+        circle = each.circle and [
+            each.circle.center.tolist(),
+            each.circle.radius,
+            each.circle.normal.tolist(),
+        ]
+        rotations.append(
+            {"keypoints": [int(place[row]) for row in each.keypoints], "circle": circle}
+        )
     return {
         "category": model.category,
         "model_id": model.model_id,
@@ -260,41 +266,30 @@ def _row(model: LibraryModel) -> dict[str, Any]:
     }
 
 
-def _written(circle: Circle | None) -> list[Any] | None:
-    return (
-        None if circle is None else [circle.center.tolist(), circle.radius, circle.normal.tolist()]
-    )
-
-
 def _symmetries_from(text: str, count: int) -> Symmetries:
     """Read a model's symmetries and check their rows of its ``count`` keypoints."""
-    try:
-        symmetries = _parse_symmetries(text)
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
-        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
-    rows = [row for pair in symmetries.reflections for row in pair]
-    rows += [row for rotation in symmetries.rotations for row in rotation.keypoints]
-    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
-        raise DataError("names a keypoint that does not exist", where="symmetries")
-    return symmetries
-
-
-def _parse_symmetries(text: str) -> Symmetries:
     from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
-    def read_circle(written: list[Any] | None) -> Circle | None:
-        if written is None:
-            return None
-        center, radius, normal = written
+    def read_circle(center: list[float], radius: float, normal: list[float]) -> Circle:
         return Circle(np.array(center), radius, np.array(normal))
 
-    data = json.loads(text)
-    rotations = (
-        RotationalSymmetry(tuple(each["keypoints"]), read_circle(each["circle"]))
-        for each in data["rotations"]
-    )
-    reflections = ((first, second) for first, second in data["reflections"])
-    return Symmetries(tuple(reflections), tuple(rotations))
+    try:
+        data = json.loads(text)
+        rotations = tuple(
+            RotationalSymmetry(
+                tuple(each["keypoints"]),
+                None if each["circle"] is None else read_circle(*each["circle"]),
+            )
+            for each in data["rotations"]
+        )
+        reflections = tuple((first, second) for first, second in data["reflections"])
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+        raise DataError(f"malformed ({str(error)[:200]})", where="symmetries") from None
+    rows = [row for pair in reflections for row in pair]
+    rows += [row for rotation in rotations for row in rotation.keypoints]
+    if not all(isinstance(row, int) and 0 <= row < count for row in rows):
+        raise DataError("names a keypoint that does not exist", where="symmetries")
+    return Symmetries(reflections, rotations)
 
 
 def _no_symmetries() -> Symmetries:

@@ -39,10 +39,7 @@ METHODS = ("optimal", "epnp")
 
 @dataclass(frozen=True)
 class RetrievalOptions:
-    """Options of a retrieval.
-
-    Raises InputError if a value is out of range or unknown.
-    """
+    """Options of a retrieval."""
 
     top: int = 10
     """Largest number of matches to return."""

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import write_json, write_text, writing
 from cadalign.io.images import write_image
-from cadalign.render import Geometry, Scene, cast_geometry, draw_overlay
+from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
 from cadalign.retrieval.match import Match
+from cadalign.retrieval.silhouettes import cast_match
 from cadalign.web import asset, fill
 
 
@@ -26,25 +26,11 @@ def write_retrieval(
     *,
     title: str,
     library: str,
-    image: ByteImage | None = None,
+    image: ByteImage | None,
 ) -> Path:
     """Write ``matches.json``, ``overlay_01.png`` and so on, and ``index.html``; returns the page.
 
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-    matches : sequence of Match
-        The best first.
-    camera : Camera
-    title : str
-        Heading of the page.
-    library : str
-        Description of the library, for the page.
-    image : (h, w, 3) uint8, optional
-        The photo; without it the overlays are drawn on grey.
-
-    Raises DataError if a file cannot be written.
+    The library is described by text. Without a photo the overlays are drawn on grey.
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
@@ -52,16 +38,15 @@ def write_retrieval(
     for rank, match in enumerate(matches, start=1):
         write_image(folder / overlay_name(rank), draw_match(image, camera, match))
     write_json(folder / "matches.json", [match.to_dict() for match in matches])
-    page = folder / "index.html"
-    cards = [_card(rank, match) for rank, match in enumerate(matches, start=1)]
     html = fill(
         "retrieval.html",
         title=escape(title),
         style=asset("retrieval.css"),
         count=len(matches),
         library=escape(library),
-        matches="".join(cards),
+        matches="".join(_card(rank, match) for rank, match in enumerate(matches, start=1)),
     )
+    page = folder / "index.html"
     write_text(page, html)
     return page
 
@@ -86,21 +71,10 @@ def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
         image,
         camera,
         est_box=match.box,
-        est_frame=_cast(camera, match),
+        est_frame=cast_match(match, camera),  # without a mesh, keypoints and box are drawn
         observed=match.points_2d,
         reprojected=match.points_2d + match.residuals,
     )
-
-
-def _cast(camera: Camera, match: Match) -> Geometry | None:
-    from cadalign.datasets import load_mesh
-
-    if match.mesh_path is None:
-        return None
-    try:
-        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
-    except CadalignError:  # keypoints and box are drawn without the mesh
-        return None
 
 
 def _card(rank: int, match: Match) -> str:
@@ -129,11 +103,5 @@ def _card(rank: int, match: Match) -> str:
 
 
 def score_text(score: float) -> str:
-    """Format a probability in percent.
-
-    Examples
-    --------
-    >>> score_text(0.123), score_text(1e-9)
-    ('12.3 %', '< 0.1 %')
-    """
+    """Format a probability in percent."""
     return f"{100 * score:.1f} %" if score >= 0.0005 else "< 0.1 %"

@@ -1,14 +1,19 @@
-"""Reading of queries: observation files whose keypoints need no model points."""
+"""Reading of queries: observations whose keypoints need no model points, masks and opacity."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from cadalign.errors import DataError
+import numpy as np
+
+from cadalign.arrays import BoolArray
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, read_json
+from cadalign.io.images import open_photo, read_image
 from cadalign.io.observation import Observation
+from cadalign.render.drawing.color import ByteImage
 
 _ORIGIN = [0.0, 0.0, 0.0]
 
@@ -18,10 +23,15 @@ def read_query(path: Path) -> Observation:
 
     The format is that of `cadalign.io.observation`, but keypoints must have a ``semantic_id`` and
     may lack ``xyz``, which is zero in the returned observation and not used.
-
-    Raises DataError if the file is missing, is not JSON, or a field is missing, unknown or invalid.
     """
-    data = _with_model_points(read_json(path))
+    data = read_json(path)
+    keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
+    if isinstance(keypoints, list):
+        filled = [
+            {"xyz": _ORIGIN, **keypoint} if isinstance(keypoint, Mapping) else keypoint
+            for keypoint in keypoints
+        ]
+        data = {**data, "keypoints": filled}
     with in_file(path):
         query = Observation.from_dict(data, folder=path.parent)
         if query.semantic_ids is None:
@@ -32,13 +42,25 @@ def read_query(path: Path) -> Observation:
     return query
 
 
-def _with_model_points(data: Any) -> Any:
-    """Fill in model points for keypoints that have none."""
-    keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
-    if not isinstance(keypoints, list):
-        return data
-    filled = [
-        {"xyz": _ORIGIN, **keypoint} if isinstance(keypoint, Mapping) else keypoint
-        for keypoint in keypoints
-    ]
-    return {**data, "keypoints": filled}
+def read_mask(path: Path, camera: Camera) -> BoolArray:
+    """Read an image whose bright pixels are the object's, (h, w) bool; raises as `read_image`."""
+    return np.asarray(read_image(path, camera).mean(axis=2) > 127.5)
+
+
+def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
+    """Read a photo with its opacity if it has one, (h, w, 3 or 4) uint8, upright by EXIF."""
+    if path is None:
+        raise InputError(
+            "the observation names no image",
+            where="--silhouette",
+            fix="add the image to the observation, or give the object's pixels with --mask",
+        )
+    colors = read_image(path, camera)
+    from PIL import ImageOps
+
+    with open_photo(path) as image:
+        if not image.has_transparency_data:
+            return colors
+        # The transparent colour of a palette is no separate channel in the file.
+        opacity = ImageOps.exif_transpose(image).convert("RGBA").getchannel("A")
+        return np.dstack([colors, np.asarray(opacity)])

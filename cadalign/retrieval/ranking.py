@@ -57,39 +57,19 @@ Search = Callable[[IntArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Searched candidates, one for each model, the best first.
+    """Searched candidates, one for each of m models, the best first."""
 
-    Parameters
-    ----------
-    candidates : (m,) int
-        Rows of the candidate set.
-    poses : (m, 15) float
-    log_likelihoods : (m,) float
-    scores : (m,) float
-        Probabilities of the models.
-    searched : int
-        Number of candidates that were searched for a pose.
-    """
-
-    candidates: IntArray
-    poses: FloatArray
-    log_likelihoods: FloatArray
-    scores: FloatArray
-    searched: int
+    candidates: IntArray  # (m,), rows of the candidate set
+    poses: FloatArray  # (m, 15)
+    log_likelihoods: FloatArray  # (m,)
+    scores: FloatArray  # (m,), probabilities of the models
+    searched: int  # number of candidates that were searched for a pose
 
 
 def rank(
-    candidates: CandidateSet, observed: Observed, options: RetrievalOptions, *, workers: int = -1
+    candidates: CandidateSet, observed: Observed, options: RetrievalOptions, workers: int
 ) -> Ranking:
-    """Rank the models of a candidate set.
-
-    Raises
-    ------
-    InputError
-        If ``workers`` is neither positive nor -1.
-    DegenerateError
-        If no model can be aligned.
-    """
+    """Rank the models of a candidate set."""
     if workers == -1:
         workers = os.cpu_count() or 1
     if workers < 1:
@@ -153,10 +133,7 @@ class _SearchState:
         return float(np.partition(best, -top)[-top]) if len(best) >= top else -np.inf
 
     def ranking(self) -> Ranking:
-        """Rank the models, each with its best labels; ties in the library's order.
-
-        Raises DegenerateError if no model has a pose.
-        """
+        """Rank the models, each with its best labels; ties in the library's order."""
         order = np.argsort(-self._reached, kind="stable")
         order = order[np.isfinite(self._reached[order])]
         if not len(order):
@@ -232,12 +209,7 @@ def shared_keypoints(
 
 
 def make_matches(
-    table: ModelTable,
-    candidates: CandidateSet,
-    observed: Observed,
-    ranking: Ranking,
-    *,
-    top: int,
+    table: ModelTable, candidates: CandidateSet, observed: Observed, ranking: Ranking, top: int
 ) -> list[Match]:
     """Make matches of the first models of a ranking."""
     matches = []

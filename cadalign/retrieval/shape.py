@@ -16,21 +16,7 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     """Root mean square distance of the shared keypoints, as a share of the true ones' extent.
 
     The estimated model is moved, and stretched along y and z (x is taken as known), to be closest
-    to the true one; it is not rotated.
-
-    Parameters
-    ----------
-    est, gt : LibraryModel
-
-    Returns
-    -------
-    float
-        0 for models that differ only by their stretch; NaN with fewer than 2 shared keypoints.
-
-    Raises
-    ------
-    InputError
-        If they are of different categories: their semantic ids mean different things.
+    to the true one; it is not rotated. NaN with fewer than 2 shared keypoints.
 
     Examples
     --------
@@ -45,13 +31,6 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
         raise InputError(f"the categories {est.category!r} and {gt.category!r} differ", where="est")
     _, mine, theirs = np.intersect1d(est.semantic_ids, gt.semantic_ids, return_indices=True)
     return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
-
-
-def is_same_shape(est: LibraryModel, gt: LibraryModel) -> bool:
-    """True if two models have the same ids and differ by at most `SAME_SHAPE` after stretch."""
-    if est.category != gt.category or set(est.semantic_ids) != set(gt.semantic_ids):
-        return False
-    return shape_distance(est, gt) <= SAME_SHAPE
 
 
 def distances(est: FloatArray, gt: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from cadalign.arrays import BoolArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.render import Scene, cast_geometry, silhouette_iou
+from cadalign.render import Geometry, Scene, cast_geometry, silhouette_iou
 from cadalign.retrieval.match import Match
 
 logger = logging.getLogger("cadalign")
@@ -32,23 +32,13 @@ _MARGIN = 0.15  # around keypoints and boxes, as a share of their extent
 
 
 def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
-    """Rank matches by keypoints and silhouettes together.
+    """Rank the best matches by keypoints and silhouettes together.
 
-    Parameters
-    ----------
-    matches : sequence of Match
-        The best matches by their keypoints.
-    mask : (h, w) bool
-        The object's pixels, as `cadalign.render.silhouette_iou` takes them.
-    camera : Camera
-
-    Returns
-    -------
-    list of Match
-        With ``silhouette_iou``, and ``score`` redistributed among them. The likelihood remains that
-        of the keypoints.
+    They get their ``silhouette_iou``, and ``score`` is redistributed among them. The likelihood
+    remains that of the keypoints.
     """
-    overlaps = [_overlap(match, mask, camera) for match in matches]
+    casts = (cast_match(match, camera) for match in matches)
+    overlaps = [None if cast is None else silhouette_iou(est=cast.mask, gt=mask) for cast in casts]
     known = [overlap for overlap in overlaps if overlap is not None]
     if not known:
         logger.warning("none of the matches has a mesh: the mask is not used")
@@ -74,28 +64,19 @@ def mask_of(
     """Choose the object's pixels: the given mask, the image's opacity, or a segmentation.
 
     The segmentation (OpenCV's GrabCut) starts from the box around the keypoints and the best match.
-
-    Parameters
-    ----------
-    mask : (h, w) bool, optional
-        For numbers, values above half of the largest possible one count.
-    image : (h, w, 3) or (h, w, 4) uint8, optional
-    matches : sequence of Match
-    camera : Camera
-
-    Returns
-    -------
-    (h, w) bool or uint8
-
-    Raises
-    ------
-    InputError
-        If both or neither are given, or one has the wrong type or size, or no pixel of the object.
+    The parameters are those of `cadalign.Library.retrieve`.
     """
     if (mask is None) == (image is None):
         raise InputError("give a mask or an image, not both", where="mask")
     where = "image" if mask is None else "mask"
-    found = np.asarray(mask) if mask is not None else _object_in(np.asarray(image), matches, camera)
+    found = np.asarray(image if mask is None else mask)
+    if mask is None:
+        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[2] not in (3, 4):
+            raise InputError(
+                f"{found.dtype} of shape {found.shape}, expected an RGB or RGBA image of uint8",
+                where="image",
+            )
+        found = found[:, :, 3] if found.shape[2] == 4 else _segment(found, matches, camera)
     if found.shape != (camera.height, camera.width):
         raise InputError(
             f"shape {found.shape}, but the camera's image is {camera.height} high and "
@@ -107,30 +88,15 @@ def mask_of(
     return found
 
 
-def _object_in(
-    pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera
-) -> npt.NDArray[Any]:
-    """Take an image's opacity, or segment the image."""
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-        raise InputError(
-            f"{pixels.dtype} of shape {pixels.shape}, expected an RGB or RGBA image of uint8",
-            where="image",
-        )
-    if pixels.shape[2] == 4:
-        return np.asarray(pixels[:, :, 3])
-    return _segment(pixels, matches, camera)
-
-
-def _overlap(match: Match, mask: npt.ArrayLike, camera: Camera) -> float | None:
-    """Intersection over union of a match's silhouette; None without a mesh."""
+def cast_match(match: Match, camera: Camera) -> Geometry | None:
+    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
     if match.mesh_path is None:
         return None
     try:
-        scene = Scene(load_mesh(match.mesh_path))
+        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
     except CadalignError as error:
         logger.warning("no silhouette: %s", error)
         return None
-    return silhouette_iou(est=cast_geometry(scene, camera, match.alignment).mask, gt=mask)
 
 
 def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:

@@ -30,14 +30,7 @@ from msgspec import Meta
 from cadalign.arrays import FloatArray
 from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
-from cadalign.io.documents import (
-    Finite,
-    ForeignDocument,
-    Text,
-    convert,
-    in_file,
-    read_json,
-)
+from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
 
 _FIX = (
     "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco_keypoints"
@@ -118,10 +111,8 @@ def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
 
 def _read(data: Any) -> list[ImageKeypoints]:
     if isinstance(data, list):
-        return [
-            _image_keypoints(entry, f"[{row}]")
-            for row, entry in enumerate(convert(data, list[_Object]))
-        ]
+        entries = enumerate(convert(data, list[_Object]))
+        return [_image_keypoints(entry, f"[{row}]", names=None) for row, entry in entries]
     if isinstance(data, dict) and "annotations" in data:
         return _from_annotations(convert(data, _Annotations))
     if isinstance(data, dict) and "instance_info" in data:
@@ -176,19 +167,14 @@ def _from_predictions(data: _Predictions) -> list[ImageKeypoints]:
     return objects
 
 
-def _image_keypoints(
-    entry: _Object, where: str, *, names: list[str] | None = None
-) -> ImageKeypoints:
-    points, third = _points(entry, f"{where}.keypoints")
+def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> ImageKeypoints:
+    place = f"{where}.keypoints"
+    points, third = _points(entry, place)
     if names is not None and len(names) != len(points):
-        raise DataError(
-            f"{len(points)} keypoints, but the category names {len(names)}",
-            where=f"{where}.keypoints",
-        )
+        what = f"{len(points)} keypoints, but the category names {len(names)}"
+        raise DataError(what, where=place)
     if third is not None and len(third) != len(points):
-        raise DataError(
-            f"{len(third)} scores of {len(points)} keypoints", where=f"{where}.keypoints"
-        )
+        raise DataError(f"{len(third)} scores of {len(points)} keypoints", where=place)
     given = (entry.score, entry.bbox_score, entry.confidence)
     return ImageKeypoints(
         points_2d=points,
@@ -220,9 +206,8 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
     else:
         flat = convert(value, list[Finite], where=where)
         if len(flat) % 3:
-            raise DataError(
-                f"{len(flat)} numbers are not x, y and visibility of keypoints", where=where
-            )
+            what = f"{len(flat)} numbers are not x, y and visibility of keypoints"
+            raise DataError(what, where=where)
         numbers = np.reshape(flat, (-1, 3))
     third: Any = entry.keypoint_scores
     if third is None and numbers.shape[1] == 3:

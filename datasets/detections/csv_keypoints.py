@@ -32,41 +32,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import UNSET, UnsetType
 
 from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
-from cadalign.io.documents import Document, Finite, Text, convert, in_file
+from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import reading
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _VISIBILITY_SCORES = (0.0, OCCLUDED_SCORE, 1.0)
 
 
-class _Row(Document):
-    """One line, as the module's documentation describes its columns."""
-
-    u: Finite
-    v: Finite
-    image: str = ""
-    # UNSET, not None: the library reads None out of the text "null".
-    name: Text | UnsetType = UNSET
-    semantic_id: Finite | UnsetType = UNSET
-    score: Finite | UnsetType = UNSET
-    visibility: Finite | UnsetType = UNSET
-    sigma: Finite | UnsetType = UNSET
-
-    def __post_init__(self) -> None:
-        # Programs write whole numbers as 2.0 in columns with gaps.
-        if self.semantic_id is not UNSET and self.semantic_id % 1:
-            raise InputError(f"{self.semantic_id} is not a whole number", where="semantic_id")
-        if self.visibility is not UNSET and self.visibility not in (0, 1, 2):
-            raise InputError(f"{self.visibility:g} is not 0, 1 or 2", where="visibility")
+_COLUMNS: dict[str, Any] = {
+    "u": Finite,
+    "v": Finite,
+    "image": str,
+    "name": Text,
+    "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
+    "score": Finite,
+    "visibility": Finite,
+    "sigma": Finite,
+}
 
 
 def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
     """Read a CSV file, one object for each image."""
-    by_image: dict[str | None, list[_Row]] = {}
+    by_image: dict[str | None, list[dict[str, Any]]] = {}
     try:
         with reading(path), path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file, strict=True)
@@ -74,7 +64,7 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
             for line in lines:
                 row = _row(header, line, f"{path}, line {lines.line_num}")
                 if row is not None:
-                    by_image.setdefault(row.image or None, []).append(row)
+                    by_image.setdefault(row.get("image") or None, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({error})", where=str(path)) from None
     if not by_image:
@@ -84,11 +74,10 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
 
 def _header(cells: list[str], where: str) -> list[str]:
     names = [_OTHER_NAMES.get(cell.strip().lower(), cell.strip().lower()) for cell in cells]
-    known = _Row.__struct_fields__
     for name in names:
-        if name not in known:
+        if name not in _COLUMNS:
             what = f"unknown column {quote(name)}"
-            raise DataError(what, where=where, fix=f"known are {', '.join(known)}")
+            raise DataError(what, where=where, fix=f"known are {', '.join(_COLUMNS)}")
         if names.count(name) > 1:
             raise DataError(f"the column {name!r} occurs twice", where=where)
     for name in ("u", "v"):
@@ -100,7 +89,7 @@ def _header(cells: list[str], where: str) -> list[str]:
     return names
 
 
-def _row(header: list[str], line: list[str], where: str) -> _Row | None:
+def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | None:
     """One line; None for one that is empty or has no pixel."""
     cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
     if not any(cells.values()):
@@ -110,21 +99,34 @@ def _row(header: list[str], line: list[str], where: str) -> _Row | None:
     if not cells["u"] and not cells["v"]:
         return None
     with in_file(where):
-        row: _Row = convert(cells, _Row, strict=False)
+        row = {
+            name: convert(_value(name, cell), _COLUMNS[name], where=name)
+            for name, cell in cells.items()
+        }
+        if row.get("semantic_id", 0) % 1:
+            raise InputError(f"{row['semantic_id']} is not a whole number", where="semantic_id")
+        if row.get("visibility", 0) not in (0, 1, 2):
+            raise InputError(f"{row['visibility']:g} is not 0, 1 or 2", where="visibility")
     return row
 
 
-def _object(path: Path, image: str | None, rows: list[_Row]) -> ImageKeypoints:
-    def column(name: str) -> Any:
-        values = [getattr(row, name) for row in rows]
-        return None if values[0] is UNSET else values
+def _value(name: str, cell: str) -> str | float:
+    """A cell as a number in the columns that hold numbers, where it is a finite one."""
+    try:
+        number = np.nan if name in ("image", "name") else float(cell)
+    except ValueError:
+        return cell
+    return number if np.isfinite(number) else cell
 
-    scores = column("score")
-    if column("visibility") is not None:
-        scores = [_VISIBILITY_SCORES[int(flag)] for flag in column("visibility")]
-    names, ids, sigma = column("name"), column("semantic_id"), column("sigma")
+
+def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    scores = columns.get("score")
+    if "visibility" in columns:
+        scores = [_VISIBILITY_SCORES[int(flag)] for flag in columns["visibility"]]
+    names, ids, sigma = (columns.get(name) for name in ("name", "semantic_id", "sigma"))
     return ImageKeypoints(
-        points_2d=np.array([[row.u, row.v] for row in rows]),
+        points_2d=np.column_stack([columns["u"], columns["v"]]),
         scores=None if scores is None else np.array(scores),
         names=None if names is None else tuple(names),
         semantic_ids=None if ids is None or names is not None else tuple(map(int, ids)),

@@ -62,35 +62,28 @@ class ImageKeypoints:
         points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)
         object.__setattr__(self, "points_2d", points)
         for name in ("scores", "sigma"):
-            value = getattr(self, name)
-            if value is None:
+            if (value := getattr(self, name)) is None:
                 continue
-            value = as_floats(value, name=f"{self.source}: {name}", shape=(len(points),))
+            where = f"{self.source}: {name}"
+            value = as_floats(value, name=where, shape=(len(points),))
             object.__setattr__(self, name, value)
-            if (value < 0).any() or (name == "sigma" and not value.all()):
-                row = int(np.argmax(value <= 0) if name == "sigma" else np.argmax(value < 0))
-                what = "not positive" if name == "sigma" else "negative"
-                raise DataError(
-                    f"keypoint {row} has the value {value[row]:g}, which is {what}",
-                    where=f"{self.source}: {name}",
-                )
+            what, bad = ("not positive", value <= 0) if name == "sigma" else ("negative", value < 0)
+            if bad.any():
+                row = int(np.argmax(bad))
+                reason = f"keypoint {row} has the value {value[row]:g}, which is {what}"
+                raise DataError(reason, where=where)
         for name in ("names", "semantic_ids"):
             values = getattr(self, name)
             if values is not None and len(values) != len(points):
-                raise DataError(
-                    f"{len(points)} keypoints but {len(values)} {name.replace('_', ' ')}",
-                    where=self.source,
-                )
+                what = f"{len(points)} keypoints but {len(values)} {name.replace('_', ' ')}"
+                raise DataError(what, where=self.source)
 
     def __len__(self) -> int:
         return len(self.points_2d)
 
 
 def choose_object(
-    objects: Sequence[ImageKeypoints],
-    *,
-    image: str | None = None,
-    number: int | None = None,
+    objects: Sequence[ImageKeypoints], *, image: str | None = None, number: int | None = None
 ) -> ImageKeypoints:
     """Choose one object out of those of a file.
 
@@ -120,19 +113,14 @@ def choose_object(
             )
         if len(images) != 1:
             listed = ", ".join(str(name) for name in images[:5])
-            raise InputError(
-                f"{len(images)} images, none of which is {image!r}"
-                if image is not None
-                else f"{len(images)} images",
-                where="image",
-                fix=f"choose one of {listed}" + (", ..." if len(images) > 5 else ""),
-            )
+            fix = f"choose one of {listed}" + (", ..." if len(images) > 5 else "")
+            missing = "" if image is None else f", none of which is {image!r}"
+            raise InputError(f"{len(images)} images{missing}", where="image", fix=fix)
         wanted = list(objects)
     if number is not None:
         if not 0 <= number < len(wanted):
-            raise InputError(
-                f"object {number} of {len(wanted)}", where="number", fix="count from 0"
-            )
+            what = f"object {number} of {len(wanted)}"
+            raise InputError(what, where="number", fix="count from 0")
         return wanted[number]
     if len(wanted) > 1 and any(found.score is None for found in wanted):
         raise InputError(
@@ -186,7 +174,9 @@ def join_keypoints(
     InputError
         If ``sigma_from_scores`` is not positive.
     """
-    kept = [row for row in range(len(found)) if _is_found(found, row, min_score)]
+    kept = list(range(len(found)))
+    if found.scores is not None:
+        kept = np.flatnonzero((found.scores > 0) & (found.scores >= min_score)).tolist()
     places = _places(found, model)
     unknown = [row for row in kept if places[row] is None]
     if unknown and not ignore_unknown:
@@ -248,12 +238,6 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
             fix="give names, or as many keypoints as the model has, in its order",
         )
     return list(range(len(found)))
-
-
-def _is_found(found: ImageKeypoints, row: int, min_score: float) -> bool:
-    if found.scores is None:
-        return True
-    return bool(found.scores[row] > 0 and found.scores[row] >= min_score)
 
 
 def _label(found: ImageKeypoints, row: int) -> str | int:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets.meshes.obj import read_obj
 from cadalign.datasets.meshes.scenes import read_ply, read_scene
 from cadalign.errors import DataError, InputError
@@ -106,7 +105,8 @@ def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ..
     >>> flat_axes(square)
     ('z',)
     """
-    extents = _extents(mesh)
+    low, high = mesh.bounds
+    extents = np.asarray(high - low)
     flat = extents <= tolerance * np.linalg.norm(extents)
     return tuple(axis for axis, thin in zip("xyz", flat, strict=True) if thin)
 
@@ -132,8 +132,3 @@ def check_solid(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> None:
             where=mesh.source,
             fix="leave it out",
         )
-
-
-def _extents(mesh: Mesh) -> FloatArray:
-    low, high = mesh.bounds
-    return np.asarray(high - low)

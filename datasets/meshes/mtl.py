@@ -34,19 +34,8 @@ def load_materials(
 ) -> dict[str, Material]:
     """Read the named materials; what is missing is warned of and becomes grey.
 
-    Parameters
-    ----------
-    obj_path : Path
-        The OBJ file, which library names are relative to.
-    libraries : iterable of str
-        What its ``mtllib`` lines name.
-    names : iterable of str
-        The materials in use; only their textures are read.
-
-    Returns
-    -------
-    dict of str to Material
-        Every one of the names.
+    ``libraries`` is what the OBJ file's ``mtllib`` lines name; only the textures of ``names`` are
+    read.
     """
     entries: dict[str, tuple[Path, dict[str, Any]]] = {}
     for library in libraries:

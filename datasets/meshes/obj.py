@@ -16,14 +16,14 @@ from typing import BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.meshes.mtl import WHITE, load_materials
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
+from cadalign.io.files import damaged
 
 _DIGITS = b"0123456789+-"
 _MAX_VALUES = 16  # of a vertex; the format has at most 7
-_DAMAGED = "the file is cut short or damaged; get it again"
 # Assimp, which wrote ShapeNetCore.v2, says in a comment how many faces, lines and points follow.
 _ASSIMP_MARK = b"Open Asset Import Library"
 _ASSIMP_COUNT = re.compile(rb"# Mesh '.*' with (\d+) faces")
@@ -62,19 +62,35 @@ def read_obj(path: Path) -> Mesh:
     except (ValueError, OverflowError):
         raise _first_malformed(path) from None
     line_of_corner = np.repeat(np.arange(len(sizes)), sizes)
-    corners[:, 0] = _absolute_indices(
-        corners[:, 0], len(vertices), line_of_corner, statements, kind=1, path=path
-    )
+    starts = np.array(statements.counts_at, dtype=np.int64)
+    seen = starts[np.searchsorted(starts[:, 0], line_of_corner, side="right") - 1, 1:]
+
+    def absolute(kind: int, chosen: BoolArray | slice, count: int) -> IntArray:
+        """Indices from 0; negative ones count back from the face. Kind 0 is that of vertices."""
+        indices, lines = corners[chosen, kind], line_of_corner[chosen]
+        rows = np.where(indices < 0, seen[chosen, kind] + indices, indices - 1)
+        wrong = np.flatnonzero((rows < 0) | (rows >= count))
+        if len(wrong):
+            named = f"{('vertex', 'texture coordinate')[kind]} {indices[wrong[0]]}"
+            face = f"face {lines[wrong[0]]} (counted from 0)"
+            raise damaged(f"{face} names {named}, but there are {count}", path)
+        return np.asarray(rows)
+
+    vertex_rows = absolute(0, slice(None), len(vertices))
+    corner_uv, has_uv = np.zeros((len(corners), 2)), corners[:, 1] != 0
+    if has_uv.any():
+        width = min(texture_coordinates.shape[1], 2)
+        rows = absolute(1, has_uv, len(texture_coordinates))
+        corner_uv[has_uv, :width] = texture_coordinates[rows, :width]
     triangles, polygon = fan_triangles(sizes)
     materials, face_material = _assign_materials(statements, path, polygon, colors is not None)
     return Mesh(
         vertices=vertices,
-        faces=corners[:, 0][triangles],
+        faces=vertex_rows[triangles],
         polygon=polygon,
         vertex_colors=colors,
-        corner_uv=_corner_uv(
-            corners[:, 1], texture_coordinates, triangles, line_of_corner, statements, path
-        ),
+        # (0, 0) where a corner names no texture coordinate.
+        corner_uv=corner_uv[triangles] if has_uv.any() else None,
         materials=materials,
         face_material=face_material,
         source=str(path),
@@ -84,23 +100,8 @@ def read_obj(path: Path) -> Mesh:
 def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
     """Cut polygons, whose corners are listed one after the other, into fans of triangles.
 
-    Parameters
-    ----------
-    sizes : (p,) int
-        The number of corners of each polygon, at least 3.
-
-    Returns
-    -------
-    triangles : (m, 3) int
-        Positions in the list of all corners.
-    polygon : (m,) int
-        Which polygon a triangle was cut from, ascending.
-
-    Examples
-    --------
-    >>> triangles, polygon = fan_triangles(np.array([3, 4]))
-    >>> triangles.tolist(), polygon.tolist()
-    ([[0, 1, 2], [3, 4, 5], [3, 5, 6]], [0, 1, 1])
+    From the polygons' numbers of corners (p,), at least 3, follow the triangles (m, 3) as positions
+    in the list of all corners, and the polygons (m,), ascending, that they were cut from.
     """
     first_corner = np.cumsum(sizes) - sizes
     counts = sizes - 2
@@ -137,11 +138,8 @@ def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
             count = _ASSIMP_COUNT.match(line) if by_assimp else None
             found.declared_elements += int(count[1]) if count else 0
         elif b"\0" in line:
-            raise DataError(
-                "holds binary data, not the text of an OBJ file",
-                where=f"{path}, line {number}",
-                fix=_DAMAGED,
-            )
+            what = "holds binary data, not the text of an OBJ file"
+            raise damaged(what, f"{path}, line {number}")
     return found
 
 
@@ -170,17 +168,11 @@ def _require_complete(statements: _Statements, path: Path) -> None:
             fix="is it an OBJ file, and whole?",
         )
     if not statements.vertices:
-        raise DataError(
-            f"{len(statements.faces)} faces, but no vertices", where=str(path), fix=_DAMAGED
-        )
+        raise damaged(f"{len(statements.faces)} faces, but no vertices", path)
     found = len(statements.faces) + statements.other_elements
     if found < statements.declared_elements:
-        raise DataError(
-            f"its comments announce {statements.declared_elements} faces and lines, but only "
-            f"{found} are there",
-            where=str(path),
-            fix=_DAMAGED,
-        )
+        announced = f"its comments announce {statements.declared_elements} faces and lines"
+        raise damaged(f"{announced}, but only {found} are there", path)
 
 
 def _parse_rows(bodies: list[bytes]) -> FloatArray:
@@ -256,57 +248,6 @@ def _parse_corner(corner: bytes) -> tuple[int, int]:
     return int(parts[0]), int(parts[1]) if len(parts) > 1 and parts[1] else 0
 
 
-def _absolute_indices(
-    indices: IntArray,
-    count: int,
-    line_of_corner: IntArray,
-    statements: _Statements,
-    *,
-    kind: int,
-    path: Path,
-) -> IntArray:
-    """Indices from 0; negative ones count back from the face. ``kind``: 1 vertices, 2 texture."""
-    starts = np.array(statements.counts_at, dtype=np.int64)
-    block = np.searchsorted(starts[:, 0], line_of_corner, side="right") - 1
-    absolute = np.where(indices < 0, starts[block, kind] + indices, indices - 1)
-    wrong = np.flatnonzero((absolute < 0) | (absolute >= count))
-    if len(wrong):
-        what = "vertex" if kind == 1 else "texture coordinate"
-        raise DataError(
-            f"face {line_of_corner[wrong[0]]} (counted from 0) names {what} {indices[wrong[0]]}, "
-            f"but there are {count}",
-            where=str(path),
-            fix=_DAMAGED,
-        )
-    return np.asarray(absolute)
-
-
-def _corner_uv(
-    indices: IntArray,
-    texture_coordinates: FloatArray,
-    triangles: IntArray,
-    line_of_corner: IntArray,
-    statements: _Statements,
-    path: Path,
-) -> FloatArray | None:
-    """Texture coordinates of the triangles' corners, (0, 0) where a corner names none."""
-    named = indices != 0
-    if not named.any():
-        return None
-    uv = np.zeros((len(indices), 2))
-    rows = _absolute_indices(
-        indices[named],
-        len(texture_coordinates),
-        line_of_corner[named],
-        statements,
-        kind=2,
-        path=path,
-    )
-    width = min(texture_coordinates.shape[1], 2)
-    uv[named, :width] = texture_coordinates[rows, :width]
-    return np.asarray(uv[triangles])
-
-
 def _assign_materials(
     statements: _Statements, path: Path, polygon: IntArray, colored: bool
 ) -> tuple[tuple[Material, ...], npt.NDArray[np.int64]]:
@@ -337,10 +278,8 @@ def _first_malformed(path: Path) -> DataError:
                     _parse_faces([body])
             except (ValueError, OverflowError):
                 shown = line[:60].decode("ascii", errors="replace")
-                return DataError(
-                    f"cannot read {shown!r}", where=f"{path}, line {number}", fix=_DAMAGED
-                )
-    return DataError("cannot be read as an OBJ file", where=str(path), fix=_DAMAGED)
+                return damaged(f"cannot read {shown!r}", f"{path}, line {number}")
+    return damaged("cannot be read as an OBJ file", path)
 
 
 def _text(body: bytes) -> str:

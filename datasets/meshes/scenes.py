@@ -18,8 +18,8 @@ from cadalign.datasets.meshes.mtl import WHITE, Texture, texture_array
 from cadalign.datasets.meshes.obj import fan_triangles
 from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.mesh import GREY, Material, Mesh
+from cadalign.io.files import damaged
 
-_DAMAGED = "the file is cut short or damaged; get it again"
 _MAX_HEADER_LINES = 1000
 
 
@@ -31,7 +31,7 @@ def read_ply(path: Path) -> Mesh:
             raise DataError("the PLY file has no faces", where=str(path))
         mesh = trimesh.load(str(path), process=False)
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.vertices) or mesh.visual is None:
-            raise DataError("no triangles could be read", where=str(path), fix=_DAMAGED)
+            raise damaged("no triangles could be read", path)
         textured = mesh.visual.kind == "texture"
         if len(mesh.vertices) < declared.get("vertex", 0) and not textured:
             raise _short(path, "vertices", len(mesh.vertices), declared["vertex"])
@@ -76,16 +76,12 @@ def _parsing(path: Path) -> Iterator[None]:
     except (OSError, CadalignError):
         raise
     except Exception as error:
-        # Text that is not UTF-8 makes trimesh look for a package that guesses encodings.
-        not_text = isinstance(error, ImportError | UnicodeDecodeError)
         reason = f"{type(error).__name__}: {str(error)[:200]}"
-        if not_text:
+        # Text that is not UTF-8 makes trimesh look for a package that guesses encodings.
+        if isinstance(error, ImportError | UnicodeDecodeError):
             reason = "neither whole binary data nor text"
-        raise DataError(
-            f"cannot be read as a {path.suffix.lstrip('.').upper()} file ({reason})",
-            where=str(path),
-            fix=_DAMAGED,
-        ) from None
+        kind = path.suffix.lstrip(".").upper()
+        raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
 
 
 def _check_accessors(path: Path) -> None:
@@ -95,11 +91,7 @@ def _check_accessors(path: Path) -> None:
         data = data[20 : 20 + int.from_bytes(data[12:16], "little")]  # the chunk of JSON
     for number, accessor in enumerate(json.loads(data).get("accessors", [])):
         if "bufferView" not in accessor and accessor["count"] > path.stat().st_size:
-            raise DataError(
-                f"accessor {number} has {accessor['count']} values, but no data",
-                where=str(path),
-                fix=_DAMAGED,
-            )
+            raise damaged(f"accessor {number} has {accessor['count']} values, but no data", path)
 
 
 def _textures(geometries: Iterable[Any], path: Path) -> dict[int, Texture]:
@@ -127,7 +119,7 @@ def _declared_counts(path: Path) -> dict[str, int]:
                 return counts
             if len(words) == 3 and words[0] == b"element" and words[2].isdigit():
                 counts[words[1].decode("ascii", errors="replace")] = int(words[2])
-    raise DataError("the PLY header has no end", where=str(path), fix=_DAMAGED)
+    raise damaged("the PLY header has no end", path)
 
 
 def _declared_off_faces(path: Path) -> int:
@@ -143,11 +135,7 @@ def _declared_off_faces(path: Path) -> int:
 
 
 def _short(path: Path, what: str, found: int, declared: int) -> DataError:
-    return DataError(
-        f"the header announces {declared} {what}, but only {found} are there",
-        where=str(path),
-        fix=_DAMAGED,
-    )
+    return damaged(f"the header announces {declared} {what}, but only {found} are there", path)
 
 
 def _with_polygons(mesh: Any, declared: int, path: Path) -> Mesh:
@@ -158,9 +146,7 @@ def _with_polygons(mesh: Any, declared: int, path: Path) -> Mesh:
         raise _short(path, "faces", len(polygons), declared)
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if sizes.min() < 3:
-        raise DataError(
-            f"face {int(sizes.argmin())} has {sizes.min()} corners", where=str(path), fix=_DAMAGED
-        )
+        raise damaged(f"face {int(sizes.argmin())} has {sizes.min()} corners", path)
     triangles, polygon = fan_triangles(sizes)
     corners = np.concatenate(polygons).astype(np.int64)
     has_colors = mesh.visual.kind == "vertex"
@@ -276,11 +262,15 @@ def _join(pieces: list[Mesh], path: Path) -> Mesh:
     material_start = np.cumsum([0] + [len(piece.materials) for piece in pieces])
     colored = any(piece.vertex_colors is not None for piece in pieces)
     textured = any(piece.corner_uv is not None for piece in pieces)
+    uv = [
+        np.zeros((len(piece.faces), 3, 2)) if piece.corner_uv is None else piece.corner_uv
+        for piece in pieces
+    ]
     return Mesh(
         vertices=np.concatenate([piece.vertices for piece in pieces]),
         faces=_stack([piece.faces for piece in pieces], vertex_start),
         vertex_colors=np.concatenate([_colors(piece) for piece in pieces]) if colored else None,
-        corner_uv=np.concatenate([_uv(piece) for piece in pieces]) if textured else None,
+        corner_uv=np.concatenate(uv) if textured else None,
         materials=tuple(material for piece in pieces for material in piece.materials),
         face_material=_stack([piece.face_material for piece in pieces], material_start),
         source=str(path),
@@ -299,7 +289,3 @@ def _colors(piece: Mesh) -> FloatArray:
     colors = np.ones((len(piece.vertices), 4))
     colors[piece.faces] = palette[piece.face_material][:, None]
     return colors
-
-
-def _uv(piece: Mesh) -> FloatArray:
-    return np.zeros((len(piece.faces), 3, 2)) if piece.corner_uv is None else piece.corner_uv

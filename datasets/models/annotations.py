@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
+from cadalign.arrays import read_only
 from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.mesh import GREY
@@ -22,6 +22,7 @@ from cadalign.io.documents import (
     convert,
     read_json,
 )
+from cadalign.io.files import damaged
 
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
@@ -38,10 +39,8 @@ class _MeshInfo(ForeignDocument):
     def __post_init__(self) -> None:
         total = sum(self.face_uv)
         if not abs(total - 1) <= _SUM_TOLERANCE:
-            raise InputError(
-                f"barycentric coordinates {list(self.face_uv)} sum to {total:g}, not to 1",
-                where="face_uv",
-            )
+            what = f"barycentric coordinates {list(self.face_uv)} sum to {total:g}, not to 1"
+            raise InputError(what, where="face_uv")
 
 
 class _CloudInfo(ForeignDocument):
@@ -73,10 +72,8 @@ class _Reflection(ForeignDocument):
 
     def __post_init__(self) -> None:
         if len(self.kp_indexes) != 2:
-            raise InputError(
-                f"{len(self.kp_indexes)} keypoints do not mirror each other, two do",
-                where="kp_indexes",
-            )
+            what = f"{len(self.kp_indexes)} keypoints do not mirror each other, two do"
+            raise InputError(what, where="kp_indexes")
 
 
 class _Rotation(ForeignDocument):
@@ -99,30 +96,28 @@ class _Entry(ForeignDocument):
     symmetries: _Symmetries | None = None
 
     def __post_init__(self) -> None:
-        first: dict[int, int] = {}
-        for row, keypoint in enumerate(self.keypoints):
-            number = keypoint.semantic_id
-            if first.setdefault(number, row) != row:
-                raise InputError(
-                    f"{number} occurs twice, first in keypoints[{first[number]}]",
-                    where=f"keypoints[{row}].semantic_id",
-                )
-        if self.symmetries is not None:
-            self._check_rows("reflection", self.symmetries.reflection)
-            self._check_rows("rotation", self.symmetries.rotation)
-
-    def _check_rows(self, kind: str, items: Iterable[_Reflection | _Rotation]) -> None:
-        for position, item in enumerate(items):
-            for row in item.kp_indexes:
-                if row >= len(self.keypoints):
+        require_unique(self.keypoints, "semantic_id")
+        for kind in ("reflection", "rotation"):
+            for position, item in enumerate(getattr(self.symmetries, kind, ())):
+                beyond = [row for row in item.kp_indexes if row >= len(self.keypoints)]
+                if beyond:
                     raise InputError(
-                        f"{row} is not the row of one of the {len(self.keypoints)} keypoints",
+                        f"{beyond[0]} is not the row of one of the {len(self.keypoints)} keypoints",
                         where=f"symmetries.{kind}[{position}].kp_indexes",
                     )
 
 
-@dataclass(frozen=True, eq=False)
-class Annotation:
+def require_unique(keypoints: Sequence[Any], field: str) -> None:
+    """Refuse a field's value, other than None, that two of the keypoints have."""
+    first: dict[Any, int] = {}
+    for row, keypoint in enumerate(keypoints):
+        value = getattr(keypoint, field)
+        if value is not None and first.setdefault(value, row) != row:
+            what = f"{value!r} occurs twice, first in keypoints[{first[value]}]"
+            raise InputError(what, where=f"keypoints[{row}].{field}")
+
+
+class Annotation(NamedTuple):
     """One model's entry of an annotation file."""
 
     class_id: str
@@ -136,8 +131,7 @@ def read_entries(path: Path) -> list[Any]:
     try:
         entries = read_json(path)
     except DataError as error:
-        fix = "the file is cut short or damaged; get it again"
-        raise DataError(error.what, where=error.where, fix=fix) from None
+        raise damaged(error.what, error.where) from None
     if not isinstance(entries, list):
         raise DataError(
             f"{quote(entries)} is not a list of models",
@@ -154,27 +148,14 @@ def entry_id(entry: Any, position: int) -> str:
 
 
 def parse_entry(entry: Any, *, where: str) -> Annotation:
-    """Check an entry of an annotation file.
-
-    Parameters
-    ----------
-    entry : object
-        The model's entry, parsed JSON.
-    where : str
-        File and model id, for messages.
-    """
+    """Check a model's entry, parsed JSON; ``where`` is file and model id, for messages."""
     try:
         read: _Entry = convert(entry, _Entry)
         symmetries = Symmetries() if read.symmetries is None else _symmetries(read.symmetries)
     except DataError as error:
         place = f"{where}, {error.where}" if error.where else where
         raise DataError(error.what, where=place, fix=_FIX) from None
-    return Annotation(
-        class_id=read.class_id,
-        model_id=read.model_id,
-        keypoints=_keypoints(read.keypoints),
-        symmetries=symmetries,
-    )
+    return Annotation(read.class_id, read.model_id, _keypoints(read.keypoints), symmetries)
 
 
 def _keypoints(entries: list[_Keypoint]) -> Keypoints:
@@ -182,15 +163,14 @@ def _keypoints(entries: list[_Keypoint]) -> Keypoints:
     grey = tuple(255 * value for value in GREY[:3])
     colors = np.array([entry.rgb or grey for entry in entries]) / 255
     return Keypoints(
-        xyz=_frozen([entry.xyz for entry in entries], float),
-        semantic_ids=_frozen([entry.semantic_id for entry in entries], np.int64),
-        face_index=_frozen([entry.mesh_info.face_index for entry in entries], np.int64),
-        barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True), float),
+        xyz=_frozen([entry.xyz for entry in entries]),
+        semantic_ids=_frozen([entry.semantic_id for entry in entries]),
+        face_index=_frozen([entry.mesh_info.face_index for entry in entries]),
+        barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True)),
         point_index=_frozen(
-            [entry.pcd_info.point_index if entry.pcd_info else _NO_POINT for entry in entries],
-            np.int64,
+            [entry.pcd_info.point_index if entry.pcd_info else _NO_POINT for entry in entries]
         ),
-        colors=_frozen(np.clip(colors, 0.0, 1.0), float),
+        colors=_frozen(np.clip(colors, 0.0, 1.0)),
     )
 
 
@@ -210,13 +190,11 @@ def _circle(read: _Circle) -> Circle:
     normal = np.array(read.normal)
     normal /= np.abs(normal).max()  # whose square is finite
     return Circle(
-        center=_frozen(read.center, float),
+        center=_frozen(read.center),
         radius=read.radius,
-        normal=_frozen(normal / np.linalg.norm(normal), float),
+        normal=_frozen(normal / np.linalg.norm(normal)),
     )
 
 
-def _frozen(values: Any, dtype: Any) -> Any:
-    array = np.array(values, dtype=dtype)
-    array.flags.writeable = False
-    return array
+def _frozen(values: Any) -> Any:
+    return read_only(np.array(values))

@@ -30,52 +30,17 @@ _NAMES = {synset: name for name, synset in SYNSETS.items()}
 
 
 def name_of_synset(synset: str) -> str:
-    """The category's name, or the synset id itself where it is not one of ShapeNetCore's.
-
-    Examples
-    --------
-    >>> name_of_synset("03001627"), name_of_synset("01234567")
-    ('chair', '01234567')
-    """
+    """The category's name, or the synset id itself where it is not one of ShapeNetCore's."""
     return _NAMES.get(synset, synset)
 
 
 def synset_of_name(name: str) -> str:
-    """The category's synset id; what is not a known name is returned as it is.
-
-    Examples
-    --------
-    >>> synset_of_name("chair"), synset_of_name("01234567")
-    ('03001627', '01234567')
-    """
+    """The category's synset id; what is not a known name is returned as it is."""
     return SYNSETS.get(name, name)
 
 
 def require_category(name: str, known: Iterable[str], *, where: str) -> str:
-    """Return the category's name if it, or the category with this synset id, is in ``known``.
-
-    Parameters
-    ----------
-    name : str
-        A category's name or synset id.
-    known : iterable of str
-        Names of the categories there are.
-    where : str
-        Where it was looked up, for the message.
-
-    Raises
-    ------
-    InputError
-        If it is unknown; the message names the known ones, and the nearest of them.
-
-    Examples
-    --------
-    >>> require_category("03001627", ["chair", "mug"], where="dataset")
-    'chair'
-    >>> require_category("chiar", ["chair"], where="root")  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    cadalign.errors.InputError: root: unknown category 'chiar', did you mean 'chair'?; ...
-    """
+    """Return the category's name if it, or the category with this synset id, is in ``known``."""
     names = sorted(known)
     for candidate in (name, name_of_synset(name)):
         if candidate in names:

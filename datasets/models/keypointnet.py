@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -112,14 +112,12 @@ class AnnotatedModel:
             )
 
 
-@dataclass(frozen=True)
-class _Category:
-    """One category's models: annotated ones, and why the others could not be read."""
+class _Category(NamedTuple):
+    """One category's models: annotated ones, why others could not be read, all in file order."""
 
     models: dict[str, AnnotatedModel]
     problems: dict[str, DataError]
-    # All model ids in file order.
-    order: tuple[str, ...]
+    order: list[str]
 
 
 class KeypointNet:
@@ -171,14 +169,10 @@ class KeypointNet:
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
         self._source = _Source(self.root, MeshLocator(self.root, shapenet_root))
-        self._categories = self._source.categories
+        self.categories = self._source.categories
+        """The categories' names, sorted."""
         self._allowed: frozenset[ModelKey] | None = None
         self._with_mesh = False
-
-    @property
-    def categories(self) -> tuple[str, ...]:
-        """The categories' names, sorted."""
-        return self._categories
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -231,7 +225,7 @@ class KeypointNet:
         chosen.__dict__.update(self.__dict__)
         if categories is not None:
             names = [categories] if isinstance(categories, str) else categories
-            chosen._categories = tuple(sorted({self._require(name) for name in names}))
+            chosen.categories = tuple(sorted({self._require(name) for name in names}))
         if split is not None:
             members = self.split(split)
             chosen._allowed = members if self._allowed is None else self._allowed & members
@@ -243,7 +237,7 @@ class KeypointNet:
 
         An entry without a model id goes by its position: ``("chair", "#17")``.
         """
-        names = self._categories if category is None else (self._require(category),)
+        names = self.categories if category is None else (self._require(category),)
         return tuple(
             (name, model_id)
             for name in names
@@ -256,7 +250,7 @@ class KeypointNet:
         """Errors of the models that could not be read, by (category, model id)."""
         return {
             (name, model_id): error
-            for name in self._categories
+            for name in self.categories
             for model_id, error in self._source.load(name).problems.items()
             if self._has(name, model_id)
         }
@@ -293,17 +287,17 @@ class KeypointNet:
         return tuple(model for model_id, model in models if self._has(name, model_id))
 
     def __iter__(self) -> Iterator[AnnotatedModel]:
-        for category in self._categories:
+        for category in self.categories:
             yield from self[category]
 
     def __len__(self) -> int:
-        return sum(len(self[category]) for category in self._categories)
+        return sum(len(self[category]) for category in self.categories)
 
     def __repr__(self) -> str:
-        return f"KeypointNet({str(self.root)!r}, categories={list(self._categories)})"
+        return f"KeypointNet({str(self.root)!r}, categories={list(self.categories)})"
 
     def _require(self, category: str) -> str:
-        return require_category(category, self._categories, where=str(self.root))
+        return require_category(category, self.categories, where=str(self.root))
 
     def _has(self, category: str, model_id: str) -> bool:
         if self._allowed is not None and (category, model_id) not in self._allowed:
@@ -318,9 +312,8 @@ class _Source:
         self._locator = locator
         self._loaded: dict[str, _Category] = {}
         folder = root / "annotations"
-        files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
-        self._files = files
-        if not files:
+        self._files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
+        if not self._files:
             single = [folder / f"{_ALL}.json", root / f"{_ALL}.json", root / "keypointnet.json"]
             found = [path for path in single if path.is_file()]
             if not found:
@@ -330,10 +323,9 @@ class _Source:
                     fix="give the folder that holds KeypointNet's annotations/ and splits/",
                 )
             self._read_single(found[0])
-        self.categories = tuple(sorted({*files, *self._loaded}))
+        self.categories = tuple(sorted({*self._files, *self._loaded}))
 
     def load(self, category: str) -> _Category:
-        """The models of a category."""
         if category not in self._loaded:
             path = self._files[category]
             entries = list(enumerate(read_entries(path)))
@@ -369,19 +361,13 @@ class _Source:
                     raise DataError("the model occurs twice", where=where, fix="remove one entry")
                 annotation = parse_entry(entry, where=where)
                 paths = self._locator.paths(annotation.class_id, annotation.model_id)
-                models[model_id] = AnnotatedModel(
-                    category=category,
-                    class_id=annotation.class_id,
-                    model_id=annotation.model_id,
-                    keypoints=annotation.keypoints,
-                    symmetries=annotation.symmetries,
-                    mesh_path=paths[0] if paths else None,
-                )
+                mesh_path = paths[0] if paths else None
+                models[model_id] = AnnotatedModel(category, *annotation, mesh_path)
             except DataError as error:
                 logger.warning("left out: %s", error)
                 problems[model_id] = error.with_traceback(None)
             order.append(model_id)
-        return _Category(models=models, problems=problems, order=tuple(order))
+        return _Category(models, problems, order)
 
 
 def _read_split(path: Path) -> frozenset[ModelKey]:
@@ -392,8 +378,7 @@ def _read_split(path: Path) -> frozenset[ModelKey]:
         if not line.strip():
             continue
         if not (synset and dash and model_id):
-            raise DataError(
-                f"{line.strip()[:60]!r} is not <synset>-<model id>", where=f"{path}, line {number}"
-            )
+            what = f"{line.strip()[:60]!r} is not <synset>-<model id>"
+            raise DataError(what, where=f"{path}, line {number}")
         members.add((name_of_synset(synset), model_id))
     return frozenset(members)

@@ -34,7 +34,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.meshes.load import load_mesh
-from cadalign.datasets.models.annotations import parse_entry
+from cadalign.datasets.models.annotations import entry_id, parse_entry, require_unique
 from cadalign.datasets.models.keypointnet import AnnotatedModel
 from cadalign.datasets.models.keypoints import Keypoints
 from cadalign.errors import CadalignError, DataError, InputError, quote
@@ -59,6 +59,7 @@ SUFFIX = ".keypoints.json"
 """What the file of ``chair.obj`` ends in: ``chair.keypoints.json``."""
 
 _SUM_TOLERANCE = 0.01
+_WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
 class _Entry(Document):
@@ -77,10 +78,8 @@ class _Entry(Document):
         if self.xyz is None and self.face_index is None:
             raise InputError("missing", where="xyz", fix="or give face_index and barycentric")
         if self.barycentric is not None and not abs(sum(self.barycentric) - 1) <= _SUM_TOLERANCE:
-            raise InputError(
-                f"{list(self.barycentric)} sum to {sum(self.barycentric):g}, not to 1",
-                where="barycentric",
-            )
+            what = f"{list(self.barycentric)} sum to {sum(self.barycentric):g}, not to 1"
+            raise InputError(what, where="barycentric")
 
 
 class _File(Document):
@@ -147,15 +146,11 @@ class ModelKeypoints:
     model: Path | None = None
 
     def __post_init__(self) -> None:
-        for field in ("name", "semantic_id"):
-            first: dict[object, int] = {}
-            for row, keypoint in enumerate(self.keypoints):
-                value = getattr(keypoint, field)
-                if value is not None and first.setdefault(value, row) != row:
-                    raise DataError(
-                        f"{value!r} occurs twice, first in keypoints[{first[value]}]",
-                        where=f"keypoints[{row}].{field}",
-                    )
+        try:
+            require_unique(self.keypoints, "name")
+            require_unique(self.keypoints, "semantic_id")
+        except InputError as error:
+            raise DataError(error.what, where=error.where) from None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -201,19 +196,11 @@ class ModelKeypoints:
             annotated.barycentric.tolist(),
             strict=True,
         )
-        return cls(
-            tuple(
-                ModelKeypoint(
-                    names.get(number, f"keypoint {number}"),
-                    tuple(xyz),
-                    number,
-                    face,
-                    tuple(weights),
-                )
-                for number, xyz, face, weights in rows
-            ),
-            model,
+        keypoints = (
+            (names.get(number, f"keypoint {number}"), tuple(xyz), number, face, tuple(weights))
+            for number, xyz, face, weights in rows
         )
+        return cls(tuple(ModelKeypoint(*fields) for fields in keypoints), model)
 
     @classmethod
     def load(
@@ -254,16 +241,13 @@ class ModelKeypoints:
     @classmethod
     def _from_annotations(cls, data: list[Any], path: Path, model: Path | None) -> ModelKeypoints:
         if model is None:
-            raise DataError(
-                "a list, not an object of model keypoints",
-                where=str(path),
-                fix="give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
-            )
+            what = "a list, not an object of model keypoints"
+            raise DataError(what, where=str(path), fix=_WANTED)
         parts = model.absolute().parts
         ids = {*parts, Path(parts[-1]).stem, *(part.split(".")[0] for part in parts)}
-        for entry in data:
-            model_id = entry.get("model_id") if isinstance(entry, dict) else None
-            if isinstance(model_id, str) and model_id in ids:
+        for position, entry in enumerate(data):
+            model_id = entry_id(entry, position)
+            if model_id in ids:
                 annotation = parse_entry(entry, where=f"{path}, {model_id}")
                 return cls._of_keypoints(annotation.keypoints, model, {})
         raise DataError(
@@ -274,13 +258,10 @@ class ModelKeypoints:
 
     @classmethod
     def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
+        other_version = "it was written by another version of cadalign"
         for name, wanted, fix in (
-            (
-                "format",
-                FORMAT,
-                "give a file of model keypoints; see cadalign.datasets.ModelKeypoints",
-            ),
-            ("version", VERSION, "it was written by another version of cadalign"),
+            ("format", FORMAT, _WANTED),
+            ("version", VERSION, other_version),
         ):
             if isinstance(data, dict) and data.get(name) != wanted:
                 raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)

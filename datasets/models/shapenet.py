@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import overload
 
@@ -73,17 +74,14 @@ class ShapeNet:
         self.root = Path(root)
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give ShapeNetCore's root")
-        self._categories: tuple[str, ...] | None = None
         self._models: dict[str, dict[str, ShapeNetModel]] = {}
 
-    @property
+    @cached_property
     def categories(self) -> tuple[str, ...]:
         """The categories there are folders of, sorted; a synset of unknown name keeps its id."""
-        if self._categories is None:
-            folders = [entry.name for entry in os.scandir(self.root) if entry.is_dir()]
-            synsets = [name for name in folders if name.isdigit() and len(name) == _SYNSET_DIGITS]
-            self._categories = tuple(sorted(map(name_of_synset, synsets)))
-        return self._categories
+        folders = [entry.name for entry in os.scandir(self.root) if entry.is_dir()]
+        synsets = [name for name in folders if name.isdigit() and len(name) == _SYNSET_DIGITS]
+        return tuple(sorted(map(name_of_synset, synsets)))
 
     def ids(self, category: str | None = None) -> tuple[tuple[str, str], ...]:
         """All (category, model id) with a mesh, sorted; of one category or of all."""
@@ -117,10 +115,8 @@ class ShapeNet:
     def __getitem__(self, key: str | tuple[str, str]) -> ShapeNetModel | tuple[ShapeNetModel, ...]:
         """``shapenet["chair"]``: a category's models; ``shapenet["chair", model_id]``: one."""
         if isinstance(key, tuple):
-            category, model_id = key
-            path = self.path(category, model_id)
-            name = self._require(category)
-            return ShapeNetModel(name, synset_of_name(name), model_id, path)
+            name, model_id = self._require(key[0]), key[1]
+            return ShapeNetModel(name, synset_of_name(name), model_id, self.path(*key))
         return tuple(self._list(self._require(key)).values())
 
     def __iter__(self) -> Iterator[ShapeNetModel]:
@@ -139,17 +135,13 @@ class ShapeNet:
     def _list(self, category: str) -> dict[str, ShapeNetModel]:
         if category not in self._models:
             synset = synset_of_name(category)
-            models = {}
-            for model_id in sorted(os.listdir(self.root / synset)):
-                path = _mesh_file(self.root / synset / model_id)
-                if path is not None:
-                    models[model_id] = ShapeNetModel(category, synset, model_id, path)
-            self._models[category] = models
+            self._models[category] = {
+                model_id: ShapeNetModel(category, synset, model_id, path)
+                for model_id in sorted(os.listdir(self.root / synset))
+                if (path := _mesh_file(self.root / synset / model_id)) is not None
+            }
         return self._models[category]
 
 
 def _mesh_file(folder: Path) -> Path | None:
-    for file in _MESH_FILES:
-        if (folder / file).is_file():
-            return folder / file
-    return None
+    return next((folder / file for file in _MESH_FILES if (folder / file).is_file()), None)

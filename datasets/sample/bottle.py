@@ -13,6 +13,7 @@ from cadalign.datasets.sample.solids import Color, Point, Solid, lathe, smooth_c
 
 _AZIMUTHS = np.radians([135.0, 45.0, -45.0, -135.0])
 # KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).
+_ROUND = (2.0, 1.0)
 _Profile = list[tuple[float, float]]
 
 
@@ -21,7 +22,8 @@ class _Kind:
     """A kind of bottle; lengths are shares of its height.
 
     ``shoulder`` is the end of the body, ``neck`` the beginning of the neck; ``curve`` shapes the
-    part between them: less than 1 is full, more is slender. ``exponent`` 2 is round.
+    part between them: less than 1 is full, more is slender. ``shape`` is
+    the superellipse's exponent and the extent along z relative to x.
     """
 
     radius: float
@@ -32,8 +34,7 @@ class _Kind:
     cap: str
     label: tuple[float, float]
     glass: tuple[Color, ...]
-    exponent: float = 2.0
-    depth: float = 1.0
+    shape: tuple[float, float] = _ROUND
     ribs: int = 0
     waist: float = 0.0
 
@@ -50,14 +51,14 @@ _KINDS = (
     _Kind(0.155, 0.68, 0.88, 0.058, 0.8, "screw", (0.38, 0.6), _CLEAR, ribs=7),  # water
     _Kind(0.15, 0.42, 0.74, 0.048, 1.35, "foil", (0.1, 0.34), _GREEN),  # Burgundy wine
     _Kind(0.134, 0.55, 0.78, 0.052, 1.0, "crown", (0.16, 0.44), _BROWN),  # beer
-    _Kind(0.2, 0.56, 0.76, 0.062, 0.45, "stopper", (0.14, 0.42), _AMBER, exponent=6.0),  # spirit
+    _Kind(0.2, 0.56, 0.76, 0.062, 0.45, "stopper", (0.14, 0.42), _AMBER, shape=(6.0, 1)),  # spirit
     _Kind(0.155, 0.66, 0.87, 0.056, 0.9, "screw", (0.36, 0.54), _PAINT, waist=0.16),  # soda
-    _Kind(0.25, 0.66, 0.83, 0.07, 0.5, "stopper", (0.2, 0.5), _CLEAR, exponent=2.4, depth=0.42),
+    _Kind(0.25, 0.66, 0.83, 0.07, 0.5, "stopper", (0.2, 0.5), _CLEAR, shape=(2.4, 0.42)),
     _Kind(0.178, 0.5, 0.78, 0.1, 1.2, "screw", (0.12, 0.36), _MILK),  # milk
     _Kind(0.15, 0.6, 0.74, 0.075, 0.6, "nozzle", (0.14, 0.5), _PAINT),  # sauce
     _Kind(0.2, 0.7, 0.78, 0.13, 0.5, "lid", (0.16, 0.56), _AMBER),  # medicine
     _Kind(0.165, 0.36, 0.74, 0.05, 1.1, "foil", (0.1, 0.3), _GREEN),  # champagne
-    _Kind(0.19, 0.62, 0.8, 0.085, 0.55, "lid", (0.12, 0.48), _PAINT, exponent=3.2, depth=0.5),
+    _Kind(0.19, 0.62, 0.8, 0.085, 0.55, "lid", (0.12, 0.48), _PAINT, shape=(3.2, 0.5)),
 )
 _CAPS: tuple[Color, ...] = (
     (176, 36, 40), (32, 34, 40), (206, 170, 84), (36, 82, 150), (240, 240, 236),
@@ -81,23 +82,16 @@ class _Bottle:
     label: Color
     stripe: Color
 
-    def exponent(self, height: npt.ArrayLike) -> FloatArray:
-        """The superellipse's exponent at heights: the body's below, round at the neck."""
-        return 2.0 + (self.kind.exponent - 2.0) * self._below_neck(height) ** 0.7
-
-    def depth(self, height: npt.ArrayLike) -> FloatArray:
-        """The extent along z relative to x at heights."""
-        return 1.0 + (self.kind.depth - 1.0) * self._below_neck(height)
-
-    def _below_neck(self, height: npt.ArrayLike) -> FloatArray:
-        kind = self.kind
+    def shape(self, height: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The superellipse's exponents and extents along z at heights, round at the neck."""
+        kind, (exponent, depth) = self.kind, self.kind.shape
         share = (kind.neck - np.asarray(height)) / (kind.neck - kind.shoulder)
-        return np.asarray(np.clip(share, 0, 1))
+        below = np.asarray(np.clip(share, 0, 1))
+        return 2.0 + (exponent - 2.0) * below**0.7, 1.0 + (depth - 1.0) * below
 
     def turned(self, profile: FloatArray, color: Color) -> Solid:
         """A profile turned around the bottle's axis, as round as the bottle is at each height."""
-        height = profile[:, 1]
-        exponent, depth = self.exponent(height), self.depth(height)
+        exponent, depth = self.shape(profile[:, 1])
         return lathe(profile, color, count=40, exponent=exponent, depth=depth)
 
 
@@ -114,11 +108,11 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     places = {8: (0.0, top + 0.1, 0.0)}
     rings = ((0, 0.02), (4, kind.shoulder), (13, kind.neck))
     for first, height in rings:
-        shape = float(drawn.exponent(height)), float(drawn.depth(height))
-        places |= _ring(first, _radius_at(profile, height), height, *shape)
-    places |= _ring(9, rim, top - 0.004, 2.0, 1.0)
+        exponent, depth = map(float, drawn.shape(height))
+        places |= _ring(first, _radius_at(profile, height), height, exponent, depth)
+    places |= _ring(9, rim, top - 0.004, *_ROUND)
     groups = tuple(tuple(range(first, first + 4)) for first in (0, 4, 9, 13))
-    is_round = kind.exponent == 2.0 and kind.depth == 1.0
+    is_round = kind.shape == _ROUND
     return Draft(
         solids=(drawn.turned(profile, drawn.glass), *cap, *_label(drawn, profile)),
         places=places,
@@ -244,9 +238,7 @@ def _ring(
     first: int, radius: float, height: float, exponent: float, depth: float
 ) -> dict[int, Point]:
     """Four places around the axis at one height, by semantic id."""
-    places = {}
-    for i, azimuth in enumerate(_AZIMUTHS):
-        x, z = np.sin(azimuth), np.cos(azimuth)
-        reach = radius / float(abs(x) ** exponent + abs(z) ** exponent) ** (1 / exponent)
-        places[first + i] = (reach * x, height, reach * z * depth)
-    return places
+    x, z = np.sin(_AZIMUTHS), np.cos(_AZIMUTHS)
+    reach = radius / (np.abs(x) ** exponent + np.abs(z) ** exponent) ** (1 / exponent)
+    xz = np.stack([reach * x, reach * z * depth], axis=1).tolist()
+    return {first + i: (x, height, z) for i, (x, z) in enumerate(xz)}

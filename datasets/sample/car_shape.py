@@ -64,16 +64,12 @@ _KINDS = (
 class CarShape:
     """Proportions [metres] and colours of a car whose middle is at z = 0, its front at -z."""
 
-    kind: str
+    kind: _Kind
     length: float
     width: float
     roof: float
-    nose: float
-    belt: float
-    tail: float
     sill: float
     shoulder_drop: float
-    tumblehome: float
     z_cowl: float
     z_roof_front: float
     z_roof_rear: float
@@ -98,16 +94,12 @@ class CarShape:
             return float((share - 0.5) * length)
 
         return cls(
-            kind=kind.name,
+            kind=kind,
             length=length,
             width=kind.width * rng.uniform(0.95, 1.05),
             roof=height - 0.042,
-            nose=kind.nose,
-            belt=kind.belt,
-            tail=kind.tail,
             sill=0.3 if kind.name in ("pickup", "suv") else 0.2,
             shoulder_drop=rng.uniform(0.12, 0.2),
-            tumblehome=kind.tumblehome,
             z_cowl=along(kind.cowl + shift),
             z_roof_front=along(kind.roof[0] + shift),
             z_roof_rear=along(kind.roof[1]),
@@ -124,7 +116,7 @@ class CarShape:
     @property
     def tail_lamp(self) -> float:
         """Height of the tail lamps."""
-        return self.tail - 0.14
+        return self.kind.tail - 0.14
 
     @property
     def steep(self) -> bool:
@@ -133,11 +125,11 @@ class CarShape:
 
     def top(self, z: float) -> float:
         """Height of the body's upper edge at z: bonnet, belt line, boot."""
-        end, nose, tail = self.length / 2, self.nose, self.tail
-        bonnet = nose + (0.08 if self.kind == "van" else 0.06)
-        boot = self.z_deck + 0.05 if self.kind == "pickup" else end - 0.1
+        end, nose, tail = self.length / 2, self.kind.nose, self.kind.tail
+        bonnet = nose + (0.08 if self.kind.name == "van" else 0.06)
+        boot = self.z_deck + 0.05 if self.kind.name == "pickup" else end - 0.1
         knots = [-end, -0.86 * end, self.z_cowl + 0.05, self.z_deck, boot, end]
-        heights = [nose - 0.02, bonnet, self.belt, self.belt + 0.02, tail, tail - 0.02]
+        heights = [nose - 0.02, bonnet, self.kind.belt, self.kind.belt + 0.02, tail, tail - 0.02]
         near_front = max(0.0, 1 - (z + end) / 0.25)
         near_rear = max(0.0, 1 - (end - z) / 0.12)
         return float(np.interp(z, knots, heights) - 0.16 * near_front**2 - 0.1 * near_rear**2)

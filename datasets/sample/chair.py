@@ -1,4 +1,4 @@
-"""Parametric chairs: seats, backs and arms in several styles."""
+"""Parametric chairs: seats, backs, arms and legs in several styles."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import solids as make
-from cadalign.datasets.sample.chair_base import chair_base
 from cadalign.datasets.sample.chair_shape import ChairShape, lighter
 from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import Solid
+from cadalign.datasets.sample.solids import Point, Solid
 
 _SPOKE_IDS = (10, 11, 12, 13, 14)
 _DARK = (38, 38, 42)
@@ -55,7 +53,7 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
         places |= {number: tuple(tip) for number, tip in zip(_SPOKE_IDS, tips, strict=True)}
     arms = _arms(p) if p.arms else []
     return Draft(
-        solids=(*_seat(p), *chair_base(p), *_BACKS[p.back](p), *arms),
+        solids=(*_seat(p), *_base(p), *_BACKS[p.back](p), *arms),
         places=places,
         mirrored=tuple(pairs),
         turned=(_SPOKE_IDS,) if p.base == "swivel" else (),
@@ -108,6 +106,98 @@ def _arms(p: ChairShape) -> list[Solid]:
         return make.both_sides(pad, post, tail)
     foot, head = (inner, low, front + 0.04), (x, y - 0.01, front + 0.04)
     return make.both_sides(pad, make.beam(foot, head, (0.026, 0.034), p.frame))
+
+
+# Legs and pedestals -------------------------------------------------------------------------------
+
+
+def _base(p: ChairShape) -> list[Solid]:
+    """Everything below the seat."""
+    special = {"swivel": _swivel, "cantilever": _cantilever, "club": _club_feet}
+    return special[p.base](p) if p.base in special else _legs(p)
+
+
+def _legs(p: ChairShape) -> list[Solid]:
+    """Four legs and the bars between them; under a shell the struts that carry it."""
+    insets = {"straight": 0.6 * p.leg, "tapered": 0.8 * p.leg, "splayed": 0.11, "turned": 0.07}
+    inset = insets[p.base]
+    x, z = p.width / 2 - inset, p.depth / 2 - inset
+    y = p.seat_height - (0.012 if p.back == "shell" else 0.4 * p.seat_thickness)
+    tops = np.array([(x, y, -z), (x, y, z)])
+    feet = np.array([(x, 0.0, z) for x, z in p.feet()])
+    legs = make.both_sides(*(_leg(p, top, foot) for top, foot in zip(tops, feet, strict=True)))
+    if p.base == "tapered":
+        return legs
+    if p.base == "splayed":
+        y = p.seat_height - 0.07
+        x, z = 0.75 * (p.width / 2 - 0.03), 0.75 * (p.depth / 2 - 0.03)
+        return [*legs, *make.both_sides(make.rod((x, y, -z), (-x, y, z), 0.008, _DARK, sides=8))]
+    share = 0.32 if p.base == "straight" else 0.4
+    front, rear = feet + share * (tops - feet)
+    front[1] = rear[1] = share * p.seat_height
+    section, mirror = (0.02, 0.028), np.array([-1, 1, 1])
+    sides = make.both_sides(make.beam(front, rear, section, p.frame))
+    if p.base == "turned":
+        middle = (front + rear) / 2 * (0, 1, 1) + front * (1, 0, 0)
+        return [*legs, *sides, make.beam(middle * mirror, middle, section, p.frame)]
+    front[1] += 0.06
+    across = (make.beam(end * mirror, end, section, p.frame) for end in (rear, front))
+    return [*legs, *sides, *across]
+
+
+def _leg(p: ChairShape, upper: Point, lower: Point) -> Solid:
+    if p.base == "straight":
+        return make.beam(upper, lower, (p.leg, p.leg), p.frame)
+    if p.base == "tapered":
+        return make.beam(upper, lower, (1.15 * p.leg, 1.15 * p.leg), p.frame, taper=0.6)
+    if p.base == "splayed":
+        return make.rod(upper, lower, 0.5 * p.leg, p.frame, end_radius=0.3 * p.leg)
+    scales = [0.75, 1.0, 0.7, 1.0, 1.15, 1.1, 0.7, 0.95, 0.6]
+    outline = make.ellipse(p.leg, p.leg, count=12)
+    return make.sweep(np.linspace(upper, lower, 9), outline, p.frame, scales=scales)
+
+
+def _cantilever(p: ChairShape) -> list[Solid]:
+    """A bent steel tube: along the floor, up in front, and back under the seat."""
+    (x, front), (_, rear) = p.feet()
+    radius, y = 0.014, p.seat_height - p.seat_thickness - 0.002
+    knots = [
+        (x, y, 0.45 * p.depth), (x, y, front + 0.07), (x, y - 0.015, front + 0.02),
+        (x, y - 0.07, front), (x, 0.09, front), (x, 0.03, front + 0.02),
+        (x, radius, front + 0.08), (x, radius, rear),
+    ]  # fmt: skip
+    outline = make.ellipse(2 * radius, 2 * radius, count=10)
+    rails = make.both_sides(
+        make.sweep(make.smooth_curve(knots, 36), outline, p.frame, side=(1, 0, 0))
+    )
+    ends = ((radius, rear - 0.012), (y, 0.4 * p.depth))
+    return [*rails, *(make.rod((-x, low, z), (x, low, z), radius, p.frame) for low, z in ends)]
+
+
+def _swivel(p: ChairShape) -> list[Solid]:
+    top = p.seat_height - (0.035 if p.back == "shell" else 0.01)
+    column = [
+        (0, 0.06), (0.045, 0.06), (0.045, 0.13), (0.03, 0.15), (0.03, 0.24), (0.018, 0.245),
+        (0.018, top - 0.07), (0.09, top - 0.04), (0.09, top), (0, top),
+    ]  # fmt: skip
+    solids = [make.lathe(column, p.frame, count=20)]
+    section = make.rounded_rectangle(0.05, 0.036, radius=0.012, steps=2)
+    for tip in p.spokes():
+        path = np.array([0.0, 0.5, 1.0])[:, None] * tip + [(0, y, 0) for y in (0.115, 0.1, 0.075)]
+        side = np.cross((0, 1, 0), tip)
+        solids += [
+            make.sweep(path, section, p.frame, scales=[1.0, 0.85, 0.6], side=side),
+            make.ellipsoid(0.96 * tip + (0, 0.03, 0), (0.05, 0.06, 0.05), _DARK, count=16),
+        ]
+    return solids
+
+
+def _club_feet(p: ChairShape) -> list[Solid]:
+    profile = [(0, 0), (0.022, 0), (0.035, 0.12), (0, 0.12)]
+    feet = [make.lathe(profile, p.frame, center=(x, 0, z), count=12) for x, z in p.feet()]
+    low, high = 0.1, p.seat_height - 0.1
+    center, size = (0, (low + high) / 2, 0), (p.width, high - low, p.depth)
+    return [*make.both_sides(*feet), make.rounded_box(center, size, p.fabric, radius=0.02, steps=2)]
 
 
 # Backs --------------------------------------------------------------------------------------------
@@ -179,14 +269,12 @@ def _spindle_back(p: ChairShape) -> list[Solid]:
     return solids
 
 
-def _shell(p: ChairShape) -> list[Solid]:
-    """Seat and back as one curved plate."""
-    return [make.sheet(p.shell(), 0.014, p.fabric)]
-
-
 def _club_back(p: ChairShape) -> list[Solid]:
     half, tall = p.back_half_width(1.0), p.back_height
-    path = _rounded_end(np.array(p.back_point(-0.1)), np.array(p.back_point(tall)), 0.05)
+    low, high = np.array(p.back_point(-0.1)), np.array(p.back_point(tall))
+    # The last stations lie close together and round the upper end off.
+    rest = 1 - np.array([0.05, 0.025, 0.006, 0.0]) / np.linalg.norm(high - low)
+    path = low + np.array([0.0, 0.5, *rest])[:, None] * (high - low)
     scales = [(1, 1), (1, 1), (1, 1), (0.985, 0.9), (0.95, 0.65), (0.92, 0.3)]
     outline = make.rounded_rectangle(2 * half, 0.16, radius=0.05, steps=4)
     back = make.sweep(path, outline, p.fabric, scales=scales)
@@ -196,18 +284,11 @@ def _club_back(p: ChairShape) -> list[Solid]:
     return [back, pad, make.rod((0, y, z - 0.12), (0, y, z - 0.13), 0.012, p.frame)]
 
 
-def _rounded_end(low: FloatArray, high: FloatArray, length: float) -> FloatArray:
-    """A straight path whose last stations lie close together."""
-    rest = 1 - np.array([length, 0.5 * length, 0.12 * length, 0.0]) / np.linalg.norm(high - low)
-    shares = np.concatenate([[0.0, 0.5], rest])
-    return np.asarray(low + shares[:, None] * (high - low))
-
-
 _BACKS: dict[str, Callable[[ChairShape], list[Solid]]] = {
     "slats": _slat_back,
     "ladder": _ladder_back,
     "panel": _panel_back,
     "spindles": _spindle_back,
-    "shell": _shell,
+    "shell": lambda p: [make.sheet(p.shell(), 0.014, p.fabric)],  # seat and back as one plate
     "club": _club_back,
 }

@@ -9,20 +9,13 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.solids import Color, Point, smooth_curve
 
+# Base, back, and arms or none.
 _STYLES = (
-    ("straight", "slats", False),
-    ("swivel", "panel", True),
-    ("splayed", "shell", False),
-    ("straight", "ladder", True),
-    ("club", "club", True),
-    ("turned", "spindles", False),
-    ("cantilever", "panel", False),
-    ("tapered", "panel", False),
-    ("swivel", "shell", False),
-    ("turned", "spindles", True),
-    ("tapered", "ladder", False),
-    ("cantilever", "slats", True),
-)
+    ("straight", "slats", False), ("swivel", "panel", True), ("splayed", "shell", False),
+    ("straight", "ladder", True), ("club", "club", True), ("turned", "spindles", False),
+    ("cantilever", "panel", False), ("tapered", "panel", False), ("swivel", "shell", False),
+    ("turned", "spindles", True), ("tapered", "ladder", False), ("cantilever", "slats", True),
+)  # fmt: skip
 _WOODS: tuple[Color, ...] = (
     (150, 98, 54), (186, 134, 80), (96, 60, 38), (206, 164, 112), (122, 70, 40), (70, 46, 34),
 )  # fmt: skip

@@ -33,51 +33,26 @@ class Draft:
 
 @dataclass(frozen=True, eq=False)
 class SampleKeypoint:
-    """A keypoint on the surface.
-
-    Parameters
-    ----------
-    semantic_id : int
-        Number of the point within its category.
-    xyz : (3,) float
-        Its position [model units].
-    face_index : int
-        The face it lies in.
-    barycentric : (3,) float
-        Weights of the face's corners, summing to 1.
-    vertex_index : int
-        The vertex nearest to it.
-    """
+    """A keypoint on the surface."""
 
     semantic_id: int
-    xyz: FloatArray
+    xyz: FloatArray  # (3,) [model units]
     face_index: int
-    barycentric: FloatArray
-    vertex_index: int
+    barycentric: FloatArray  # (3,) weights of the face's corners, of sum 1
+    vertex_index: int  # of the nearest vertex
 
 
 @dataclass(frozen=True, eq=False)
 class SampleModel:
     """A finished model: the diagonal of its bounding box is 1, the front is at -z.
 
-    Parameters
-    ----------
-    category : str
-        The category's name.
-    model_id : str
-        The model's name within the data set.
-    mesh : Mesh
-        The surface with vertex colours; coordinates are exact in single precision.
-    keypoints : tuple of SampleKeypoint
-        Ordered by semantic id.
-    mirrored, turned, round
-        The symmetries, as in `Draft`.
+    Its symmetries are those of its `Draft`.
     """
 
     category: str
     model_id: str
-    mesh: Mesh
-    keypoints: tuple[SampleKeypoint, ...]
+    mesh: Mesh  # with vertex colours; coordinates are exact in single precision
+    keypoints: tuple[SampleKeypoint, ...]  # ordered by semantic id
     mirrored: tuple[tuple[int, int], ...]
     turned: tuple[tuple[int, ...], ...]
     round: bool
@@ -122,22 +97,13 @@ def _join(solids: Sequence[Solid]) -> tuple[FloatArray, IntArray, FloatArray]:
     return positions, faces, split_colors
 
 
-def split_creases(
-    vertices: FloatArray, faces: IntArray, *, crease: float = _CREASE_DEGREES
-) -> tuple[FloatArray, IntArray]:
-    """Double the vertices along edges sharper than an angle [degrees]: new vertices and faces.
+def split_creases(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """Double the vertices along sharp edges: new vertices and faces.
 
     Shading then stays smooth only where the shape is.
-
-    Examples
-    --------
-    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    >>> faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 3], [1, 2, 3]])
-    >>> len(split_creases(corners, faces)[0])
-    12
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    smooth = mesh.face_adjacency_angles < np.radians(crease)
+    smooth = mesh.face_adjacency_angles < np.radians(_CREASE_DEGREES)
     beside, ends = mesh.face_adjacency[smooth], mesh.face_adjacency_edges[smooth]
     # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
     corner = (faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)
@@ -168,16 +134,7 @@ def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKey
 
 
 def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle.
-
-    Examples
-    --------
-    >>> triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
-    >>> closest_barycentric(triangle, np.array([0.25, 0.25, 3.0])).tolist()
-    [[0.5, 0.25, 0.25]]
-    >>> closest_barycentric(triangle, np.array([2.0, -1.0, 0.0])).tolist()
-    [[0.0, 1.0, 0.0]]
-    """
+    """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle."""
     points = np.broadcast_to(point, (len(triangles), 3))
     surface: Any = trimesh.triangles
     nearest = surface.closest_point(triangles, points)

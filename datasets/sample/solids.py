@@ -32,16 +32,7 @@ class Solid:
 
     @classmethod
     def from_triangles(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Solid:
-        """Weld coinciding vertices, drop triangles without area, turn the surface outward.
-
-        Examples
-        --------
-        >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-        >>> inward = [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
-        >>> solid = Solid.from_triangles(corners, inward, (200, 0, 0))
-        >>> bool(solid.volume > 0)
-        True
-        """
+        """Weld coinciding vertices, drop triangles without area, turn the surface outward."""
         points = np.round(np.asarray(vertices, dtype=float), _WELD_DECIMALS) + 0.0
         welded, inverse = np.unique(points, axis=0, return_inverse=True)
         triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
@@ -73,7 +64,7 @@ def both_sides(*solids: Solid) -> list[Solid]:
 # Outlines and curves ------------------------------------------------------------------------------
 
 
-def ellipse(width: float, height: float, *, count: int = 16, exponent: float = 2.0) -> FloatArray:
+def ellipse(width: float, height: float, *, count: int, exponent: float = 2.0) -> FloatArray:
     """An outline (count, 2): a superellipse ``|x/a|^exponent + |y/b|^exponent = 1`` (Lame curve).
 
     It starts at the top and is mirror symmetric in its first coordinate.
@@ -118,16 +109,11 @@ def at_height(outline: FloatArray, y: float) -> FloatArray:
 
 
 def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
-    """Join a row of closed outlines by a surface and close its two ends.
+    """Join a row of closed outlines (k, n, 3), n even, by a surface and close its two ends.
 
-    Parameters
-    ----------
-    outlines : (k, n, 3) float
-        ``k`` outlines of ``n`` points each, ``n`` even; point ``j`` of one is joined with point
-        ``j`` of the next. An end is closed by strips between the points ``j`` and ``n - j`` and a
-        spine in the middle of them, so outlines should be symmetric in that order. An outline may
-        shrink to a line or a point.
-    color : tuple of 3 int
+    Point ``j`` of one is joined with point ``j`` of the next. An end is closed by strips between
+    the points ``j`` and ``n - j`` and a spine in the middle of them, so outlines should be
+    symmetric in that order. An outline may shrink to a line or a point.
     """
     rings = np.asarray(outlines, dtype=float)
     # An end is one more outline that has collapsed onto its spine.
@@ -206,7 +192,7 @@ def stacked(
 
 
 def sweep(
-    path: npt.ArrayLike,
+    path: npt.ArrayLike | Sequence[npt.ArrayLike],
     section: FloatArray,
     color: Color,
     *,
@@ -244,7 +230,7 @@ def rod(
     """A round bar between two points, tapered where ``end_radius`` differs."""
     taper = 1.0 if end_radius is None else end_radius / radius
     outline = ellipse(2 * radius, 2 * radius, count=sides)
-    return sweep(np.array([start, end], dtype=float), outline, color, scales=[1.0, taper])
+    return sweep([start, end], outline, color, scales=[1.0, taper])
 
 
 def beam(
@@ -259,9 +245,7 @@ def beam(
 ) -> Solid:
     """A bar of rectangular section between two points; ``size`` is along and across ``side``."""
     outline = rounded_rectangle(*size, radius=0.18 * min(size) * bevel, steps=int(bevel))
-    return sweep(
-        np.array([start, end], dtype=float), outline, color, scales=[1.0, taper], side=side
-    )
+    return sweep([start, end], outline, color, scales=[1.0, taper], side=side)
 
 
 def lathe(
@@ -269,7 +253,7 @@ def lathe(
     color: Color,
     *,
     center: npt.ArrayLike = (0, 0, 0),
-    count: int = 32,
+    count: int,
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
 ) -> Solid:
@@ -287,16 +271,14 @@ def lathe(
     return loft(np.array(rings) + np.asarray(center, dtype=float), color)
 
 
-def ellipsoid(
-    center: npt.ArrayLike, size: npt.ArrayLike, color: Color, *, count: int = 16
-) -> Solid:
+def ellipsoid(center: npt.ArrayLike, size: npt.ArrayLike, color: Color, *, count: int) -> Solid:
     """An ellipsoid of the given full extents (3,)."""
     angle = np.linspace(0, np.pi, count // 2 + 1)
     unit = lathe(np.stack([np.sin(angle), -np.cos(angle)], axis=1), color, count=count)
     return unit.with_vertices(unit.vertices * np.asarray(size, dtype=float) / 2 + center)
 
 
-def wheel(center: npt.ArrayLike, profile: npt.ArrayLike, color: Color, *, count: int = 24) -> Solid:
+def wheel(center: npt.ArrayLike, profile: npt.ArrayLike, color: Color, *, count: int) -> Solid:
     """Turn a profile (radius, distance outward along x) around an axis along x."""
     upright = lathe(profile, color, count=count)
     return upright.with_vertices(upright.vertices[:, [1, 0, 2]] + np.asarray(center, dtype=float))

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.vessel_cargo import cargo
-from cadalign.datasets.sample.vessel_motor import tug, yacht
-from cadalign.datasets.sample.vessel_sail import sail
+from cadalign.datasets.sample.vessel_decks import cargo, sail, tug, yacht
 from cadalign.datasets.sample.vessel_shape import VesselShape
 
 _STRIPE = (238, 238, 234)

@@ -134,15 +134,13 @@ def _check_arguments(
     if categories is None:
         return tuple(MAKERS)
     if isinstance(categories, str):
-        raise InputError(
-            "a single text, not a sequence", where="categories", fix=f"give [{categories!r}]"
-        )
+        what = "a single text, not a sequence"
+        raise InputError(what, where="categories", fix=f"give [{categories!r}]")
     unknown = [name for name in categories if name not in MAKERS]
     if unknown or not categories or len(set(categories)) < len(categories):
         what = f"unknown category {unknown[0]!r}" if unknown else f"{list(categories)!r}"
-        raise InputError(
-            what, where="categories", fix=f"give some of {', '.join(MAKERS)}, each once"
-        )
+        fix = f"give some of {', '.join(MAKERS)}, each once"
+        raise InputError(what, where="categories", fix=fix)
     return tuple(categories)
 
 
@@ -152,14 +150,12 @@ def _make(category: str, index: int, seed: int) -> SampleModel:
     offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
     if category == "bottle":
         offset[2] = 0.0
-    draft = MAKERS[category](rng, index)
-    return finish(
-        draft, category=category, model_id=f"sample_{category}_{index:03d}", offset=offset
-    )
+    draft, model_id = MAKERS[category](rng, index), f"sample_{category}_{index:03d}"
+    return finish(draft, category=category, model_id=model_id, offset=offset)
 
 
 def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
-    splits: dict[str, list[str]] = {"train": [], "val": [], "test": []}
+    splits: dict[str, list[str]] = {name: [] for name in _SPLITS}
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for name in names:
         (root / "ShapeNetCore.v2.ply" / SYNSETS[name]).mkdir(parents=True)
@@ -177,12 +173,8 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
     for split, lines in splits.items():
         path = root / "splits" / f"{split}.txt"
         path.write_text("".join(lines), encoding="utf-8", newline="\n")
-    marker = {
-        "made_by": "cadalign.datasets.sample",
-        "categories": list(names),
-        "per_category": int(per_category),
-        "seed": int(seed),
-    }
+    arguments = {"categories": list(names), "per_category": int(per_category), "seed": int(seed)}
+    marker = {"made_by": "cadalign.datasets.sample", **arguments}
     (root / _MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
 
 
@@ -213,10 +205,7 @@ def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
         "rgb": [round(255 * value) for value in rgb],
         "semantic_id": keypoint.semantic_id,
         "pcd_info": {"point_index": keypoint.vertex_index},
-        "mesh_info": {
-            "face_index": keypoint.face_index,
-            "face_uv": keypoint.barycentric.tolist(),
-        },
+        "mesh_info": {"face_index": keypoint.face_index, "face_uv": keypoint.barycentric.tolist()},
     }
 
 
@@ -255,6 +244,6 @@ def _check_replaceable(target: Path) -> None:
 
 
 def _is_ours(path: Path) -> bool:
-    known = {_MARKER, *(f"splits/{split}.txt" for split in ("train", "val", "test"))}
+    known = {_MARKER, *(f"splits/{split}.txt" for split in _SPLITS)}
     known |= {f"annotations/{category}.json" for category in MAKERS}
     return path.as_posix() in known or path.match("ShapeNetCore.v2.ply/*/sample_*.ply")

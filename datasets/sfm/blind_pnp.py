@@ -140,9 +140,8 @@ class BlindPnP(CorrespondenceSet):
         pairs = _rows(self._array("inlier_matches", position, shape=(None, 2)))
         bad = pairs[(pairs < 0) | (pairs >= len(rows))]
         if len(bad):
-            raise InputError(
-                f"names row {bad[0]} of {len(rows)} in matches", where="inlier_matches"
-            )
+            what = f"names row {bad[0]} of {len(rows)} in matches"
+            raise InputError(what, where="inlier_matches")
         return rays[pairs[:, 1]], points_3d[pairs[:, 0]]
 
     def _paired(self, position: int, pose: Alignment) -> tuple[FloatArray, FloatArray]:
@@ -241,10 +240,8 @@ def _find_layout(root: Path) -> tuple[Path, _Layout]:
 
 def _load_samples(file: Path) -> Any:
     value = load_pickle(file)
-    is_list = isinstance(value, list | tuple | dict) or (
-        isinstance(value, np.ndarray) and value.ndim > 0
-    )
-    if not is_list:
+    is_array = isinstance(value, np.ndarray) and value.ndim > 0
+    if not is_array and not isinstance(value, list | tuple | dict):
         raise DataError(f"holds {type(value).__name__}, not a list of samples", where=str(file))
     return value
 

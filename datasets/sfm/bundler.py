@@ -7,27 +7,32 @@ of Bundler 0.4, https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.datasets.sfm.bundler_file import read_bundler
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.io.files import damaged, reading
 from cadalign.io.images import open_photo
 
 ImageSize = tuple[int, int]
 """Width and height [px]."""
 
-# Bundler's camera looks down -z with y up, cadalign's down z with y down.
 _IMAGE_SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"))
 # How far keypoints may lie outside the image's pixel centres [px].
 _MARGIN = 1.0
+_HEADER = "# Bundle file v0.3"
+_CAMERA_VALUES = 15
+# A point: xyz, colour, the number of its views; then the views.
+_POINT_VALUES = 7
+_VIEW_VALUES = 4
 
 
 class Bundler(CorrespondenceSet):
@@ -66,16 +71,15 @@ class Bundler(CorrespondenceSet):
         sizes: ImageSize | Sequence[ImageSize] | None = None,
     ) -> None:
         file = _find_file(Path(path))
-        self._model = read_bundler(file)
+        self._model = _read_bundler(file)
         count = len(self._model.cameras)
         self._sizes = _as_sizes(sizes, count)
-        photos = _find_photos(file, count)
-        self._photos = photos.paths
+        names, self._photos = _find_photos(file, count)
         placed = self._model.cameras[:, 0] != 0
         self._rows = np.flatnonzero(placed)
-        self.unplaced = tuple(photos.names[row] for row in np.flatnonzero(~placed))
+        self.unplaced = tuple(names[row] for row in np.flatnonzero(~placed))
         """The ids of the photos without a pose."""
-        super().__init__(file, [photos.names[row] for row in self._rows])
+        super().__init__(file, [names[row] for row in self._rows])
 
     def _read(self, position: int) -> Correspondences:
         row = int(self._rows[position])
@@ -99,7 +103,8 @@ class Bundler(CorrespondenceSet):
         if self._sizes is not None:
             size = self._sizes[row]
         elif photo is not None:
-            size = _photo_size(photo)
+            with open_photo(photo) as image:  # not turned upright: Bundler does not either
+                size = image.size
         reach = np.abs(centred).max(axis=0, initial=0.0)
         if not np.isfinite(reach).all():
             raise InputError("an observation is NaN or infinite", where="observations")
@@ -113,14 +118,6 @@ class Bundler(CorrespondenceSet):
                 fix="give the sizes of the photos that the model was made from",
             )
         return size
-
-
-@dataclass(frozen=True)
-class _Photos:
-    """The ids of a model's photos and their files, where there are any."""
-
-    names: tuple[str, ...]
-    paths: tuple[Path | None, ...]
 
 
 def _find_file(path: Path) -> Path:
@@ -138,8 +135,8 @@ def _find_file(path: Path) -> Path:
     raise DataError("there is no bundle.out", where=str(path), fix="give Bundler's output file")
 
 
-def _find_photos(file: Path, count: int) -> _Photos:
-    """The photos beside a model: those of its list, or those of a folder ``images``."""
+def _find_photos(file: Path, count: int) -> tuple[list[str], list[Path | None]]:
+    """Ids and files, where there are any, of a model's list, or of a folder ``images``."""
     # Bundler writes bundle/bundle.out beside list.txt.
     for folder in (file.parent, file.parent.parent):
         if (folder / "list.txt").is_file():
@@ -148,11 +145,11 @@ def _find_photos(file: Path, count: int) -> _Photos:
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     found = [path for path in found if path.suffix.lower() in _IMAGE_SUFFIXES]
     if len(found) == count:
-        return _Photos(tuple(path.name for path in found), tuple(found))
-    return _Photos(tuple(str(row) for row in range(count)), (None,) * count)
+        return [path.name for path in found], [*found]
+    return [str(row) for row in range(count)], [None] * count
 
 
-def _listed_photos(listing: Path, file: Path, count: int) -> _Photos:
+def _listed_photos(listing: Path, file: Path, count: int) -> tuple[list[str], list[Path | None]]:
     # A line is a path, optionally followed by 0 and the focal length that the EXIF data give.
     lines = listing.read_text(encoding="utf-8", errors="replace").split("\n")
     names = [line.split()[0].removeprefix("./") for line in lines if line.strip()]
@@ -166,12 +163,7 @@ def _listed_photos(listing: Path, file: Path, count: int) -> _Photos:
     for name in names:
         candidates = [listing.parent / name, listing.parent / "images" / Path(name).name]
         paths.append(next((path for path in candidates if path.is_file()), None))
-    return _Photos(tuple(names), tuple(paths))
-
-
-def _photo_size(path: Path) -> ImageSize:
-    with open_photo(path) as photo:  # not turned upright: Bundler does not either
-        return photo.size
+    return names, paths
 
 
 def _as_sizes(
@@ -183,7 +175,113 @@ def _as_sizes(
     if array.shape == (2,):
         array = np.tile(array, (count, 1))
     if array.shape != (count, 2) or array.dtype.kind not in "iu" or (array < 1).any():
-        raise InputError(
-            f"not a (width, height), nor one for each of {count} photos", where="sizes"
-        )
+        what = f"not a (width, height), nor one for each of {count} photos"
+        raise InputError(what, where="sizes")
     return tuple((int(width), int(height)) for width, height in array)
+
+
+# The file -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Content of the file; observations are ordered by camera."""
+
+    # (c, 15) focal length [px], k1, k2, rotation (row by row) and translation, world to camera;
+    # zeros for a photo without a pose.
+    cameras: FloatArray
+    points: FloatArray  # (m, 3)
+    view_points: IntArray  # (v,) the point that each observation shows
+    view_pixels: FloatArray  # (v, 2) where, from the image's middle [px], x to the right and y up
+    view_starts: IntArray  # (c + 1,) where each camera's observations begin
+
+    def views(self, camera: int) -> tuple[IntArray, FloatArray]:
+        """One camera's observations: points (n,) and positions (n, 2)."""
+        chosen = slice(self.view_starts[camera], self.view_starts[camera + 1])
+        return self.view_points[chosen], self.view_pixels[chosen]
+
+
+def _read_bundler(path: Path) -> _Model:
+    values = _read_values(path)
+    if len(values) < 2:
+        raise damaged("the numbers of cameras and points are missing", path)
+    camera_count, point_count = (_as_count(value, path, "the first line") for value in values[:2])
+    start = 2 + _CAMERA_VALUES * camera_count
+    if start > len(values):
+        camera = (len(values) - 2) // _CAMERA_VALUES
+        raise damaged(f"the file ends within camera {camera} of {camera_count}", path)
+    points, views = _read_points(values, start, point_count, path)
+    view_points = np.repeat(np.arange(point_count), [len(each) for each in views])
+    table = np.concatenate([np.empty((0, _VIEW_VALUES)), *views])
+    cameras = table[:, 0]
+    bad = np.flatnonzero(~((cameras >= 0) & (cameras < camera_count) & (cameras % 1 == 0)))
+    if len(bad):
+        raise damaged(
+            f"point {view_points[bad[0]]} is observed in camera {cameras[bad[0]]:g}, which doesn't "
+            f"exist; there are {camera_count}",
+            path,
+        )
+    order = np.argsort(cameras, kind="stable")
+    return _Model(
+        cameras=values[2:start].reshape(-1, _CAMERA_VALUES),
+        points=points,
+        view_points=view_points[order],
+        view_pixels=table[order, 2:],
+        view_starts=np.searchsorted(cameras[order], np.arange(camera_count + 1)),
+    )
+
+
+def _read_points(
+    values: FloatArray, start: int, count: int, path: Path
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Coordinates (count, 3), and for each point its views (k, 4): camera, key, x, y."""
+    points = []
+    views = []
+    for row in range(count):
+        end = start + _POINT_VALUES
+        if end <= len(values):
+            points.append(values[start : start + 3])
+            start, end = end, end + _VIEW_VALUES * _as_count(values[end - 1], path, f"point {row}")
+        if end > len(values):
+            raise damaged(f"the file ends within point {row} of {count}", path)
+        views.append(values[start:end].reshape(-1, _VIEW_VALUES))
+        start = end
+    if start < len(values):
+        extra = len(values) - start
+        raise damaged(f"{extra} values too many after the last of {count} points", path)
+    return np.array(points, dtype=float).reshape(-1, 3), views
+
+
+def _read_values(path: Path) -> FloatArray:
+    with reading(path):
+        text = path.read_text(encoding="utf-8", errors="replace")
+    header, _, body = text.partition("\n")
+    if header.strip() != _HEADER:
+        raise DataError(
+            f"begins with {header.strip()[:40]!r}",
+            where=str(path),
+            fix=f"only files that begin with {_HEADER!r} can be read",
+        )
+    try:
+        # Deprecated for a long time: to stop at text that is no number with a mere warning.
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            return np.fromstring(body, dtype=float, sep=" ")
+    except (ValueError, DeprecationWarning):
+        raise _not_a_number(body, path) from None
+
+
+def _not_a_number(body: str, path: Path) -> DataError:
+    for number, line in enumerate(body.split("\n"), start=2):
+        for word in line.split():
+            try:
+                float(word)
+            except ValueError:
+                return damaged(f"{word[:40]!r} is not a number", f"{path}, line {number}")
+    return damaged("holds something else than numbers", path)
+
+
+def _as_count(value: float, path: Path, where: str) -> int:
+    if not (0 <= value < np.inf and value % 1 == 0):
+        raise damaged(f"{value:g} is not a number of things", f"{path}, {where}")
+    return int(value)

@@ -12,13 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import IntArray
-from cadalign.datasets.sfm.colmap_binary import (
-    read_cameras_binary,
-    read_images_binary,
-    read_points_binary,
-)
-from cadalign.datasets.sfm.colmap_model import INVALID_POINT
-from cadalign.datasets.sfm.colmap_text import read_cameras_text, read_images_text, read_points_text
+from cadalign.datasets.sfm import colmap_files
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
@@ -26,8 +20,6 @@ from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 
 _STEMS = ("cameras", "images", "points3D")
-# COLMAP itself prefers the binary files where both are there.
-_SUFFIXES = (".bin", ".txt")
 _SUBFOLDERS = (".", "sparse/0", "sparse", "0")
 
 
@@ -62,25 +54,25 @@ class Colmap(CorrespondenceSet):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         folder, suffix = _find_model(Path(path))
-        binary = suffix == ".bin"
-        files = {stem: folder / f"{stem}{suffix}" for stem in _STEMS}
-        self._camera_file, self._point_file = files["cameras"], files["points3D"]
-        read_cameras = read_cameras_binary if binary else read_cameras_text
-        self._cameras = read_cameras(self._camera_file)
-        ids, xyz = (read_points_binary if binary else read_points_text)(self._point_file)
-        images = (read_images_binary if binary else read_images_text)(files["images"])
+        self._camera_file, image_file, self._point_file = (
+            folder / f"{stem}{suffix}" for stem in _STEMS
+        )
+        read = colmap_files.READERS[suffix]
+        self._cameras = read.cameras(self._camera_file)
+        ids, xyz = read.points(self._point_file)
+        images = read.images(image_file)
         order = np.argsort(ids, kind="stable")
         self._point_ids, self._points = ids[order], xyz[order]
         twice = self._point_ids[1:][self._point_ids[1:] == self._point_ids[:-1]]
         if len(twice):
             raise DataError(f"point {twice[0]} occurs twice", where=str(self._point_file))
         self._images = sorted(images, key=lambda image: image[0])
-        super().__init__(files["images"], [name for name, _ in self._images])
+        super().__init__(image_file, [name for name, _ in self._images])
 
     def _read(self, position: int) -> Correspondences:
         name, read_view = self._images[position]
         view = read_view()
-        rows = view.point_ids != INVALID_POINT
+        rows = view.point_ids != colmap_files.INVALID_POINT
         point_ids = view.point_ids[rows]
         return Correspondences(
             id=name,
@@ -115,9 +107,8 @@ class Colmap(CorrespondenceSet):
         try:
             return Camera.from_dict(self._cameras[camera_id])
         except InputError as error:
-            raise DataError(
-                error.what, where=f"{self._camera_file}, camera {camera_id}", fix=error.fix
-            ) from None
+            where = f"{self._camera_file}, camera {camera_id}"
+            raise DataError(error.what, where=where, fix=error.fix) from None
 
 
 def _find_model(root: Path) -> tuple[Path, str]:
@@ -126,7 +117,7 @@ def _find_model(root: Path) -> tuple[Path, str]:
         raise DataError("no such folder", where=str(root), fix="give the folder of a COLMAP model")
     incomplete = ""
     for folder in (root / name for name in _SUBFOLDERS):
-        for suffix in _SUFFIXES:
+        for suffix in colmap_files.READERS:
             missing = [stem for stem in _STEMS if not (folder / f"{stem}{suffix}").is_file()]
             if not missing:
                 return folder, suffix

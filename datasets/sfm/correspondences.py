@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
@@ -109,20 +109,16 @@ class Correspondences:
             A mask, or the rows to keep.
         """
         chosen = np.asarray(rows)
-        if chosen.dtype.kind not in "biu" or (
-            chosen.dtype.kind == "b" and chosen.shape != (len(self),)
-        ):
+        is_mask = chosen.dtype.kind == "b" and chosen.shape == (len(self),)
+        if not is_mask and chosen.dtype.kind not in "iu":
             if chosen.size:
-                raise InputError(
-                    f"neither a mask of {len(self)} values nor row numbers", where="rows"
-                )
+                what = f"neither a mask of {len(self)} values nor row numbers"
+                raise InputError(what, where="rows")
             chosen = chosen.astype(np.int64)
-        return Correspondences(
-            id=self.id,
+        return replace(
+            self,
             points_3d=self.points_3d[chosen],
             points_2d=self.points_2d[chosen],
-            camera=self.camera,
-            cam_from_world=self.cam_from_world,
             point_ids=None if self.point_ids is None else self.point_ids[chosen],
         )
 
@@ -152,9 +148,8 @@ class CorrespondenceSet(ABC):
         self._warned: set[str] = set()
         if len(self._positions) < len(self.ids):
             twice = next(name for i, name in enumerate(self.ids) if self._positions[name] != i)
-            raise DataError(
-                f"the image {twice!r} occurs twice", where=str(source), fix="remove one of them"
-            )
+            what = f"the image {twice!r} occurs twice"
+            raise DataError(what, where=str(source), fix="remove one of them")
 
     @abstractmethod
     def _read(self, position: int) -> Correspondences:
@@ -217,8 +212,9 @@ class CorrespondenceSet(ABC):
         if isinstance(key, str):
             position = self._positions.get(key)
             if position is None:
+                known = ", ".join(self.ids[:5]) + (", ..." if len(self) > 5 else "")
                 raise InputError(
-                    f"no image {key!r}", where=str(self.source), fix=f"known are {_some(self.ids)}"
+                    f"no image {key!r}", where=str(self.source), fix=f"known are {known}"
                 )
             return position
         if not isinstance(key, int | np.integer) or not -len(self) <= key < len(self):
@@ -242,30 +238,15 @@ class CorrespondenceSet(ABC):
 
 
 def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:
-    """Make a true pose out of a rotation written with few digits.
+    """Make a true pose out of a rotation (3, 3) written with few digits: the nearest one.
 
-    Parameters
-    ----------
-    rotation : (3, 3) float
-        Orthonormal to 1e-3, determinant +1; the nearest rotation is taken.
-    translation : (3,) float
-        Any shape of 3 values.
-
-    Raises
-    ------
-    InputError
-        If it is not a rotation, or a value is NaN or infinite.
+    ``rotation`` must be orthonormal to 1e-3; ``translation`` is 3 values of any shape.
     """
     matrix = as_floats(rotation, name="rotation", shape=(3, 3))
     shift = as_floats(np.reshape(translation, -1), name="translation", shape=(3,))
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not error <= _ROTATION_TOLERANCE:
-        raise InputError(
-            f"not a rotation matrix: {np.array2string(matrix, precision=4)}", where="rotation"
-        )
+        shown = np.array2string(matrix, precision=4)
+        raise InputError(f"not a rotation matrix: {shown}", where="rotation")
     left, _, right = np.linalg.svd(matrix)
     return Alignment(left @ right, shift, np.ones(3))
-
-
-def _some(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")

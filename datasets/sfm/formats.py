@@ -123,9 +123,8 @@ def _recognize(root: Path) -> _Format:
             fix="for other formats, give the folder",
         )
     if not root.is_dir():
-        raise DataError(
-            "no such folder", where=str(root), fix="give the folder of the correspondences"
-        )
+        fix = "give the folder of the correspondences"
+        raise DataError("no such folder", where=str(root), fix=fix)
     # A layout with files missing is better named by its loader, which says which ones.
     fits = [known.fit(root) for known in _FORMATS]
     found = [known for known, fit in zip(_FORMATS, fits, strict=True) if fit and fit == max(fits)]

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError, quote
-from cadalign.io.files import reading
+from cadalign.io.files import damaged, reading
 
 # Numbers, text and objects; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
@@ -38,53 +38,30 @@ _FIX = (
 
 
 def load_pickle(path: str | os.PathLike[str]) -> Any:
-    """Load a pickle of NumPy arrays, numbers, text, and containers of these.
+    """Load a pickle of NumPy arrays (as a subclass), numbers, text, and containers of these.
 
     Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
     Latin-1, the encoding that keeps its bytes.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
-    Returns
-    -------
-    object
-        What it holds; arrays come as a subclass of ``numpy.ndarray``.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is no whole pickle, or asks for anything else; names what it
-        asked for.
     """
-    where = str(path)
     with reading(Path(path)):
         data = Path(path).read_bytes()
     try:
         _check_program(data)
-        value = _PlainUnpickler(io.BytesIO(data), where).load()
+        value = _PlainUnpickler(io.BytesIO(data), str(path)).load()
         _check_size(value, limit=10 * len(data))
         return value
     except DataError:
         raise
     except Exception as error:  # damaged pickles make the unpickler raise what it likes
-        raise DataError(
-            f"not a whole pickle of arrays ({type(error).__name__}: {str(error)[:200]})",
-            where=where,
-            fix="the file is cut short or damaged; get it again",
-        ) from None
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise damaged(f"not a whole pickle of arrays ({reason})", path) from None
 
 
 def _check_program(data: bytes) -> None:
     """Follow the pickle's stack with the nesting depths of its values in the place of values.
 
-    Raises
-    ------
-    pickle.UnpicklingError
-        If values are nested too deeply (hashing them would exhaust the stack), or a place in the
-        pickle's memory is numbered beyond its length (the unpickler would allocate them all).
+    Refused are values that are nested too deeply (hashing them would exhaust the stack), and places
+    in the pickle's memory numbered beyond its length (the unpickler would allocate them all).
     """
     stack: list[int] = []
     marks: list[int] = []
@@ -103,7 +80,6 @@ def _check_program(data: bytes) -> None:
         elif name in ("GET", "BINGET", "LONG_BINGET"):
             stack.append(memory[int(argument)])
         else:
-            after = len(opcode.stack_after)
             if pickletools.markobject in opcode.stack_before:
                 start = marks.pop()
                 # What stands before the mark: the container that is filled.
@@ -118,7 +94,7 @@ def _check_program(data: bytes) -> None:
                 depth = 1 + max(used, default=0)
             if depth > _MAX_DEPTH:
                 raise pickle.UnpicklingError(f"values are nested more than {_MAX_DEPTH} deep")
-            stack.extend([depth] * after)
+            stack.extend([depth] * len(opcode.stack_after))
 
 
 def _check_size(value: Any, *, limit: int) -> None:
@@ -183,15 +159,11 @@ class _Dtype:
     def __init__(self, code: str, align: Any = False, copy: Any = False) -> None:
         if not isinstance(code, str) or not _PLAIN_DTYPE.fullmatch(code):
             raise pickle.UnpicklingError(f"the dtype {quote(code)} is not one of plain values")
-        self._dtype = np.dtype(code)
+        self.value: np.dtype[Any] = np.dtype(code)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # (version, byte order, subdtype, names, fields, ...); the rest follows from the code.
-        self._dtype = self._dtype.newbyteorder(state[1])
-
-    @property
-    def value(self) -> np.dtype[Any]:
-        return self._dtype
+        self.value = self.value.newbyteorder(state[1])
 
 
 class _Array(np.ndarray[Any, Any]):
@@ -207,9 +179,8 @@ class _Array(np.ndarray[Any, Any]):
             fits = isinstance(data, bytes | str) and len(data) == count * values.itemsize
         # Refilling an array would pull its memory away from whatever looks at it already.
         if not fits or self.size:
-            raise pickle.UnpicklingError(
-                f"an array of shape {quote(shape)} has other data than that"
-            )
+            what = f"an array of shape {quote(shape)} has other data than that"
+            raise pickle.UnpicklingError(what)
         # NumPy's stubs ask for a numpy.bool, which it doesn't take.
         rebuilt: Any = (1, shape, values, bool(fortran_order), data)
         super().__setstate__(rebuilt)
@@ -232,7 +203,8 @@ def _make_allowed() -> dict[tuple[str, str], Any]:
         return np.empty(0).view(_Array)
 
     def scalar(dtype: _Dtype, data: bytes | str) -> Any:
-        return np.frombuffer(_as_bytes(data), dtype=dtype.value, count=1)[0]
+        content = data.encode("latin1") if isinstance(data, str) else bytes(data)
+        return np.frombuffer(content, dtype=dtype.value, count=1)[0]
 
     def from_buffer(
         buffer: bytes | bytearray, dtype: _Dtype, shape: Any, order: str, axes: Any = None
@@ -248,9 +220,6 @@ def _make_allowed() -> dict[tuple[str, str], Any]:
             raise pickle.UnpicklingError(f"the encoding {quote(encoding)} is not expected")
         return text.encode("latin1")
 
-    def no_bytes() -> bytes:
-        return b""
-
     return {
         ("numpy", "ndarray"): array_type,
         ("numpy", "dtype"): _Dtype,
@@ -258,15 +227,11 @@ def _make_allowed() -> dict[tuple[str, str], Any]:
         ("numpy._core.multiarray", "scalar"): scalar,
         ("numpy._core.numeric", "_frombuffer"): from_buffer,
         ("_codecs", "encode"): encode,
-        ("builtins", "bytes"): no_bytes,
+        ("builtins", "bytes"): lambda: b"",
         ("builtins", "set"): set,
         ("builtins", "frozenset"): frozenset,
         ("collections", "OrderedDict"): collections.OrderedDict,
     }
-
-
-def _as_bytes(data: bytes | str) -> bytes:
-    return data.encode("latin1") if isinstance(data, str) else bytes(data)
 
 
 def _as_shape(shape: Any) -> tuple[int, ...]:

@@ -21,6 +21,10 @@ _SHIFT = 4
 _FARTHEST = 1e6
 _PLATE_OPACITY = 0.62
 _SMALL_SIDE = 1000
+# Widths of dark borders, in units; markers are small and need more to stand out.
+_LINE_CASING, _MARKER_CASING = 0.6, 0.75
+
+_Strokes = tuple[tuple[Color, int], tuple[Color, int]]
 
 
 @dataclass(frozen=True)
@@ -63,15 +67,10 @@ class Canvas:
         size = (columns // self._zoom, rows // self._zoom)
         return np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
-    @property
-    def _casing(self) -> int:
-        """Width of the dark border of lines [canvas px]."""
-        return max(1, round(0.6 * float(self.unit)))
-
-    @property
-    def _marker_casing(self) -> int:
-        """The same for markers, which are small and need more to stand out."""
-        return max(1, round(0.75 * self.unit))
+    def _strokes(self, color: Color, *, width: float, casing: float) -> _Strokes:
+        """Colour and thickness [canvas px] of a line's dark border, then of the line itself."""
+        inner, border = (max(1, round(value * self.unit)) for value in (width, casing))
+        return (CASING, inner + 2 * border), (color, inner)
 
     def blend_from(self, before: ByteImage, *, opacity: float) -> None:
         """Let what was drawn since ``before`` was copied show through to it."""
@@ -83,31 +82,29 @@ class Canvas:
         """Draw a line through (n, 2) pixels; its width is in units."""
         parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else [points]
         fixed = [_fixed_point(part) for part in parts]
-        inner = max(1, round(width * self.unit))
-        for shade, thickness in ((CASING, inner + 2 * self._casing), (color, inner)):
+        for shade, thickness in self._strokes(color, width=width, casing=_LINE_CASING):
             cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
 
     def dot(self, point: FloatArray, color: Color, *, radius: float) -> None:
         """Draw a disc without casing."""
-        x, y = (int(value) for value in _fixed_point(point))
-        fixed = int(radius * self.unit * (1 << _SHIFT))
-        cv2.circle(self.image, (x, y), fixed, color, -1, cv2.LINE_AA, _SHIFT)
+        self._circle(point, color, radius, -1)
 
     def ring(self, point: FloatArray, color: Color, *, radius: float) -> None:
         """Draw a circle."""
+        for shade, thickness in self._strokes(color, width=1.5, casing=_MARKER_CASING):
+            self._circle(point, shade, radius, thickness)
+
+    def _circle(self, point: FloatArray, color: Color, radius: float, thickness: int) -> None:
         x, y = (int(value) for value in _fixed_point(point))
         fixed = int(radius * self.unit * (1 << _SHIFT))
-        inner = max(1, round(1.5 * self.unit))
-        for shade, thickness in ((CASING, inner + 2 * self._marker_casing), (color, inner)):
-            cv2.circle(self.image, (x, y), fixed, shade, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.circle(self.image, (x, y), fixed, color, thickness, cv2.LINE_AA, _SHIFT)
 
     def cross(self, point: FloatArray, color: Color, *, radius: float) -> None:
         """Draw an upright cross."""
         reach = radius * self.unit
         arms = [point + np.array(arm) * reach for arm in ([[-1, 0], [1, 0]], [[0, -1], [0, 1]])]
         fixed = [_fixed_point(arm) for arm in arms]
-        inner = max(1, round(1.5 * self.unit))
-        for shade, thickness in ((CASING, inner + 2 * self._marker_casing), (color, inner)):
+        for shade, thickness in self._strokes(color, width=1.5, casing=_MARKER_CASING):
             cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
 
     def arrow(self, start: FloatArray, end: FloatArray, color: Color, *, width: float) -> None:
@@ -121,11 +118,11 @@ class Canvas:
         aside = np.array([-along[1], along[0]]) * head * 0.42
         neck = end - along * head
         triangle = _fixed_point(np.array([end, neck + aside, neck - aside]))
-        casing = 2 * self._casing
+        (_, outer), (_, inner) = self._strokes(color, width=width, casing=_LINE_CASING)
+        casing = outer - inner
         self.line(np.array([start, neck]), color, width=width)
         cv2.polylines(self.image, [triangle], True, CASING, casing, cv2.LINE_AA, _SHIFT)
         cv2.fillPoly(self.image, [triangle], color, cv2.LINE_AA, _SHIFT)
-        inner = max(1, round(width * self.unit))
         # The shaft again, over the head's casing.
         joint = _fixed_point(np.array([neck - along * casing, neck + along * head * 0.3]))
         cv2.polylines(self.image, [joint], False, color, inner, cv2.LINE_AA, _SHIFT)

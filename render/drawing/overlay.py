@@ -41,7 +41,10 @@ class _Stroke:
     depth: float
     points: FloatArray
     color: Color
+    is_hidden: bool = False
+    """Behind the box itself."""
     arrow: str = ""
+    """The letter at its tip."""
 
 
 def draw_overlay(
@@ -116,22 +119,21 @@ def draw_overlay(
         raise InputError(
             f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
         )
-    near: list[_Stroke] = []
-    far: list[_Stroke] = []
+    strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
-            _collect_edges(box, color, camera, near, far)
+            strokes += _edge_strokes(box, color, camera)
     main_box = est_box if est_box is not None else gt_box
     if axes and main_box is not None:
-        near += _axis_strokes(main_box, camera)
-    near, far = ([_placed(stroke, canvas) for stroke in strokes] for strokes in (near, far))
+        strokes += _axis_strokes(main_box, camera)
+    strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
     seen, back = (None if points is None else canvas.place(points) for points in (seen, back))
-    _draw_strokes(canvas, near, far)
+    _draw_strokes(canvas, strokes)
     _draw_keypoints(canvas, seen, back)
     predicted = est_box is not None or est_frame is not None
     entries = _legend_entries(gt_box, predicted, seen, back, axes=axes and main_box is not None)
     if legend and entries:
-        canvas.legend(entries, keep_clear=_drawn_pixels([*near, *far], seen, back))
+        canvas.legend(entries, keep_clear=_drawn_pixels(strokes, seen, back))
     return canvas.finished()
 
 
@@ -162,10 +164,9 @@ def _as_rgb(image: Any, camera: Camera) -> ByteImage:
     return pixels
 
 
-def _collect_edges(
-    box: Box, color: Color, camera: Camera, near: list[_Stroke], far: list[_Stroke]
-) -> None:
-    """Sort a box's edges into those before and those behind the box itself."""
+def _edge_strokes(box: Box, color: Color, camera: Camera) -> list[_Stroke]:
+    """A box's edges, those behind the box itself hidden."""
+    strokes: list[_Stroke] = []
     corners = box.corners
     # Where the camera is, along each axis from the centre, in half extents.
     position = -(box.center @ box.rotation)
@@ -175,28 +176,25 @@ def _collect_edges(
     for first, second in BOX_EDGES:
         across = [k for k in range(3) if not (first ^ second) >> k & 1]
         faces = [(k, 1 if first >> k & 1 else -1) for k in across]
-        strokes = _strokes(corners[[first, second]], color, camera, _near_plane(box))
-        (near if inside or any(shows[face] for face in faces) else far).extend(strokes)
+        is_hidden = not (inside or any(shows[face] for face in faces))
+        strokes += _strokes(box, corners[[first, second]], camera, color, is_hidden=is_hidden)
+    return strokes
 
 
 def _axis_strokes(box: Box, camera: Camera) -> list[_Stroke]:
     """Arrows from the box's centre to its faces."""
-    strokes = []
-    for k, name in enumerate("xyz"):
+    strokes: list[_Stroke] = []
+    for k, (name, color) in enumerate(zip("xyz", AXIS_COLORS, strict=True)):
         tip = box.center + box.rotation[:, k] * box.extents[k] / 2
-        ends = np.array([box.center, tip])
-        for stroke in _strokes(ends, AXIS_COLORS[k], camera, _near_plane(box)):
-            strokes.append(replace(stroke, arrow=name))
+        strokes += _strokes(box, np.array([box.center, tip]), camera, color, arrow=name)
     return strokes
 
 
-def _near_plane(box: Box) -> float:
-    return _NEAR * (float(np.linalg.norm(box.extents)) or 1.0)
-
-
-def _strokes(ends: FloatArray, color: Color, camera: Camera, near_plane: float) -> list[_Stroke]:
+def _strokes(
+    box: Box, ends: FloatArray, camera: Camera, color: Color, **style: Any
+) -> list[_Stroke]:
     """Project a segment (2, 3); none if it is not seen, several if a lens cuts it up."""
-    clipped = _clip(ends, camera, near_plane)
+    clipped = _clip(ends, camera, _NEAR * (float(np.linalg.norm(box.extents)) or 1.0))
     if clipped is None:
         return []
     depth = float(clipped[:, 2].mean())
@@ -208,9 +206,7 @@ def _strokes(ends: FloatArray, color: Color, camera: Camera, near_plane: float) 
     pixels = camera.pixels_from_normalized(normalized)
     runs = np.split(np.arange(count), np.flatnonzero(np.diff(kept)) + 1)
     return [
-        _Stroke(depth=depth, points=pixels[run], color=color)
-        for run in runs
-        if kept[run[0]] and len(run) > 1
+        _Stroke(depth, pixels[run], color, **style) for run in runs if kept[run[0]] and len(run) > 1
     ]
 
 
@@ -229,30 +225,28 @@ def _clip(ends: FloatArray, camera: Camera, near_plane: float) -> FloatArray | N
         ]
     )
     first, second = (planes[:, :3] @ ends.T + planes[:, 3:]).T
-    low, high = 0.0, 1.0
-    for a, b in zip(first, second, strict=True):
-        if a < 0 and b < 0:
-            return None
-        if a < 0:
-            low = max(low, a / (a - b))
-        elif b < 0:
-            high = min(high, a / (a - b))
+    if ((first < 0) & (second < 0)).any():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = first / (first - second)
+    low = crossing.max(initial=0.0, where=first < 0)
+    high = crossing.min(initial=1.0, where=second < 0)
     if low >= high:
         return None
     return np.asarray(ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0]))
 
 
-def _placed(stroke: _Stroke, canvas: Canvas) -> _Stroke:
-    return replace(stroke, points=canvas.place(stroke.points))
-
-
-def _draw_strokes(canvas: Canvas, near: list[_Stroke], far: list[_Stroke]) -> None:
-    """Far edges thin, dashed and faint; then the others, the nearest last."""
+def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
+    """Hidden edges thin, dashed and faint; then the others, the nearest last."""
+    by_depth = sorted(strokes, key=lambda stroke: -stroke.depth)
     before = canvas.image.copy()
-    for stroke in sorted(far, key=lambda stroke: -stroke.depth):
-        canvas.line(stroke.points, stroke.color, width=1.2, dashed=True)
+    for stroke in by_depth:
+        if stroke.is_hidden:
+            canvas.line(stroke.points, stroke.color, width=1.2, dashed=True)
     canvas.blend_from(before, opacity=_HIDDEN_OPACITY)
-    for stroke in sorted(near, key=lambda stroke: -stroke.depth):
+    for stroke in by_depth:
+        if stroke.is_hidden:
+            continue
         if stroke.arrow:
             canvas.arrow(stroke.points[0], stroke.points[-1], stroke.color, width=2.0)
         else:
@@ -260,7 +254,7 @@ def _draw_strokes(canvas: Canvas, near: list[_Stroke], far: list[_Stroke]) -> No
             for end in stroke.points[[0, -1]]:
                 # Fills the notch that a casing cuts into the edge it meets.
                 canvas.dot(end, stroke.color, radius=1.2)
-    for stroke in near:
+    for stroke in strokes:
         if stroke.arrow:
             along = stroke.points[-1] - stroke.points[0]
             ahead = along / max(float(np.linalg.norm(along)), 1e-9) * 11 * canvas.unit

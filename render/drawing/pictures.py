@@ -161,7 +161,5 @@ def keypoint_picture(
 
 
 def _with_mask(rgb: npt.NDArray[np.uint8], geometry: Geometry) -> ByteImage:
-    result: ByteImage = np.zeros((*rgb.shape[:2], 4), dtype=np.uint8)
-    result[:, :, :3] = np.where(geometry.mask[:, :, None], rgb, 0)
-    result[:, :, 3] = np.where(geometry.mask, 255, 0)
-    return result
+    opaque = np.full((*rgb.shape[:2], 1), 255, dtype=np.uint8)
+    return np.concatenate([rgb, opaque], axis=2) * geometry.mask[:, :, None]

@@ -17,7 +17,6 @@ from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.pictures import (
     depth_picture,
     face_picture,
-    keypoint_picture,
     line_picture,
     normal_picture,
 )
@@ -25,7 +24,6 @@ from cadalign.render.frame import Renderer
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.scene import Scene
 from cadalign.render.views.viewpoints import frame_object, look_at
-from cadalign.render.views.visibility import visible_keypoints
 
 VIEWS: dict[str, tuple[float, float]] = {
     "iso": (145.0, 25.0),
@@ -38,7 +36,7 @@ VIEWS: dict[str, tuple[float, float]] = {
 }
 """Azimuth and elevation [degrees] of the named views, see `look_at`; ShapeNet's models face -z."""
 
-STYLES = ("color", "depth", "normals", "faces", "lines")
+_PICTURES = {"depth": depth_picture, "normals": normal_picture, "faces": face_picture}
 _FILL = 0.88
 
 
@@ -121,24 +119,10 @@ def draw_still(
         return renderer.render(scene, camera, cam_from_model, samples=samples).color
     if style == "lines":
         return _smooth_lines(scene, camera, cam_from_model)
-    pictures = {"depth": depth_picture, "normals": normal_picture, "faces": face_picture}
-    if style not in pictures:
-        raise InputError(
-            f"unknown style {style!r}", where="style", fix=f"known are {', '.join(STYLES)}"
-        )
-    return pictures[style](cast_geometry(scene, camera, cam_from_model))
-
-
-def with_keypoints(
-    image: ByteImage,
-    scene: Scene,
-    camera: Camera,
-    cam_from_model: Alignment,
-    keypoints: npt.ArrayLike,
-) -> ByteImage:
-    """Draw a model's keypoints (k, 3) over a picture of it, seen ones and hidden ones."""
-    visible = visible_keypoints(scene, keypoints, camera, cam_from_model)
-    return keypoint_picture(image, camera, keypoints, cam_from_model, visible=visible)
+    if style not in _PICTURES:
+        known = ", ".join(["color", *_PICTURES, "lines"])
+        raise InputError(f"unknown style {style!r}", where="style", fix=f"known are {known}")
+    return _PICTURES[style](cast_geometry(scene, camera, cam_from_model))
 
 
 def turntable(

@@ -11,22 +11,11 @@ from cadalign.render.raycast.shading import Studio
 
 
 class Open3DRenderer(RaycastRenderer):
-    """Draws as `RaycastRenderer` does; Open3D finds the hits.
-
-    Parameters
-    ----------
-    studio : Studio, optional
-        The lights.
-
-    Raises
-    ------
-    RenderError
-        If Open3D cannot be imported.
-    """
+    """Draws as `RaycastRenderer` does; Open3D finds the hits."""
 
     name = "open3d"
 
-    def __init__(self, *, studio: Studio | None = None) -> None:
+    def __init__(self, *, studio: Studio | None) -> None:
         try:
             import_module("cadalign.render.open3d.engine")
         except (ImportError, OSError) as error:  # OSError: a library of the system is missing

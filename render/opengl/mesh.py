@@ -12,6 +12,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Material
 from cadalign.render.drawing.color import LinearArray, linear_from_srgb
 from cadalign.render.raycast.shading import DARKEST
+from cadalign.render.raycast.surface import color_channels
 from cadalign.render.scene import Scene
 
 _ROUGHNESS = 0.55
@@ -108,7 +109,6 @@ def _texture(image: npt.NDArray[np.uint8] | None) -> Any:
     """An opaque RGBA texture: rows of other widths than 4 bytes a pixel would be misread."""
     if image is None:
         return None
-    pixels = image[:, :, None] if image.ndim == 2 else image
-    rgba = np.full((*pixels.shape[:2], 4), 255, dtype=np.uint8)
-    rgba[:, :, :3] = pixels[:, :, :3] if pixels.shape[2] >= 3 else pixels[:, :, :1]
+    rgba = np.full((*image.shape[:2], 4), 255, dtype=np.uint8)
+    rgba[:, :, :3] = color_channels(image)
     return pyrender.Texture(source=rgba, source_channels="RGBA")

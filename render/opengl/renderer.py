@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 
 import cv2
@@ -15,7 +14,7 @@ from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import Frame, check_image_size
 from cadalign.render.opengl.context import shared_context, straight_color
 from cadalign.render.raycast.occlusion import darken_corners
-from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
+from cadalign.render.raycast.posed import Rectangle, pose_scene
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry, check_samples
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
@@ -32,23 +31,13 @@ class PyrenderRenderer:
 
     A model with transparent parts, which OpenGL would need sorted, is drawn by ray casting wholly.
     A process has one OpenGL context, however many of these there are; a forked process must not
-    use its parent's, so start pools with "spawn" (or use loky).
-
-    Parameters
-    ----------
-    studio : Studio, optional
-        The lights.
-
-    Raises
-    ------
-    RenderError
-        If OpenGL does not start. Where its libraries are broken the whole process may die:
-        `make_renderer` tries it in another one first.
+    use its parent's, so start pools with "spawn" (or use loky). Where OpenGL's libraries are broken
+    the whole process may die: `make_renderer` tries it in another one first.
     """
 
     name = "pyrender"
 
-    def __init__(self, *, studio: Studio | None = None) -> None:
+    def __init__(self, *, studio: Studio | None) -> None:
         self.studio = studio or Studio()
         self._context = shared_context()
         self._context.check_process()
@@ -73,14 +62,6 @@ class PyrenderRenderer:
         """Draw a scene; see `RaycastRenderer.render`.
 
         OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
-
-        Raises
-        ------
-        RenderError
-            If the image is too large, OpenGL fails, or this process was forked from one that has
-            drawn with OpenGL.
-        InputError
-            If ``samples`` is not from 1 to 256.
         """
         if self.drawn_by(scene, samples=samples) != self.name:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
@@ -88,14 +69,13 @@ class PyrenderRenderer:
         check_image_size(camera)
         geometry = cast_geometry(scene, camera, cam_from_model)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        block = object_rectangle(scene, camera, cam_from_model)
-        if block is not None:
-            posed = PosedScene(scene, cam_from_model)
-            sides = posed.seen_sides(geometry.face_id[block.slices])
-            self._stage.place(scene, cam_from_model, sides=sides)
+        posed = pose_scene(scene, camera, cam_from_model, caster=None)
+        if posed is not None:
+            block = posed.block.slices
+            self._stage.place(scene, cam_from_model, posed.seen_sides(geometry.face_id[block]))
             draw = self._draw_bent if camera.distortion else self._draw
-            color[block.slices] = straight_color(draw(camera, block))
-            darken_corners(color, geometry, block, posed, camera, studio=self.studio)
+            color[block] = straight_color(draw(camera, posed.block))
+            darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
     def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
@@ -105,8 +85,8 @@ class PyrenderRenderer:
     def _draw(self, camera: Camera, block: Rectangle) -> ByteImage:
         """Draw a block of an image without lens distortion, premultiplied (h, w, 4)."""
         result: ByteImage = np.empty((block.height, block.width, 4), dtype=np.uint8)
-        for tile in _tiles(block):
-            width, height = (_rounded_up(size) for size in (tile.width, tile.height))
+        for tile in block.tiles(_TILE, _TILE):
+            width, height = (-(-n // _SIZE_STEP) * _SIZE_STEP for n in (tile.width, tile.height))
             self._stage.look(camera, (tile.left, tile.top, width, height))
             drawn = self._context.draw(self._stage.scene, width=width, height=height)
             rows = slice(tile.top - block.top, tile.bottom - block.top)
@@ -116,11 +96,7 @@ class PyrenderRenderer:
 
     def _draw_bent(self, camera: Camera, block: Rectangle) -> ByteImage:
         """Draw as a pinhole camera would and bend that as the lens does, premultiplied."""
-        columns, rows = np.meshgrid(
-            np.arange(block.left, block.right), np.arange(block.top, block.bottom)
-        )
-        pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-        rays, valid = camera.normalize_where_valid(pixels)
+        rays, valid = camera.normalize_where_valid(block.pixels)
         if not valid.any():
             return np.zeros((block.height, block.width, 4), dtype=np.uint8)
         low, high = rays[valid].min(axis=0), rays[valid].max(axis=0)
@@ -132,18 +108,6 @@ class PyrenderRenderer:
         at_x, at_y = at.astype(np.float32).T.reshape(2, block.height, block.width)
         bent = cv2.remap(drawn, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(bent, dtype=np.uint8)
-
-
-def _tiles(block: Rectangle) -> Iterator[Rectangle]:
-    for top in range(block.top, block.bottom, _TILE):
-        for left in range(block.left, block.right, _TILE):
-            yield Rectangle(
-                left, top, min(left + _TILE, block.right), min(top + _TILE, block.bottom)
-            )
-
-
-def _rounded_up(size: int) -> int:
-    return -(-size // _SIZE_STEP) * _SIZE_STEP
 
 
 def _pinhole_over(camera: Camera, low: FloatArray, high: FloatArray) -> Camera:

@@ -57,10 +57,8 @@ class GlStage:
         self._nodes: tuple[Any, ...] = ()
         self._shown: ref[Scene] | None = None
 
-    def place(
-        self, scene: Scene, cam_from_model: Alignment, *, sides: tuple[bool, bool] = (True, True)
-    ) -> None:
-        """Put a scene's mesh where it is seen; ``sides``: whether to draw front and back faces."""
+    def place(self, scene: Scene, cam_from_model: Alignment, sides: tuple[bool, bool]) -> None:
+        """Put a scene's mesh where it is seen; ``sides``: draw front faces, draw back faces."""
         if self._shown is None or self._shown() is not scene:
             for node in self._nodes:
                 self.scene.remove_node(node)

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
+from cadalign.geometry.mesh import Mesh
 
 FaceArray = npt.NDArray[np.int32]
 SingleArray = npt.NDArray[np.float32]
@@ -64,46 +65,24 @@ class EmbreeEngine:
 
 
 class RayCaster:
-    """A bounding volume hierarchy over finite vertices (n, 3) and faces (m, 3), then only read."""
+    """A bounding volume hierarchy over a mesh, then only read; safe in several threads."""
 
-    def __init__(
-        self, vertices: FloatArray, faces: IntArray, *, engine: EngineMaker = EmbreeEngine
-    ) -> None:
-        used = vertices[np.unique(faces)]
-        low, high = used.min(axis=0), used.max(axis=0)
+    def __init__(self, mesh: Mesh, face_normals: FloatArray, *, engine: EngineMaker) -> None:
+        low, high = mesh.bounds
         self._center = (low + high) / 2
         # A mesh of a single point has no size; any radius serves.
         self._radius = float(np.linalg.norm(high - low)) / 2 or 1.0
-        self._triangles = vertices[faces]
-        first = self._triangles[:, 0]
-        self._normals = np.cross(self._triangles[:, 1] - first, self._triangles[:, 2] - first)
-        length = np.linalg.norm(self._normals, axis=1, keepdims=True)
-        self._normals /= np.where(length > 0, length, 1.0)
-        unit = (vertices - self._center) / self._radius
-        self._engine = engine(unit.astype(np.float32), faces.astype(np.int32))
+        self._triangles, self._normals = mesh.triangles, face_normals
+        unit = (mesh.vertices - self._center) / self._radius
+        self._engine = engine(unit.astype(np.float32), mesh.faces.astype(np.int32))
 
     def first_hits(
         self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
     ) -> tuple[FaceArray, FloatArray]:
-        """Find the first triangle on each of many rays from one point.
+        """Find the first triangle on each ray (n, 3) from one point, beyond ``start`` (n,).
 
-        Several threads may call this at once: embree lets go of the interpreter lock.
-
-        Parameters
-        ----------
-        origin : (3,) float
-            Where all rays begin [model units].
-        directions : (n, 3) float
-            Directions, of any length but 0.
-        start : (n,) float, optional
-            Ignore what lies before ``origin + start * direction``; by default 0.
-
-        Returns
-        -------
-        face : (n,) int32
-            The triangle's number, -1 where there is none.
-        distance : (n,) float
-            The point is ``origin + distance * direction``; infinite where nothing is hit.
+        Its number is -1 and its distance infinite where there is none; ``start`` and distances,
+        both (n,), count in the directions' own lengths.
         """
         face = self._first_faces(origin, directions, start)
         return face, self._distances(origin, directions, face)

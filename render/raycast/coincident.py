@@ -9,16 +9,11 @@ from cadalign.geometry.edges import number_rows
 
 
 def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Find, for each triangle, which one to show of those with the same three corners.
+    """Find, for each triangle, the first with the same corners wound alike, and the other way.
 
     Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
-    front and of its back. The one to show is wound towards the viewer.
-
-    Returns
-    -------
-    alike, opposite : (m,) int
-        The first triangle there that is wound as this one is, and the first that is wound the
-        other way, which is the triangle itself where there is none.
+    front and of its back. The one to show is wound towards the viewer. Both results are (m,) int;
+    where no triangle is wound the other way, the two are the same.
     """
     corners = number_rows(vertices)[faces]
     place = number_rows(np.sort(corners, axis=1))

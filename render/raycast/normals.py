@@ -15,23 +15,19 @@ _PAIRS_AT_ONCE = 1 << 20
 def corner_normals(
     vertices: FloatArray, faces: IntArray, face_normals: FloatArray, *, crease_angle: float
 ) -> FloatArray:
-    """Average, at each corner of each face, the normals of the faces that continue it smoothly.
+    """Average, at each face's corners, the normals of faces that continue it smoothly, (m, 3, 3).
 
     Faces meet where their vertices have the same position, whether they share the vertex or not.
     Those that are turned the other way count with their normal reversed, since the faces of many
     CAD models are turned at random. Each counts by its angle at the corner. Faces at a larger angle
-    than ``crease_angle`` [degrees] meet in an edge.
-
-    Returns
-    -------
-    (m, 3, 3) float
-        A unit normal for each face's corner, on the side of that face's own normal.
+    than ``crease_angle`` [degrees] meet in an edge. The unit normals are on the side of their face.
     """
     point = number_rows(vertices)[faces].ravel()
     weight = _corner_angles(vertices[faces]).ravel()
     normals = np.repeat(face_normals, 3, axis=0)
     order = np.argsort(point, kind="stable")
-    start, valence = _runs(point[order])
+    valence = np.bincount(point)
+    start = np.cumsum(valence) - valence
     result = normals.copy()
     for count in np.unique(valence):
         if count == 1 or count > _MAX_VALENCE:
@@ -53,12 +49,6 @@ def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> Flo
     total = share @ normals
     length = np.linalg.norm(total, axis=2, keepdims=True)
     return np.where(length > 1e-9, total / np.where(length > 0, length, 1.0), normals)
-
-
-def _runs(values: IntArray) -> tuple[IntArray, IntArray]:
-    """Starts and lengths of the runs of equal values in a sorted array."""
-    start = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
-    return start, np.diff(np.concatenate([start, [len(values)]]))
 
 
 def _corner_angles(triangles: FloatArray) -> FloatArray:

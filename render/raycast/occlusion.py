@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import Geometry
 from cadalign.render.raycast.posed import PosedScene, Rectangle
@@ -32,33 +31,21 @@ _POINTS_AT_ONCE = 1 << 12
 _ENCODING = 1 / 2.2
 
 
-def darken_corners(
-    color: ByteImage,
-    geometry: Geometry,
-    block: Rectangle,
-    posed: PosedScene,
-    camera: Camera,
-    *,
-    studio: Studio,
-) -> None:
-    """Darken, in place, corners and places under other parts of the object.
-
-    ``color`` is (h, w, 4) uint8, ``block`` holds the object, ``studio`` says strength and reach.
-    """
+def darken_corners(color: ByteImage, geometry: Geometry, posed: PosedScene, studio: Studio) -> None:
+    """Darken, in place, corners and places under other parts of the object."""
     if studio.occlusion <= 0:
         return
-    openness = _openness(geometry, block, posed, camera, studio.occlusion_reach * posed.diagonal)
+    openness = _openness(geometry, posed, studio.occlusion_reach * posed.diagonal)
     if openness is None:
         return
     factor = (1 - studio.occlusion * (1 - openness)) ** np.float32(_ENCODING)
-    part = color[block.slices]
+    part = color[posed.block.slices]
     part[:, :, :3] = (part[:, :, :3] * factor[:, :, None] + 0.5).astype(np.uint8)
 
 
-def _openness(
-    geometry: Geometry, block: Rectangle, posed: PosedScene, camera: Camera, reach: float
-) -> SingleImage | None:
-    """Share of the sky that each pixel of a block sees, (h, w) float32; None without pixels."""
+def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> SingleImage | None:
+    """Share of the sky that the block's pixels see, (h, w) float32; None without pixels."""
+    block, camera = posed.block, posed.camera
     covered = int(geometry.mask[block.slices].sum())
     if not covered:
         return None

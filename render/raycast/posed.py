@@ -11,7 +11,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.projection import model_rays, perspective
 from cadalign.render.drawing.color import LinearArray
 from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.shading import Studio
@@ -23,6 +23,9 @@ _MAX_LAYERS = 8
 _SEEN_THROUGH = 1 / 64
 # How far behind a transparent hit the ray goes on, in diagonals of the model.
 _LAYER_GAP = 2e-5
+# Pixels left about the object.
+_MARGIN = 2
+_POINTS_PER_SIDE = 65
 
 
 @dataclass(frozen=True)
@@ -49,19 +52,41 @@ class Rectangle:
         """The block's rows and columns, to index images with."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    def tiles(self, width: int, height: int) -> list[Rectangle]:
+        """Cut the block into tiles of at most this size, which is at least a pixel."""
+        width, height = max(1, width), max(1, height)
+        return [
+            Rectangle(left, top, min(left + width, self.right), min(top + height, self.bottom))
+            for top in range(self.top, self.bottom, height)
+            for left in range(self.left, self.right, width)
+        ]
+
+    @property
+    def pixels(self) -> FloatArray:
+        """Pixel centres, row by row, (n, 2)."""
+        pixels = np.empty((self.height, self.width, 2))
+        pixels[:, :, 0] = np.arange(self.left, self.right)
+        pixels[:, :, 1] = np.arange(self.top, self.bottom)[:, None]
+        return pixels.reshape(-1, 2)
+
 
 class PosedScene:
-    """A scene placed before a camera; ``caster`` replaces the scene's own ray hierarchy."""
+    """A scene placed before a camera, seen in a block of its pixels; made by `pose_scene`."""
 
     def __init__(
-        self, scene: Scene, cam_from_model: Alignment, *, caster: RayCaster | None = None
+        self,
+        scene: Scene,
+        camera: Camera,
+        cam_from_model: Alignment,
+        block: Rectangle,
+        caster: RayCaster,
     ) -> None:
         self.scene = scene
-        self._caster = caster or scene.caster
+        self.camera = camera
+        self.block = block
+        self._caster = caster
         self._alignment = cam_from_model
-        # Columns take normalised coordinates (u, v, 1) to directions in the model frame.
-        self._model_from_ray = cam_from_model.rotation.T / cam_from_model.scale[:, None]
-        self._origin = -self._model_from_ray @ cam_from_model.translation
+        self._origin, self._model_from_ray = model_rays(cam_from_model)
         first = scene.triangles[:, 0]
         side = np.einsum("mk,mk->m", self._origin - first, scene.face_normals)
         self._side = np.where(side < 0, -1.0, 1.0)
@@ -80,9 +105,9 @@ class PosedScene:
         self, normalized: FloatArray, *, start: FloatArray | None = None
     ) -> tuple[FaceArray, FloatArray]:
         """Find what is seen in normalised directions (n, 2): triangles and depths, both (n,)."""
-        columns = self._model_from_ray.T
-        directions = normalized @ columns[:2] + columns[2]
-        face, depth = self._caster.first_hits(self._origin, directions, start=start)
+        face, depth = self._caster.first_hits(
+            self._origin, self._directions(normalized), start=start
+        )
         return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
 
     def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
@@ -96,8 +121,7 @@ class PosedScene:
     @cached_property
     def diagonal(self) -> float:
         """The diagonal of the stretched model's bounding box [model units]."""
-        extents = (self.scene.bounds[1] - self.scene.bounds[0]) * self._alignment.scale
-        return float(np.linalg.norm(extents))
+        return self.scene.stretched_diagonal(self._alignment)
 
     def blocked(
         self, points_cam: FloatArray, directions: FloatArray, *, reach: float
@@ -140,7 +164,7 @@ class PosedScene:
             result[active] = seen
             going = np.flatnonzero(seen[:, 3] < 1 - _SEEN_THROUGH)
             rays, depth = rays[going], depth[going]
-            along = rays @ self._model_from_ray.T[:2] + self._model_from_ray[:, 2]
+            along = self._directions(rays)
             speed = np.sqrt(np.einsum("nk,nk->n", along, along))
             face, depth = self.cast(rays, start=depth + _LAYER_GAP * self.scene.diagonal / speed)
             hit = np.flatnonzero(face >= 0)
@@ -174,8 +198,7 @@ class PosedScene:
 
     def _weights(self, normalized: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
         """Barycentric coordinates of hits, (n, 3)."""
-        columns = self._model_from_ray.T
-        points = (normalized @ columns[:2] + columns[2]) * depth[:, None]
+        points = self._directions(normalized) * depth[:, None]
         points += self._origin - self.scene.triangles[face, 0]
         later = np.einsum("nck,nk->nc", self.scene.barycentric_gradients[face], points)
         weights = np.column_stack([1 - later.sum(axis=1), later])
@@ -193,16 +216,29 @@ class PosedScene:
         side = self._side[face].astype(np.float32)
         return np.asarray(turned * (side / np.maximum(length, np.float32(1e-30)))[:, None])
 
+    def _directions(self, normalized: FloatArray) -> FloatArray:
+        """Directions (n, 3) in the model frame of normalised ones (n, 2)."""
+        columns = self._model_from_ray.T
+        return np.asarray(normalized @ columns[:2] + columns[2])
+
     def _to_camera(self, normals: FloatArray) -> LinearArray:
         rows = normals @ self._normal_matrix.T
         rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
         return (rows * self._side[:, None]).astype(np.float32)
 
 
-def object_rectangle(
-    scene: Scene, camera: Camera, cam_from_model: Alignment, *, margin: int = 2
-) -> Rectangle | None:
-    """The block of pixels that holds all of the object and a margin [px]; None if it is unseen."""
+def pose_scene(
+    scene: Scene, camera: Camera, cam_from_model: Alignment, *, caster: RayCaster | None
+) -> PosedScene | None:
+    """Place a scene before a camera; None if it is unseen. The caster is by default its own."""
+    block = _object_rectangle(scene, camera, cam_from_model)
+    if block is None:
+        return None
+    return PosedScene(scene, camera, cam_from_model, block, caster or scene.caster)
+
+
+def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Rectangle | None:
+    """The block of pixels that holds all of the object and a margin; None if it is unseen."""
     points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
     nearest = points[:, 2].min()
     if points[:, 2].max() <= 0:
@@ -223,16 +259,16 @@ def object_rectangle(
     pixels = camera.pixels_from_normalized(normalized)
     size = (camera.width, camera.height)
     # Clip before converting to whole numbers, which far-off pixels would overflow.
-    first = np.clip(np.floor(pixels.min(axis=0)) - margin, 0, size).astype(int)
-    last = np.clip(np.ceil(pixels.max(axis=0)) + margin + 1, 0, size).astype(int)
+    first = np.clip(np.floor(pixels.min(axis=0)) - _MARGIN, 0, size).astype(int)
+    last = np.clip(np.ceil(pixels.max(axis=0)) + _MARGIN + 1, 0, size).astype(int)
     if (first >= last).any():
         return None
     return Rectangle(int(first[0]), int(first[1]), int(last[0]), int(last[1]))
 
 
-def _outline(low: FloatArray, high: FloatArray, *, count: int = 65) -> FloatArray:
-    """Points along the border of a rectangle, (4 count, 2)."""
-    share = np.linspace(0, 1, count)[:, None]
+def _outline(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Points along the border of a rectangle, (n, 2)."""
+    share = np.linspace(0, 1, _POINTS_PER_SIDE)[:, None]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     following = np.roll(corners, -1, axis=0)
     lines = [a + share * (b - a) for a, b in zip(corners, following, strict=True)]

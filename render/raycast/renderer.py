@@ -7,9 +7,8 @@ from operator import attrgetter
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -17,7 +16,7 @@ from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_lin
 from cadalign.render.frame import Frame, Geometry, check_image_size
 from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.occlusion import darken_corners
-from cadalign.render.raycast.posed import PosedScene, Rectangle, object_rectangle
+from cadalign.render.raycast.posed import PosedScene, Rectangle, pose_scene
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.raycast.threads import in_threads
 from cadalign.render.scene import Scene
@@ -96,9 +95,8 @@ class RaycastRenderer:
         check_image_size(camera)
         geometry = _empty_geometry(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
-        block = object_rectangle(scene, camera, cam_from_model)
-        if block is not None:
-            posed = PosedScene(scene, cam_from_model, caster=self._caster_of(scene))
+        posed = pose_scene(scene, camera, cam_from_model, caster=self._caster_of(scene))
+        if posed is not None:
             posed.prepare_color()
 
             def shade(
@@ -107,53 +105,38 @@ class RaycastRenderer:
                 light = posed.light_of_hits(normalized, face, depth, self.studio)
                 color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
-            _cast(geometry, block, posed, camera, shade=shade)
+            _cast(geometry, posed, shade)
             if samples > 1:
-                self._antialias(color, block, posed, camera, samples)
-            darken_corners(color, geometry, block, posed, camera, studio=self.studio)
+                self._antialias(color, posed, samples)
+            darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
     def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
         """The renderer's own name."""
         return self.name
 
-    def _antialias(
-        self,
-        color: ByteImage,
-        block: Rectangle,
-        posed: PosedScene,
-        camera: Camera,
-        samples: int,
-    ) -> None:
+    def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
         """Draw the pixels that differ from a neighbour again, with several rays each."""
-        part = color[block.slices]
+        part = color[posed.block.slices]
         unlike = _unlike_neighbours(part)
         if posed.scene.surface.opaque:
-            self._sample(color, unlike, block, posed, camera, samples)
+            self._sample(color, unlike, posed, samples)
             return
         # What shows through is softer than an outline, and costs a ray for each layer.
         outline = _unlike_neighbours(part[:, :, 3:])
-        self._sample(color, unlike & outline, block, posed, camera, samples)
-        self._sample(color, unlike & ~outline, block, posed, camera, -(-samples // 2))
+        self._sample(color, unlike & outline, posed, samples)
+        self._sample(color, unlike & ~outline, posed, -(-samples // 2))
 
-    def _sample(
-        self,
-        color: ByteImage,
-        chosen: npt.NDArray[np.bool_],
-        block: Rectangle,
-        posed: PosedScene,
-        camera: Camera,
-        samples: int,
-    ) -> None:
-        """Draw pixels of a block with several rays each."""
+    def _sample(self, color: ByteImage, chosen: BoolArray, posed: PosedScene, samples: int) -> None:
+        """Draw the chosen pixels of the scene's block with several rays each."""
         rows, columns = np.nonzero(chosen)
-        pixels = np.column_stack([columns + block.left, rows + block.top])
+        pixels = np.column_stack([columns + posed.block.left, rows + posed.block.top])
         offsets = _subpixel_offsets(samples)
         step = max(1, _RAYS_AT_ONCE // samples)
 
         def draw(part: IntArray) -> None:
             pixels = (part[:, None] + offsets).reshape(-1, 2)
-            rays, valid = camera.normalize_where_valid(pixels)
+            rays, valid = posed.camera.normalize_where_valid(pixels)
             light = posed.light(rays, self.studio)
             light[~valid] = 0
             light = light.reshape(len(part), samples, 4)
@@ -187,9 +170,9 @@ def cast_geometry(
     """
     check_image_size(camera)
     geometry = _empty_geometry(camera)
-    block = object_rectangle(scene, camera, cam_from_model)
-    if block is not None:
-        _cast(geometry, block, PosedScene(scene, cam_from_model, caster=caster), camera)
+    posed = pose_scene(scene, camera, cam_from_model, caster=caster)
+    if posed is not None:
+        _cast(geometry, posed)
     return geometry
 
 
@@ -207,16 +190,13 @@ def _empty_geometry(camera: Camera) -> Geometry:
 
 def _cast(
     geometry: Geometry,
-    block: Rectangle,
     posed: PosedScene,
-    camera: Camera,
-    *,
     shade: Callable[[Rectangle, FloatArray, FaceArray, FloatArray], None] | None = None,
 ) -> None:
-    """Fill a block of the images with hits of one ray through each pixel's centre, and shade it."""
+    """Fill the images with hits of one ray through each pixel's centre, and shade these."""
 
     def draw(band: Rectangle) -> None:
-        normalized, valid = _normalized(camera, band)
+        normalized, valid = posed.camera.normalize_where_valid(band.pixels)
         face, depth = posed.cast(normalized)
         face[~valid] = -1
         hit = np.flatnonzero(face >= 0)
@@ -229,27 +209,10 @@ def _cast(
         if shade is not None:
             shade(band, normalized, face, depth)
 
-    in_threads(draw, _bands(block))
+    in_threads(draw, posed.block.tiles(posed.block.width, _RAYS_AT_ONCE // posed.block.width))
 
 
-def _bands(block: Rectangle) -> list[Rectangle]:
-    """Cut a block into bands of rows, to be cast at a time."""
-    rows = max(1, _RAYS_AT_ONCE // block.width)
-    return [
-        Rectangle(block.left, top, block.right, min(top + rows, block.bottom))
-        for top in range(block.top, block.bottom, rows)
-    ]
-
-
-def _normalized(camera: Camera, block: Rectangle) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Normalised coordinates (n, 2) of pixel centres, row by row, and where they are valid."""
-    pixels = np.empty((block.height, block.width, 2))
-    pixels[:, :, 0] = np.arange(block.left, block.right)
-    pixels[:, :, 1] = np.arange(block.top, block.bottom)[:, None]
-    return camera.normalize_where_valid(pixels.reshape(-1, 2))
-
-
-def _unlike_neighbours(color: ByteImage) -> npt.NDArray[np.bool_]:
+def _unlike_neighbours(color: ByteImage) -> BoolArray:
     """Pixels of (h, w, k) that visibly differ from one of 8 neighbours, (h, w) bool."""
     around = np.ones((3, 3), dtype=np.uint8)
     span = cv2.subtract(cv2.dilate(color, around), cv2.erode(color, around))

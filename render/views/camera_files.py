@@ -99,25 +99,15 @@ class CameraView:
 
 
 def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
-    """Read cameras and poses from a file or folder of any of the three kinds.
-
-    Parameters
-    ----------
-    path : str or path-like
-        An Open3D or NeRF JSON file, or the folder of a COLMAP model.
-
-    Returns
-    -------
-    list of CameraView
-
-    Raises
-    ------
-    DataError
-        If it is missing, of another kind, or malformed; it names the file and the field.
-    """
+    """Read cameras and poses from an Open3D or NeRF JSON file, or the folder of a COLMAP model."""
     path = Path(path)
     if path.is_dir():
-        return _read_colmap(path)
+        # The loaders stand above this module, and are not needed for the other formats.
+        from cadalign.datasets.sfm.colmap import Colmap
+
+        model = Colmap(path)
+        images = (model[name] for name in model.ids)
+        return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]
     data = read_json(path)
     with in_file(path), np.errstate(over="ignore", invalid="ignore"):
         return _views_of(data)
@@ -126,13 +116,7 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
 def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
     """Write one view as `PinholeCameraParameters`, several as a `PinholeCameraTrajectory`.
 
-    Raises
-    ------
-    InputError
-        If there are no views, one has lens distortion, which these files have no place for, or a
-        pose has a scale.
-    DataError
-        If the file cannot be written.
+    Refused are lens distortion, which these files have no place for, and poses with a scale.
     """
     _require_views(views)
     entries = [_open3d_entry(view, number) for number, view in enumerate(views)]
@@ -145,38 +129,24 @@ def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> N
 def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
     """Write ``transforms.json``; what all cameras share stands at the top.
 
-    Raises
-    ------
-    InputError
-        If there are no views, a lens has more coefficients than k1, k2, p1, p2, or a pose has a
-        scale.
-    DataError
-        If the file cannot be written.
+    Refused are lenses of more coefficients than k1, k2, p1, p2, and poses with a scale.
     """
     _require_views(views)
     cameras = [_nerf_camera(view.camera, number) for number, view in enumerate(views)]
-    shared = {key: value for key, value in cameras[0].items() if _in_all(key, value, cameras)}
-    frames = [
-        {"file_path": view.name}
-        | {key: value for key, value in camera.items() if key not in shared}
-        | {"transform_matrix": _world_from_opengl(view, number).tolist()}
-        for number, (view, camera) in enumerate(zip(views, cameras, strict=True))
-    ]
+    shared = {k: v for k, v in cameras[0].items() if all(camera[k] == v for camera in cameras)}
+    frames = []
+    for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+        own = {key: value for key, value in camera.items() if key not in shared}
+        pose = np.linalg.inv(opengl_from_model(_rigid(view, number)))
+        frames.append({"file_path": view.name, **own, "transform_matrix": pose.tolist()})
     write_json(Path(path), {**shared, "frames": frames})
 
 
 def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
     """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 
-    Cameras that are equal are written once.
-
-    Raises
-    ------
-    InputError
-        If there are no views, a pose has a scale, or a name is missing, holds a line break or
-        occurs twice.
-    DataError
-        If the files cannot be written.
+    Cameras that are equal are written once. Refused are poses with a scale, and names that are
+    missing, hold a line break or occur twice.
     """
     _require_views(views)
     names = [view.name for view in views]
@@ -227,14 +197,8 @@ def _open3d_view(view: _Open3dView, where: str) -> CameraView:
     with within(where):
         matrix = _matrix(view.intrinsic.intrinsic_matrix, 3, "intrinsic_matrix").T
         extrinsic = _matrix(view.extrinsic, 4, "extrinsic").T
-        camera = Camera(
-            width=view.intrinsic.width,
-            height=view.intrinsic.height,
-            fx=matrix[0, 0],
-            fy=matrix[1, 1],
-            cx=matrix[0, 2],
-            cy=matrix[1, 2],
-        )
+        size, focal = (view.intrinsic.width, view.intrinsic.height), (matrix[0, 0], matrix[1, 1])
+        camera = Camera(*size, *focal, matrix[0, 2], matrix[1, 2])
         return CameraView(camera, Alignment(extrinsic[:3, :3], extrinsic[:3, 3], np.ones(3)))
 
 
@@ -280,9 +244,8 @@ def _nerf_views(data: dict[str, Any]) -> list[CameraView]:
 def _camera_from_nerf(frame: _NerfFrame) -> Camera:
     for name, value in (("k3", frame.k3), ("k4", frame.k4)):
         if value:
-            raise InputError(
-                f"{name} is a fisheye's coefficient", where=name, fix="undistort first"
-            )
+            what = f"{name} is a fisheye's coefficient"
+            raise InputError(what, where=name, fix="undistort first")
     width, height = frame.w, frame.h
     if width is None or height is None:
         raise InputError("w and h, the image's size, are missing")
@@ -306,9 +269,8 @@ def _camera_from_nerf(frame: _NerfFrame) -> Camera:
 
 def _nerf_camera(camera: Camera, number: int) -> dict[str, Any]:
     if any(camera.distortion[4:]):
-        raise InputError(
-            "transforms.json has no place for more than k1, k2, p1, p2", where=f"views[{number}]"
-        )
+        what = "transforms.json has no place for more than k1, k2, p1, p2"
+        raise InputError(what, where=f"views[{number}]")
     coefficients = camera.distortion[:4] or (0.0,) * 4
     return {
         "w": camera.width,
@@ -319,26 +281,6 @@ def _nerf_camera(camera: Camera, number: int) -> dict[str, Any]:
         "cy": camera.cy + PIXEL_CENTRE,
         **dict(zip(_NERF_DISTORTION, coefficients, strict=True)),
     }
-
-
-def _world_from_opengl(view: CameraView, number: int) -> FloatArray:
-    return np.asarray(np.linalg.inv(opengl_from_model(_rigid(view, number))))
-
-
-def _in_all(key: str, value: Any, cameras: list[dict[str, Any]]) -> bool:
-    return all(camera[key] == value for camera in cameras)
-
-
-# COLMAP
-
-
-def _read_colmap(folder: Path) -> list[CameraView]:
-    # The loaders stand above this module, and are not needed for the other formats.
-    from cadalign.datasets.sfm.colmap import Colmap
-
-    model = Colmap(folder)
-    images = (model[name] for name in model.ids)
-    return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]
 
 
 # All of them

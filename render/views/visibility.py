@@ -9,6 +9,7 @@ from cadalign.arrays import FloatArray, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import model_rays, perspective
 from cadalign.render.scene import Scene
 from cadalign.render.views.lens_field import within_lens_field
 
@@ -69,12 +70,10 @@ def visible_keypoints(
     chosen = np.flatnonzero(visible)
     if not len(chosen):
         return visible
-    extents = (scene.bounds[1] - scene.bounds[0]) * cam_from_model.scale
-    slack = tolerance * float(np.linalg.norm(extents))
+    slack = tolerance * scene.stretched_diagonal(cam_from_model)
     targets = in_camera[chosen, None] + slack * _beside(in_camera[chosen])
     # In the camera frame a ray ends at its target; in the model frame its parameter is the same.
-    model_from_ray = cam_from_model.rotation.T / cam_from_model.scale[:, None]
-    origin = -model_from_ray @ cam_from_model.translation
+    origin, model_from_ray = model_rays(cam_from_model)
     _, distance = scene.caster.first_hits(origin, targets.reshape(-1, 3) @ model_from_ray.T)
     reach = 1 - slack / np.linalg.norm(targets, axis=2)
     visible[chosen] = (distance.reshape(reach.shape) >= reach).any(axis=1)
@@ -85,11 +84,9 @@ def seen_in_image(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool
     """Say which camera-frame points (k, 3) lie before the camera and inside its image; (k,)."""
     seen = points_cam[:, 2] > 0
     before = np.flatnonzero(seen)
-    normalized = points_cam[before, :2] / points_cam[before, 2:]
+    normalized = perspective(points_cam[before])
     inside = camera.contains(camera.pixels_from_normalized(normalized))
-    if camera.distortion:
-        inside &= within_lens_field(camera, normalized)
-    seen[before] = inside
+    seen[before] = inside & within_lens_field(camera, normalized)
     return np.asarray(seen)
 
 

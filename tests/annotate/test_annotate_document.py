@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.document import Document, FocalChoice, Pair
-from cadalign.annotate.history import History
+from cadalign.annotate.document import Document, FocalChoice, History, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
@@ -86,7 +87,7 @@ def edited(document: Document, edit: int, which: int) -> Document:
         return document.move(number, (float(which), 2.0))
     if edit == 3:
         return document.delete(number)
-    return document.choose_focal(FocalChoice(known=which % 2 == 0, pixels=100.0 + which))
+    return replace(document, focal=FocalChoice(known=which % 2 == 0, pixels=100.0 + which))
 
 
 @given(EDITS)

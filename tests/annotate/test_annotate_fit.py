@@ -13,8 +13,8 @@ from support.problems import problem_of
 from cadalign import Alignment, Camera, fit
 from cadalign.annotate.alignment import Intrinsics, LiveAlignment, align
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.next_best import NextBest, find_next_best, unknown_name, updated_variances
-from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
+from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
+from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
 from cadalign.errors import InputError
 from cadalign.evaluation.simulation.problems import Problem
 from cadalign.fitting.prediction import projection_jacobian
@@ -206,12 +206,10 @@ def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> No
     candidates = candidates[result.alignment.apply(candidates)[:, 2] > 0.5]
     brute = np.array([refitted(problem, result, point, focal).diagonal() for point in candidates])
     predicted = updated_variances(
-        candidates, result.camera, result.alignment, result.covariance, sigma=1.0
+        candidates, result.camera, result.alignment, result.covariance, 1.0
     )
     np.testing.assert_allclose(predicted, brute, rtol=2e-3)
-    next_best = find_next_best(
-        candidates, result.camera, result.alignment, result.covariance, sigma=1.0
-    )
+    next_best = find_next_best(candidates, result.camera, result.alignment, result.covariance, 1.0)
     assert next_best is not None
     column = brute[:, next_best.unknown]
     assert column[next_best.row] <= column.min() * (1 + 5e-3)
@@ -222,18 +220,14 @@ def test_next_best_concerns_the_most_uncertain_unknown() -> None:
     problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 1e-4, 0.04])
-    next_best = find_next_best(
-        problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0
-    )
+    next_best = find_next_best(problem.points_3d, problem.camera, result.alignment, covariance, 1.0)
     assert next_best is not None
     assert next_best.unknown == 7
     assert next_best.before == pytest.approx(0.2)
     distance = np.linalg.norm(result.alignment.translation)
     covariance[5, 5] = (0.3 * distance) ** 2  # in shares of the distance
     assert (
-        find_next_best(
-            problem.points_3d, problem.camera, result.alignment, covariance, sigma=1.0
-        ).unknown
+        find_next_best(problem.points_3d, problem.camera, result.alignment, covariance, 1.0).unknown
         == 5
     )
 
@@ -242,16 +236,13 @@ def test_equally_good_candidates_give_the_first() -> None:
     problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     same = np.repeat(problem.points_3d[:1], 5, axis=0)
-    next_best = find_next_best(same, problem.camera, result.alignment, result.covariance, sigma=1.0)
+    next_best = find_next_best(same, problem.camera, result.alignment, result.covariance, 1.0)
     assert next_best is not None
     assert next_best.row == 0
     assert (
-        find_next_best(same[:0], problem.camera, result.alignment, result.covariance, sigma=1.0)
-        is None
+        find_next_best(same[:0], problem.camera, result.alignment, result.covariance, 1.0) is None
     )
-    assert (
-        find_next_best(same, problem.camera, result.alignment, np.zeros((8, 8)), sigma=1.0) is None
-    )
+    assert find_next_best(same, problem.camera, result.alignment, np.zeros((8, 8)), 1.0) is None
 
 
 # --- derivatives -----------------------------------------------------------------------------
@@ -344,5 +335,4 @@ def test_text_names_point_and_gain() -> None:
     assert next_best_text(NextBest(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
         "tip: it would determine the rotation to ± 0.5° instead of 4°"
     )
-    assert unknown_name(8) == "the focal length"
-    assert unknown_name(6, "y") == "the stretch along x"
+    assert UNKNOWNS[8] == "the focal length"

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.annotate.display import display_bytes
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import CadModel, display_bytes
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError

@@ -16,6 +16,7 @@ from support.refusals import refusal_text
 
 from cadalign import Camera, FitResult, fit
 from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import Photo, find_photos
 from cadalign.annotate.session import Session
@@ -127,7 +128,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
     place_all(case.open(), case, count=7)
     file = case.folder / "photo_fit" / "fit.json"
     before = file.read_bytes()
-    unready = open_session(image=case.photo, model=case.model)
+    unready = open_session(SessionOptions(image=case.photo, model=case.model))
     unready.act(0, {"do": "delete", "pair": 1})
     assert file.read_bytes() == before
     unready.warm_up()
@@ -142,7 +143,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
 def test_fit_file_goes_when_ready_solvers_find_no_alignment(case: Case) -> None:
     place_all(case.open(), case, count=6)
     file = case.folder / "photo_fit" / "fit.json"
-    unready = open_session(image=case.photo, model=case.model)
+    unready = open_session(SessionOptions(image=case.photo, model=case.model))
     for pair in (1, 2, 3):
         unready.act(0, {"do": "delete", "pair": pair})
     assert file.exists()
@@ -305,14 +306,16 @@ def test_contradicting_pair_is_marked(case: Case) -> None:
 def test_bad_actions_are_refused_and_change_nothing(
     original: Case, action: dict[str, Any], message: str
 ) -> None:
-    session = open_session(image=original.photo, model=original.model, keypoints=original.keypoints)
+    session = open_session(
+        SessionOptions(image=original.photo, model=original.model, keypoints=original.keypoints)
+    )
     assert refusal_text(lambda: session.act(0, action)).startswith(message)
     assert session.photos[0].document.pairs == ()
     assert not original.observation.exists()
 
 
 def test_unknown_photo_is_refused(original: Case) -> None:
-    session = open_session(image=original.photo, model=original.model)
+    session = open_session(SessionOptions(image=original.photo, model=original.model))
     assert refusal_text(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
     assert refusal_text(lambda: page_state(session, -1)) == "image: there is no photo 0"
 
@@ -505,7 +508,7 @@ def test_folder_without_photos_is_refused(tmp_path: Path) -> None:
         find_photos(tmp_path)
     (tmp_path / "x.png").write_text("no photo")
     with pytest.raises(DataError, match=r"none of the photos in this folder can be read$"):
-        open_session(image=tmp_path, model=tmp_path / "m.ply")
+        open_session(SessionOptions(image=tmp_path, model=tmp_path / "m.ply"))
 
 
 def test_observation_goes_with_one_photo(case: Case) -> None:
@@ -605,7 +608,7 @@ def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
 
 
 def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:
-    session = open_session(image=case.photo, model=case.model, camera=case.camera)
+    session = open_session(SessionOptions(image=case.photo, model=case.model, camera=case.camera))
     assert isinstance(session, Session)
     state = page_state(session, 0)
     assert state["alignment"]["status"] == "preparing"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cadalign.datasets import SYNSETS, ShapeNet
+from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DataError, InputError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -76,3 +77,10 @@ def test_synset_table_is_consistent():
     assert len(SYNSETS) == len(set(SYNSETS.values())) == 55
     assert all(synset.isdigit() and len(synset) == 8 for synset in SYNSETS.values())
     assert SYNSETS["vessel"] == "04530566"
+
+
+def test_a_category_is_known_by_its_name_and_by_its_synset():
+    for name in ("chair", "03001627"):
+        assert require_category(name, ["chair", "mug"], where="root") == "chair"
+    with pytest.raises(InputError, match="root: unknown category 'chiar', did you mean 'chair'"):
+        require_category("chiar", ["chair"], where="root")

@@ -69,5 +69,5 @@ def test_simulate_takes_the_address(cluster: Any) -> None:
 def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
     workers = DaskWorkers(address, timeout=1.0)
     with pytest.raises(DataError, match="no Dask scheduler answers") as caught:
-        next(workers.evaluate(SweepExperiment(KIND.kind), []))
+        next(workers.evaluate(SweepExperiment(KIND.kind, seed=0), []))
     assert caught.value.where == address

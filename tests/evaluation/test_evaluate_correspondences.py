@@ -330,7 +330,7 @@ class TestRows:
         given = (problem.points_3d, problem.points_2d, problem.camera)
 
         def fit_with(method, ransac):
-            return fit(*given, **fit_options(method, ransac=ransac))
+            return fit(*given, **fit_options(method, sigma=1.0, ransac=ransac))
 
         wide = fit_with("ransac-optimal", RansacOptions(max_reproj_error=4.0))
         narrow = fit_with("ransac-optimal", RansacOptions(max_reproj_error=0.1))

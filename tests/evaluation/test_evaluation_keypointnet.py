@@ -15,6 +15,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 from cadalign.evaluation.outcome import FAILED, OK
@@ -106,8 +107,10 @@ def test_rays_without_a_mesh_are_a_failed_row(annotated: Path) -> None:
 
 
 def test_an_instance_does_not_depend_on_its_neighbours(sample_root: Path) -> None:
-    tasks = KeypointTasks(KeypointNet(sample_root), views=2)
-    experiment = KeypointNetExperiment(("optimal", "aepnp-paper", "limit"))
+    methods = ("optimal", "aepnp-paper", "limit")
+    options = KeypointNetOptions(sample_root, views_per_model=2, methods=methods)
+    tasks = KeypointTasks(KeypointNet(sample_root), options)
+    experiment = KeypointNetExperiment(options, drawn_in=None)
     together = experiment.evaluate(tasks[:]).rows
     alone = [row for task in reversed(tasks[:]) for row in experiment.evaluate([task]).rows]
     assert sorted(map(str, together)) == sorted(map(str, alone))

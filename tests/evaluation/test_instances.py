@@ -74,7 +74,13 @@ def test_too_few_keypoints_are_an_error_that_says_how_many() -> None:
 
 def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
     instance = make_hull_instance(
-        KeypointHull(cloud()), np.arange(14), names=("chair", "a"), noise_px=0.0
+        KeypointHull(cloud()),
+        np.arange(14),
+        names=("chair", "a"),
+        noise_px=0.0,
+        min_visible=6,
+        seed=0,
+        view_index=0,
     )
     projected = instance.camera.project(instance.gt.apply(instance.points_3d))
     assert np.allclose(projected, instance.points_2d)
@@ -88,7 +94,13 @@ def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
 def test_instances_follow_from_seed_and_names_alone() -> None:
     def points(seed: int, model: str, view: int) -> FloatArray:
         instance = make_hull_instance(
-            KeypointHull(cloud()), np.arange(14), names=("chair", model), seed=seed, view_index=view
+            KeypointHull(cloud()),
+            np.arange(14),
+            names=("chair", model),
+            noise_px=1.0,
+            min_visible=6,
+            seed=seed,
+            view_index=view,
         )
         return instance.points_2d
 
@@ -150,7 +162,9 @@ def test_every_method_solves_an_easy_problem(name: str) -> None:
     problem = simulate_problem(
         np.random.default_rng(4), points=30, noise_px=0.0, stretch=(1.0, 1.0)
     )
-    result = fit(problem.points_3d, problem.points_2d, problem.camera, **fit_options(name))
+    result = fit(
+        problem.points_3d, problem.points_2d, problem.camera, **fit_options(name, sigma=1.0)
+    )
     assert rotation_error(est=result.alignment, gt=problem.alignment) < 1e-3
 
 

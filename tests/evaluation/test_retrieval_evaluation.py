@@ -16,6 +16,7 @@ from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, same_shapes
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.spec import SPEC
@@ -76,7 +77,7 @@ class TestQueries:
             query = observe_model(model, task, seed=seed)
             assert len(query.points_2d) == 7
             assert len(set(query.semantic_ids.tolist())) == 7
-            projected = query.camera.project(query.gt.apply(model.xyz[query.semantic_ids]))
+            projected = KEYPOINT_CAMERA.project(query.gt.apply(model.xyz[query.semantic_ids]))
             errors.append(query.points_2d - projected)
             assert query.gt.scale[0] == 1
             assert ((query.gt.scale[1:] > 0.5) & (query.gt.scale[1:] < 2)).all()
@@ -156,7 +157,7 @@ class TestRows:
         best = opened.retrieve(
             query.points_2d,
             query.semantic_ids,
-            query.camera,
+            KEYPOINT_CAMERA,
             shape_sigma=QUICK.shape_sigma,
             exclude=[("box", "007")],
             top=50,

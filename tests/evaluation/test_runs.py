@@ -95,7 +95,7 @@ def run_squares(
 ) -> list[dict[str, object]]:
     folder = RunFolder(path)
     plan = Plan(experiment, range(count), {"value": config}, 7)
-    execute(plan, folder, workers=workers_of(workers))
+    execute(plan, folder, workers=workers_of(workers, None))
     return read_table(folder.results).to_pylist()
 
 
@@ -259,8 +259,8 @@ def test_a_tables_bytes_do_not_show_its_pieces(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [-2, -10])
 def test_a_wrong_number_of_workers_is_an_error(count: int) -> None:
     with pytest.raises(InputError, match="not a number of processes"):
-        workers_of(count)
-    assert workers_of(-1) == LocalProcesses(-1)
+        workers_of(count, None)
+    assert workers_of(-1, None) == LocalProcesses(-1)
 
 
 def test_a_chunk_with_a_failing_task_keeps_its_order() -> None:

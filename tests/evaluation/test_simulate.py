@@ -13,7 +13,7 @@ import pytest
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.simulation.experiment import SweepExperiment, SweepTask, SweepTasks
+from cadalign.evaluation.simulation.experiment import SweepExperiment, SweepTask, sweep_tasks
 from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.problems import simulate_problem
 
@@ -54,7 +54,7 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
     options = {"values": (1, 3), "runs": 4, "points": 12, "methods": ("optimal", "limit")}
     kind = SweepOptions("noise", **options).kind
     experiment = SweepExperiment(kind, seed=3)
-    tasks = SweepTasks(kind.values, kind.runs)[:]
+    tasks = sweep_tasks(kind)
     together = experiment.evaluate(tasks).rows
     alone = [row for task in tasks for row in experiment.evaluate([task]).rows]
     assert together == alone

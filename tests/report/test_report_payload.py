@@ -198,7 +198,9 @@ def test_estimates_say_what_the_fit_says(payload: dict[str, Any]) -> None:
     for exhibit in payload["exhibits"].values():
         camera = Camera(**exhibit["camera"])
         # The pixels are stored to 1e-4.
-        fitted = fit(exhibit["points_3d"], exhibit["points_2d"], camera, **fit_options("optimal"))
+        fitted = fit(
+            exhibit["points_3d"], exhibit["points_2d"], camera, **fit_options("optimal", sigma=1.0)
+        )
         estimate = exhibit["estimates"][0]
         assert estimate["sigma"] == fitted.sigma == 1.0
         assert fitted.std is not None
@@ -400,7 +402,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
     root = annotations(tmp_path / "data", [f"m{k:03d}" for k in range(150)])
     run = evaluate(root, tmp_path / "run", methods=("optimal", "limit"))
     whole = report(tmp_path, run)
-    unfinished = half_finished(run, KeypointNetExperiment(("optimal", "limit")), root)
+    unfinished = half_finished(run, KeypointNetOptions(root, methods=("optimal", "limit")))
     found = report(tmp_path, unfinished)
     (state,) = found["runs"]
     assert (state["state"], state["done"], state["total"]) == ("unfinished", 64 + 22, 150)
@@ -413,7 +415,7 @@ def test_an_unfinished_run_shows_what_there_is(tmp_path: Path) -> None:
     assert found["exhibits"]["85"] == last
 
 
-def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> Path:
+def half_finished(run: Path, options: KeypointNetOptions) -> Path:
     """Put a run back to where its second chunk of three was missing."""
     from cadalign.evaluation.runs.tables import write_rows
 
@@ -421,12 +423,16 @@ def half_finished(run: Path, experiment: KeypointNetExperiment, root: Path) -> P
     for path in (folder.results, folder.records, folder.timings):
         path.unlink()
     folder.parts.mkdir()
-    tasks = KeypointTasks(KeypointNet(root), views=1)
+    experiment = KeypointNetExperiment(options, drawn_in=None)
+    tasks = KeypointTasks(KeypointNet(options.root), options)
     for index in (0, 2):
         result = experiment.evaluate(tasks[64 * index : 64 * index + 64])
-        write_rows(folder.part(index), experiment.columns, result.rows)
-        write_rows(folder.part_records(index), experiment.record_columns, result.records)
-        write_rows(folder.part_timings(index), experiment.timing_columns, result.timings)
+        for table, columns, rows in (
+            (folder.results, experiment.columns, result.rows),
+            (folder.records, experiment.record_columns, result.records),
+            (folder.timings, experiment.timing_columns, result.timings),
+        ):
+            write_rows(folder.part(table, index), columns, rows)
     return run
 
 
@@ -568,7 +574,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
     assert (run["state"], run["done"], run["total"]) == ("unfinished", 16, 20)
     rows = [row["cells"] for row in found["headline"]["rows"]]
     assert [row["instances"] for row in rows] == [16, 16]
-    results = read_table(folder.part(0)).to_pylist()
+    results = read_table(folder.part(folder.results, 0)).to_pylist()
     ranks = [row["rank"] for row in results if row["protocol"] == "leave-in"]
     assert rows[0]["rank_1"] == pytest.approx(100 * np.mean([rank == 1 for rank in ranks]))
     assert rows[0]["milliseconds"] > 0

@@ -31,7 +31,7 @@ def headline(category: str = "chair") -> Headline:
         HeadlineRow(0, "all", "limit", {"n": 3.0, "r": None}),
     ]
     paper = [HeadlineRow(0, category, "stated", {"n": None, "r": 0.998})]
-    return Headline("category", COLUMNS, rows, paper=paper, note="Medians, in %.")
+    return Headline("category", COLUMNS, rows, failures=[], paper=paper, note="Medians, in %.")
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from cadalign.retrieval.bounds import error_bound
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import rank
-from cadalign.retrieval.shape import is_same_shape, shape_distance
+from cadalign.retrieval.shape import SAME_SHAPE, shape_distance
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 LENS = replace(CAMERA, distortion=(-0.1, 0.03, 0.001, -0.002))
@@ -381,6 +381,7 @@ def test_no_pose_has_errors_below_the_bound(
         Library.from_models([model])._table,
         observe(seen, np.arange(count), CAMERA, options),
         options,
+        exclude=(),
     )
     errors = pixels - seen
     cost = np.einsum("ni,nij,nj->", errors, np.linalg.inv(covariances), errors)
@@ -408,7 +409,7 @@ def test_the_bound_spares_most_of_the_work() -> None:
     options = RetrievalOptions(top=1)
     many = Library.from_models([make_model(number) for number in range(2000)])
     observed = observe(pixels, IDS, CAMERA, options)
-    ranking = rank(gather_candidates(many._table, observed, options), observed, options)
+    ranking = rank(gather_candidates(many._table, observed, options, ()), observed, options, -1)
     assert ranking.searched < 500
 
 
@@ -523,6 +524,13 @@ def test_invalid_arguments_are_refused(change: dict[str, Any], message: str) -> 
 
 
 # --- shapes ----------------------------------------------------------------------------------
+
+
+def is_same_shape(est: LibraryModel, gt: LibraryModel) -> bool:
+    """True if two models have the same ids and differ by at most `SAME_SHAPE` after stretch."""
+    if est.category != gt.category or set(est.semantic_ids) != set(gt.semantic_ids):
+        return False
+    return shape_distance(est, gt) <= SAME_SHAPE
 
 
 @given(seed=st.integers(0, 1000), y=st.floats(0.3, 3.0), z=st.floats(0.3, 3.0))

@@ -23,9 +23,8 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.mask_files import read_opacity
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.query import read_query
+from cadalign.retrieval.query import read_opacity, read_query
 
 
 @dataclass(frozen=True)
@@ -383,7 +382,9 @@ def test_a_page_shows_the_matches_side_by_side(
 
 def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None:
     for top in (3, 2):
-        write_retrieval(tmp_path, case.retrieve(top=top), CAMERA, title="t", library="l")
+        write_retrieval(
+            tmp_path, case.retrieve(top=top), CAMERA, title="t", library="l", image=None
+        )
     assert len(list(tmp_path.glob("overlay_*.png"))) == 2
 
 
@@ -391,7 +392,7 @@ def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) ->
     mine = ["overlay_mine.png", "overlay_1.png", "overlay_007.png", "overlay_12_old.png"]
     for name in (*mine, "overlay_12.png", "overlay_100.png"):
         (tmp_path / name).touch()
-    write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
+    write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l", image=None)
     left = sorted(path.name for path in tmp_path.glob("overlay_*.png"))
     assert left == sorted([*mine, "overlay_01.png"])
 
@@ -399,13 +400,13 @@ def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) ->
 def test_an_old_overlay_that_cannot_be_removed_is_one_line(case: Case, tmp_path: Path) -> None:
     (tmp_path / "overlay_02.png").mkdir()
     with pytest.raises(DataError, match=f"{tmp_path}: cannot be written"):
-        write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l")
+        write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l", image=None)
 
 
 def test_names_are_escaped(case: Case, tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
     match = replace(case.retrieve(top=1)[0], model_id=evil, category='"><b>', mesh_path=None)
-    page = write_retrieval(tmp_path, [match], CAMERA, title=evil, library=evil)
+    page = write_retrieval(tmp_path, [match], CAMERA, title=evil, library=evil, image=None)
     text = page.read_text(encoding="utf-8")
     assert "<script>" not in text
     assert "<b>" not in text

@@ -16,11 +16,12 @@ import uvicorn
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.server import listen, make_app
 from cadalign.annotate.session import Session
 from cadalign.datasets import KeypointNet, ModelKeypoints
-from cadalign.evaluation.instances.instance import Instance, make_instance
+from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, visible_keypoints
 
@@ -65,7 +66,7 @@ class Case:
             "camera": self.camera,
             "keypoints": self.keypoints,
         }
-        session = open_session(**(defaults | options))
+        session = open_session(SessionOptions(**(defaults | options)))
         session.warm_up()
         return session
 
@@ -73,7 +74,9 @@ class Case:
 def make_case(sample_root: Path, folder: Path) -> Case:
     """Render the photo and write camera and keypoints."""
     model = KeypointNet(sample_root)["chair", "sample_chair_000"]
-    instance = make_instance(model, seed=0)
+    instance = make_instance(
+        model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
+    )
     assert instance.scene is not None
     assert model.mesh_path is not None
     frame = RaycastRenderer().render(instance.scene, instance.camera, instance.cam_from_model)

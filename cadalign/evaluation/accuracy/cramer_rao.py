@@ -35,11 +35,6 @@ def cramer_rao_bound(
     The inverse of the Fisher information (J' W J)^-1 at the truth, which has the scale 1 along x,
     for independent Gaussian noise of the keypoints; in the order of `FitResult.covariance`, (8, 8)
     or (9, 9). ``sigma`` and ``focal`` are as for `cadalign.fit`.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
     """
     in_camera = gt.apply(points_3d)
     rays = perspective(in_camera)
@@ -77,17 +72,12 @@ def sample_limit(
 def limit_estimate(
     points_3d: FloatArray, points_2d: FloatArray, camera: Camera, gt: Alignment
 ) -> Alignment:
-    """Estimate of an ideal estimator from these observations, to first order.
+    """Estimate of an ideal estimator from noisy observations (n, 2) [px], to first order.
 
     The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
     the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
     the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
     x, the camera no lens distortion.
-
-    Raises
-    ------
-    DegenerateError
-        If the points do not determine the alignment.
     """
     jacobian = projection_jacobian(points_3d, camera, gt, known_axis="x", unknowns=UNKNOWNS)
     jacobian = jacobian.reshape(-1, UNKNOWNS)

@@ -47,13 +47,7 @@ def has_statistics(name: str) -> bool:
 
 
 def check_methods(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once, if all are known.
-
-    Raises
-    ------
-    InputError
-        If there are none, or one is unknown; the message names the known ones.
-    """
+    """Return the names, each once, if all are known."""
     unique = tuple(dict.fromkeys(names))
     known = method_names()
     for name in unique:
@@ -70,21 +64,11 @@ def check_methods(names: Iterable[str]) -> tuple[str, ...]:
     return unique
 
 
-def fit_options(
-    name: str, *, sigma: float = 1.0, ransac: RansacOptions | None = None
-) -> dict[str, Any]:
+def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None = None) -> dict[str, Any]:
     """The options of `cadalign.fit` and `cadalign.fit_batch` that make it a method.
 
-    Parameters
-    ----------
-    name : str
-        In `method_names`.
-    sigma : float
-        Standard deviation of the keypoints' noise [px]; robust methods take what lies within 3.5 of
-        it for an inlier.
-    ransac : RansacOptions, optional
-        Another threshold, other bounds and another seed for robust methods; the minimal solver and
-        the refinement are the method's own.
+    Robust methods take what lies within 3.5 ``sigma`` [px] for an inlier, or go by ``ransac``, but
+    for the minimal solver and the refinement, which are the method's own.
     """
     if name in _RANSAC:
         common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)

@@ -53,13 +53,7 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class Look:
-    """Label and line of a method.
-
-    Parameters
-    ----------
-    label, color, marker, dash : str
-        The marker and the kind of line are matplotlib's.
-    """
+    """Label and line of a method; the marker and the dash are matplotlib's."""
 
     label: str
     color: str
@@ -117,13 +111,7 @@ def label_log_axis(axes: Axes) -> None:
 
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:
-    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files.
-
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
-    """
+    """Write a figure as PNG and PDF, ``path`` being without an ending; returns the files."""
     files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "pdf")]
     for file in files:
         # Without its date a PDF is the same in every run.

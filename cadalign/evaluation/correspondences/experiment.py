@@ -30,7 +30,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -70,16 +70,10 @@ COLUMNS: Columns = (
 
 @dataclass(frozen=True)
 class CorrespondenceExperiment:
-    """Evaluates methods on stretched scenes with outliers.
+    """Evaluates methods on stretched scenes with outliers."""
 
-    Parameters
-    ----------
-    options : CorrespondenceOptions
-        Of which those on methods, the search for inliers and the seed are used.
-    """
-
-    columns: ClassVar[Columns] = COLUMNS
-    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    columns = COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
 
     options: CorrespondenceOptions
 
@@ -114,7 +108,7 @@ class CorrespondenceExperiment:
         for method in self.options.methods:
             start = time.perf_counter()
             try:
-                how = fit_options(method, ransac=ransac)
+                how = fit_options(method, sigma=1.0, ransac=ransac)
                 result = fit(truth.points_3d, truth.points_2d, truth.camera, **how)
                 seconds = time.perf_counter() - start
                 outcome = Outcome(task.names(method), errors_of(result, truth, method=method))
@@ -148,26 +142,11 @@ def errors_of(result: FitResult, truth: Problem, *, method: str) -> Row:
 
 
 def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> Problem:
-    """Stretch what an image shows, and move some of its points to anywhere in the image.
+    """Stretch what an image shows, and move a share of its points to anywhere in the image.
 
-    Parameters
-    ----------
-    seen : Correspondences
-    outliers : float
-        Share of the points that are moved, rounded to a whole number of them.
-    rng : numpy.random.Generator
-        The only source of randomness.
-
-    Returns
-    -------
-    Problem
-        The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
-        alignment has the scene's true pose and the scale (1, s_y, s_z).
-
-    Raises
-    ------
-    DataError
-        If the lens model is not valid in nearly the whole image.
+    The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
+    alignment has the scene's true pose and the scale (1, s_y, s_z). Raises DataError if the lens
+    model is not valid in nearly the whole image.
     """
     scale = np.array([1.0, *rng.uniform(*_STRETCH, 2)])
     pose = seen.cam_from_world

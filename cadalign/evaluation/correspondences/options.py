@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -26,7 +26,7 @@ class CorrespondenceOptions(ExperimentOptions):
     started again. Times are best measured with --workers 1.
     """
 
-    experiment: ClassVar[str] = "correspondences"
+    experiment = "correspondences"
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder of a COLMAP or Bundler model, or of a blind-PnP data set's split."""

@@ -7,15 +7,9 @@ from functools import partial
 
 from cadalign.datasets import open_correspondences
 from cadalign.evaluation import metrics
+from cadalign.evaluation.correspondences import summary
 from cadalign.evaluation.correspondences.experiment import CorrespondenceExperiment
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.correspondences.summary import (
-    HEADLINE,
-    conclude,
-    console_table,
-    plots,
-    summarize,
-)
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -51,12 +45,12 @@ def _describe(run: Run) -> str:
 SPEC = Spec(
     options=CorrespondenceOptions,
     plan=plan,
-    columns=HEADLINE,
-    summarize=summarize,
-    table=console_table,
+    columns=summary.HEADLINE,
+    summarize=summary.summarize,
+    table=summary.console_table,
     group=lambda run: metrics.OUTLIERS,
-    plots=plots,
-    conclude=conclude,
+    plots=summary.plots,
+    conclude=summary.conclude,
     title=partial(on_datasets, "correspondences"),
     describe=_describe,
     note=(

@@ -20,19 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class CorrespondenceTask:
-    """One draw of scales and outliers for one image.
+    """One draw of scales for one image, with a share of its points to be moved.
 
-    Parameters
-    ----------
-    image : str
-        Its id.
-    outliers : float
-        Share of the image points that are to be moved.
-    draw : int
-    seen : Correspondences, optional
-        Its correspondences; None where it cannot be read.
-    problem : str
-        Reason why it cannot be read.
+    ``seen`` is None where the image cannot be read, for the reason ``problem``.
     """
 
     image: str
@@ -48,18 +38,7 @@ class CorrespondenceTask:
 
 
 class CorrespondenceTasks(Sequence[CorrespondenceTask]):
-    """All draws, image by image and share by share, made when asked for.
-
-    Parameters
-    ----------
-    images : CorrespondenceSet
-    options : CorrespondenceOptions
-
-    Raises
-    ------
-    DataError
-        If no image can be read.
-    """
+    """All draws, image by image and share by share, made when asked for."""
 
     def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
         self._images = images

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import ClassVar
 
 from cadalign.evaluation.options import NoiseOption
 
@@ -18,8 +17,8 @@ class DemoOptions(NoiseOption):
     Writes results.csv, overlays/*.png and index.html.
     """
 
-    experiment: ClassVar[str] = "demo"
-    command: ClassVar[str] = "demo"
+    experiment = "demo"
+    command = "demo"
 
     root: Path | None = None
     """Folder of a dataset in KeypointNet's layout; by default a sample dataset is generated."""

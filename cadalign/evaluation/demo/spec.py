@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Sequence
 from typing import Any
@@ -13,14 +11,15 @@ from cadalign.errors import DataError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
 from cadalign.evaluation.keypointnet.summary import TABLE
-from cadalign.evaluation.keypointnet.tasks import KeypointTask
+from cadalign.evaluation.keypointnet.tasks import AUTO, KeypointTask
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
-from cadalign.evaluation.summary import ALL, ConsoleTable, Summary
+from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, csv_text
 from cadalign.io.files import write_text
 
 METHOD = "optimal"
@@ -31,11 +30,6 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan one view of the first models with a mesh of every category.
 
     Another demonstration in the folder is replaced, one that was interrupted goes on.
-
-    Raises
-    ------
-    DataError
-        If no model has a mesh.
     """
     root = options.root
     if root is None:
@@ -64,13 +58,11 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "models": ["/".join(key) for key in keys],
     }
     _clear(folder, config)
-    experiment = KeypointNetExperiment(
-        (METHOD,),
-        noise_px=options.noise_px,
-        seed=options.seed,
-        drawn_in=folder.made_for_pictures(),
+    views = KeypointNetOptions(
+        root, methods=(METHOD,), noise_px=options.noise_px, seed=options.seed
     )
-    tasks = [KeypointTask.of_model(dataset, *key) for key in keys]
+    experiment = KeypointNetExperiment(views, folder.made_for_pictures())
+    tasks = [KeypointTask.of_model(dataset, *key, visibility=AUTO) for key in keys]
     return Plan(experiment, tasks, config, chunk_size=1)
 
 
@@ -105,14 +97,13 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
     """Write ``results.csv`` with all rows, the seed and the seconds."""
-    text = io.StringIO()
-    names = [*(name for name, _ in COLUMNS), "seed", "seconds"]
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
+    names = [name for name, _ in COLUMNS]
     seconds = run.timings["seconds"].to_pylist()
-    for row, time in zip(run.results.to_pylist(), seconds, strict=True):
-        writer.writerow({**row, "seed": run.config["seed"], "seconds": time})
-    write_text(run.folder.path / "results.csv", text.getvalue())
+    rows = [
+        [*(row[name] for name in names), run.config["seed"], time]
+        for row, time in zip(run.results.to_pylist(), seconds, strict=True)
+    ]
+    write_text(run.folder.path / "results.csv", csv_text([[*names, "seed", "seconds"], *rows]))
 
 
 SPEC = Spec(

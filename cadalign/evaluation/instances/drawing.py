@@ -41,13 +41,6 @@ def draw_instance(
     ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
     one with the boxes, ``pictures`` it as it is, ``sketches`` the preview of its model's mesh. Each
     file appears whole or not at all.
-
-    Raises
-    ------
-    RenderError
-        If the instance has no mesh to draw.
-    DataError
-        If a file cannot be written.
     """
     stem = record_stem(category, model_id, view)
     if instance.scene is None:

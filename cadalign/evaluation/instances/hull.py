@@ -30,13 +30,7 @@ _SIGNS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 @dataclass(frozen=True, eq=False)
 class KeypointHull:
-    """The convex hull of a model's keypoints.
-
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        The keypoints [model units].
-    """
+    """The convex hull of a model's keypoints (k, 3) [model units]."""
 
     xyz: FloatArray
 
@@ -80,23 +74,8 @@ def sample_hull_view(
 ) -> tuple[Alignment, npt.NDArray[np.bool_]]:
     """Draw a view, as `cadalign.render.sample_view` does, in which enough keypoints count as seen.
 
-    Parameters
-    ----------
-    hull : KeypointHull
-    camera : Camera
-        Without lens distortion.
-    rng : numpy.random.Generator
-    min_visible : int
-
-    Returns
-    -------
-    cam_from_model : Alignment
-    visible : (k,) bool
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints; it says how many the best one showed.
+    Returns the pose and a mask (k,) of the visible keypoints; raises DegenerateError if no view
+    shows enough of them. The camera has no lens distortion.
     """
     count = len(hull.xyz)
     best = 0

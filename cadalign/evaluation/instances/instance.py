@@ -39,7 +39,6 @@ class Instance:
 
     Parameters
     ----------
-    camera : Camera
     cam_from_model : Alignment
         The pose of the model as the image shows it.
     points_3d : (n, 3) float
@@ -68,8 +67,8 @@ class Instance:
     bounds: FloatArray
     gt: Alignment
     visibility: str
-    scene: Scene | None = None
-    diagonal: float = 1.0
+    scene: Scene | None
+    diagonal: float
 
     @cached_property
     def gt_box(self) -> Box:
@@ -78,13 +77,7 @@ class Instance:
 
 
 def load_scene(model: AnnotatedModel) -> Scene:
-    """Read a model's mesh for `make_instance`.
-
-    Raises
-    ------
-    DataError
-        If the mesh is missing, damaged or flat.
-    """
+    """Read a model's mesh for `make_instance`."""
     from cadalign.datasets import check_solid
     from cadalign.render import Scene
 
@@ -96,50 +89,26 @@ def load_scene(model: AnnotatedModel) -> Scene:
 def make_instance(
     model: AnnotatedModel,
     *,
-    camera: Camera = KEYPOINT_CAMERA,
-    noise_px: float = 1.0,
-    min_visible: int = 6,
-    seed: int = 0,
-    view_index: int = 0,
-    scene: Scene | None = None,
+    noise_px: float,
+    min_visible: int,
+    seed: int,
+    view_index: int,
+    scene: Scene,
 ) -> Instance:
-    """Draw a view, a stretch and keypoint noise for an annotated model with a mesh.
+    """Draw a view, a stretch and keypoint noise [px] for an annotated model with a mesh.
 
-    Everything random follows from (seed, category, model id, view index).
-
-    Parameters
-    ----------
-    model : AnnotatedModel
-    camera : Camera
-    noise_px : float
-        Standard deviation of the Gaussian noise on each image coordinate [px].
-    min_visible : int
-        Least number of keypoints that a view must show.
-    seed, view_index : int
-    scene : Scene, optional
-        The model's, as `load_scene` gives it, where it has been loaded.
-
-    Returns
-    -------
-    Instance
-
-    Raises
-    ------
-    DataError
-        If the mesh is missing, damaged or flat.
-    RenderError
-        If no view shows enough keypoints.
+    Everything random follows from (seed, category, model id, view index). The scene is the
+    model's, as `load_scene` gives it.
     """
     from cadalign.render import sample_view
 
     rng = instance_rng(seed, model.category, model.model_id, str(view_index))
-    scene = scene or load_scene(model)
-    view = sample_view(scene, model.keypoints.xyz, camera, rng=rng, min_visible=min_visible)
+    xyz = model.keypoints.xyz
+    view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
     return _stretched(
-        model.keypoints.xyz,
+        xyz,
         model.keypoints.semantic_ids,
         view.visible,
-        camera=camera,
         cam_from_model=view.cam_from_model,
         bounds=scene.bounds,
         noise_px=noise_px,
@@ -154,30 +123,15 @@ def make_hull_instance(
     semantic_ids: IntArray,
     *,
     names: tuple[str, str],
-    noise_px: float = 1.0,
-    min_visible: int = 6,
-    seed: int = 0,
-    view_index: int = 0,
+    noise_px: float,
+    min_visible: int,
+    seed: int,
+    view_index: int,
 ) -> Instance:
-    """Draw a view, a stretch and keypoint noise for an annotated model without a mesh.
+    """Draw a view, a stretch and keypoint noise, as `make_instance`, for a model without a mesh.
 
     Which keypoints are seen, and the model's box, follow from the keypoints alone; see
-    `cadalign.evaluation.instances.hull`.
-
-    Parameters
-    ----------
-    hull : KeypointHull
-        The model's keypoints.
-    semantic_ids : (k,) int
-    names : tuple of 2 str
-        Category and model id.
-    noise_px, min_visible, seed, view_index
-        As for `make_instance`.
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints.
+    `cadalign.evaluation.instances.hull`. ``names`` are category and model id.
     """
     rng = instance_rng(seed, *names, str(view_index))
     pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
@@ -185,12 +139,12 @@ def make_hull_instance(
         hull.xyz,
         semantic_ids,
         visible,
-        camera=KEYPOINT_CAMERA,
         cam_from_model=pose,
         bounds=hull.bounds,
         noise_px=noise_px,
         rng=rng,
         visibility=HULL,
+        scene=None,
     )
 
 
@@ -199,20 +153,19 @@ def _stretched(
     semantic_ids: IntArray,
     visible: npt.NDArray[np.bool_],
     *,
-    camera: Camera,
     cam_from_model: Alignment,
     bounds: FloatArray,
     noise_px: float,
     rng: np.random.Generator,
     visibility: str,
-    scene: Scene | None = None,
+    scene: Scene | None,
 ) -> Instance:
     """The instance of a view, with a stretch and noise drawn for it."""
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
     seen = xyz[visible]
-    projected = camera.project(cam_from_model.apply(seen))
+    projected = KEYPOINT_CAMERA.project(cam_from_model.apply(seen))
     return Instance(
-        camera=camera,
+        camera=KEYPOINT_CAMERA,
         cam_from_model=cam_from_model,
         points_3d=seen * stretch,
         points_2d=projected + noise_px * rng.standard_normal(projected.shape),

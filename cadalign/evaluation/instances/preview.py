@@ -24,15 +24,10 @@ _CREASE_DEG = 30.0
 
 @dataclass(frozen=True, eq=False)
 class MeshPreview:
-    """A simplified model.
+    """A simplified model [model units].
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        [model units]
-    faces : (m, 3) int
-    edges : (k, 2) int
-        Pairs of vertices for a wireframe: parts too thin for triangles, creases and borders.
+    ``edges`` are pairs of vertices for a wireframe: parts too thin for triangles, creases and
+    borders.
     """
 
     vertices: FloatArray
@@ -59,15 +54,7 @@ class MeshPreview:
 def preview_of(
     mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
 ) -> MeshPreview:
-    """Simplify a mesh by merging the vertices in each cell of a grid.
-
-    The grid is fine enough to leave about as many triangles as may be; a mesh that has few is kept.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    max_faces, max_edges : int
-        Largest numbers of triangles and lines.
+    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
 
     Examples
     --------
@@ -88,13 +75,7 @@ def preview_of(
 
 
 def write_preview(path: Path, mesh: Mesh) -> None:
-    """Write a preview of a mesh as JSON.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    """
+    """Write a preview of a mesh as JSON."""
     write_text(path, dense_json(preview_of(mesh).to_dict()))
 
 

@@ -65,16 +65,7 @@ def pose_of(estimate: FitResult | Alignment) -> Alignment:
 def record_row(
     instance: Instance, outcomes: Sequence[Outcome], estimates: Sequence[Estimate]
 ) -> Row:
-    """The record of an instance as a table row.
-
-    Parameters
-    ----------
-    instance : Instance
-    outcomes : sequence of Outcome
-        One for each method.
-    estimates : sequence of FitResult, Alignment or CadalignError
-        Those that these are the outcomes of, in the same order.
-    """
+    """The record of an instance as a table row, from each method's outcome and its estimate."""
     camera = instance.camera
     record = {
         "camera": {

@@ -79,14 +79,6 @@ class SymmetryGroup:
         The best angle about an axis a follows in closed form: with N = G' R_gt' R_est the trace
         of Rot(a, angle)' N is A cos(angle) + B sin(angle) + a'N a, where A = tr N - a'N a and
         B = a . (N_32 - N_23, N_13 - N_31, N_21 - N_12).
-
-        Parameters
-        ----------
-        est, gt : Alignment
-
-        Returns
-        -------
-        Alignment
         """
         if self.is_trivial:
             return gt
@@ -113,15 +105,7 @@ class SymmetryGroup:
 
 
 def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
-    """Find the rotations that map a model onto itself; the module says by which rule.
-
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        The model's keypoints.
-    symmetries : Symmetries
-        The annotated ones.
-    """
+    """Find the rotations that map a model's keypoints (k, 3) onto itself, by the module's rule."""
     trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
         return trivial

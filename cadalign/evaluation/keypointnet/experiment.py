@@ -33,7 +33,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from functools import lru_cache
 
 import numpy as np
 
@@ -49,6 +49,7 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
 from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
@@ -58,9 +59,6 @@ from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.projection import perspective
-
-if TYPE_CHECKING:
-    from cadalign.render import Scene
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 _POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
@@ -78,30 +76,17 @@ COLUMNS: Columns = (
 class KeypointNetExperiment:
     """Evaluates methods on views of annotated models.
 
-    Parameters
-    ----------
-    methods : tuple of str
-        Names in `cadalign.evaluation.accuracy.methods.method_names`.
-    noise_px : float
-        Standard deviation of the keypoints' noise [px].
-    min_visible : int
-        Least number of keypoints that a view must show.
-    seed : int
-    drawn_in : RunFolder, optional
-        Where the first method's alignment of every instance with a mesh is drawn; its folders for
-        pictures must exist.
+    The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
+    if one is given; its folders for pictures must exist.
     """
 
-    columns: ClassVar[Columns] = COLUMNS
+    columns = COLUMNS
     # A method's share of the seconds that its chunk took.
-    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
-    record_columns: ClassVar[Columns] = RECORD_COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
+    record_columns = RECORD_COLUMNS
 
-    methods: tuple[str, ...]
-    noise_px: float = 1.0
-    min_visible: int = 6
-    seed: int = 0
-    drawn_in: RunFolder | None = None
+    options: KeypointNetOptions
+    drawn_in: RunFolder | None
 
     def warm_up(self) -> None:
         """Compile solvers and metrics."""
@@ -110,9 +95,10 @@ class KeypointNetExperiment:
             category="warm-up",
             model_id="",
             view=0,
-            xyz=rng.uniform(-0.3, 0.3, (12, 3)),
+            hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
             semantic_ids=np.arange(12),
             symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+            model=None,
         )
         self.evaluate([task])
 
@@ -120,15 +106,15 @@ class KeypointNetExperiment:
         """A row for every task and method, and a record for every instance."""
         instances: list[Instance | str] = []
         extra = []
-        maker = _InstanceMaker(self)
         for task in tasks:
             start = time.perf_counter()
             try:
-                instances.append(maker.instance(task))
+                instances.append(self._instance(task))
             except Exception as error:
                 instances.append(reason_of(error))
             extra.append(time.perf_counter() - start)
-        per_method = [self._evaluate_method(method, tasks, instances) for method in self.methods]
+        methods = self.options.methods
+        per_method = [self._evaluate_method(method, tasks, instances) for method in methods]
         outcomes, records = [], []
         for k, instance in enumerate(instances):
             answers = [answers[k] for answers in per_method]
@@ -141,7 +127,17 @@ class KeypointNetExperiment:
 
     def failure(self, task: KeypointTask, reason: str) -> Rows:
         """A failed row for every method."""
-        return Rows.of(_failure(task, method, reason) for method in self.methods)
+        return Rows.of(_failure(task, method, reason) for method in self.options.methods)
+
+    def _instance(self, task: KeypointTask) -> Instance:
+        if task.problem:
+            raise DataError(task.problem)
+        names = ("noise_px", "min_visible", "seed")
+        how = {name: getattr(self.options, name) for name in names} | {"view_index": task.view}
+        if task.model is not None:
+            return make_instance(task.model, scene=_scene_of(task.model), **how)
+        model = (task.category, task.model_id)
+        return make_hull_instance(task.hull, task.semantic_ids, names=model, **how)
 
     def _evaluate_method(
         self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | str]
@@ -178,11 +174,9 @@ class KeypointNetExperiment:
             [instance.points_3d for instance in instances],
             [instance.points_2d for instance in instances],
             [instance.camera for instance in instances],
-            **fit_options(method, sigma=self.noise_px or 1.0),
+            **fit_options(method, sigma=self.options.noise_px or 1.0),
         )
-        return [
-            batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))
-        ]
+        return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
 
     def _estimate(self, method: str, instance: Instance) -> Estimate:
         """The estimate of the bound, or of a method that tells more than an alignment."""
@@ -190,7 +184,7 @@ class KeypointNetExperiment:
         try:
             if method == LIMIT:
                 return limit_estimate(*given, instance.gt)
-            return fit(*given, **fit_options(method, sigma=self.noise_px or 1.0))
+            return fit(*given, **fit_options(method, sigma=self.options.noise_px or 1.0))
         except CadalignError as error:
             return error
 
@@ -200,7 +194,8 @@ class KeypointNetExperiment:
         if isinstance(estimate, CadalignError):
             return _failure(task, method, str(estimate), instance)
         alignment = pose_of(estimate)
-        if self.drawn_in is not None and instance.scene is not None and method == self.methods[0]:
+        is_first = method == self.options.methods[0]
+        if self.drawn_in is not None and instance.scene is not None and is_first:
             _draw(self.drawn_in, task, instance, alignment)
         metrics = _errors(alignment, instance, instance.gt, instance.gt_box)
         truth = task.symmetry.nearest_truth(est=alignment, gt=instance.gt)
@@ -218,37 +213,8 @@ class KeypointNetExperiment:
         )
 
 
-class _InstanceMaker:
-    """Makes the instances of a chunk; what views of one model share is made once."""
-
-    def __init__(self, experiment: KeypointNetExperiment) -> None:
-        self._options = {
-            name: getattr(experiment, name) for name in ("noise_px", "min_visible", "seed")
-        }
-        self._model: tuple[str, str] | None = None
-        self._hull = KeypointHull(np.empty((0, 3)))
-        self._scene: Scene | None = None
-
-    def instance(self, task: KeypointTask) -> Instance:
-        """The instance of a task.
-
-        Raises
-        ------
-        CadalignError
-            If there is none.
-        """
-        if task.problem:
-            raise DataError(task.problem)
-        names = task.category, task.model_id
-        if self._model != names:
-            self._model, self._scene = names, None
-            self._hull = KeypointHull(task.xyz)
-        if task.model is None:
-            return make_hull_instance(
-                self._hull, task.semantic_ids, names=names, view_index=task.view, **self._options
-            )
-        self._scene = self._scene or load_scene(task.model)
-        return make_instance(task.model, view_index=task.view, scene=self._scene, **self._options)
+# Views of one model come one after another.
+_scene_of = lru_cache(maxsize=1)(load_scene)
 
 
 def _errors(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -21,7 +21,7 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     Killed, it goes on where it was when the same command is started again.
     """
 
-    experiment: ClassVar[str] = "keypointnet"
+    experiment = "keypointnet"
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout."""

@@ -26,20 +26,9 @@ _CHUNK, _CHUNK_DRAWN = 64, 8
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models."""
     dataset = KeypointNet(options.root).subset(categories=options.categories, split=options.split)
-    tasks = KeypointTasks(
-        dataset,
-        views=options.views_per_model,
-        visibility=options.visibility,
-        max_models=options.max_models,
-    )
+    tasks = KeypointTasks(dataset, options)
     drawn = options.render == "overlay"
-    experiment = KeypointNetExperiment(
-        methods=options.methods,
-        noise_px=options.noise_px,
-        min_visible=options.min_visible,
-        seed=options.seed,
-        drawn_in=folder.made_for_pictures() if drawn else None,
-    )
+    experiment = KeypointNetExperiment(options, folder.made_for_pictures() if drawn else None)
     config = {
         **asdict(options),
         "experiment": options.experiment,
@@ -63,7 +52,7 @@ def describe(run: Run) -> str:
 def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
     """The paper's numbers on the same categories; all of them are about 1 px of noise."""
     if 1.0 not in {run.noise_px for run in runs}:
-        return Reference()
+        return Reference((), "")
     stated = tuple(line for line in paper_lines() if line.group in groups)
     return Reference(stated, f"{PERCENT_NOTE} Its models and views are others." if stated else "")
 

@@ -44,15 +44,7 @@ def summarize(run: Run) -> list[Summary]:
 
 
 def summarize_cells(category: str, cells: Cells) -> list[Summary]:
-    """A summary for every method, in the order in which they come.
-
-    Parameters
-    ----------
-    category : str
-        Name of these rows.
-    cells : dict of array
-        Columns of a result table.
-    """
+    """A summary of rows for every method, in the order in which they come."""
     methods = list(dict.fromkeys(cells["method"].tolist()))
     bound = np.nan
     if LIMIT in methods:

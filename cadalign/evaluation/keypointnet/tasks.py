@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import IntArray
 from cadalign.errors import CadalignError, DataError
+from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import RAYS
 from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.runs.tables import Row
 
 if TYPE_CHECKING:
@@ -29,12 +31,8 @@ class KeypointTask:
 
     Parameters
     ----------
-    category, model_id : str
-    view : int
-    xyz : (k, 3) float
-        Keypoints.
-    semantic_ids : (k,) int
-    symmetry : SymmetryGroup
+    hull : KeypointHull
+        Keypoints (k, 3), and what views without a mesh need to know of them.
     model : AnnotatedModel, optional
         The model with its mesh; None where it is evaluated on its keypoints alone.
     problem : str
@@ -44,10 +42,10 @@ class KeypointTask:
     category: str
     model_id: str
     view: int
-    xyz: FloatArray
+    hull: KeypointHull
     semantic_ids: IntArray
     symmetry: SymmetryGroup
-    model: AnnotatedModel | None = None
+    model: AnnotatedModel | None
     problem: str = ""
 
     def names(self, method: str) -> Row:
@@ -57,16 +55,17 @@ class KeypointTask:
 
     @classmethod
     def of_model(
-        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str = AUTO
+        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
     ) -> KeypointTask:
         """The first view of a dataset's model; a malformed one gives a task with a problem."""
         blank = cls(
             category=category,
             model_id=model_id,
             view=0,
-            xyz=np.empty((0, 3)),
+            hull=KeypointHull(np.empty((0, 3))),
             semantic_ids=np.empty(0, dtype=np.int64),
             symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+            model=None,
         )
         try:
             model = dataset[category, model_id]
@@ -74,7 +73,7 @@ class KeypointTask:
             return replace(blank, problem=str(error))
         return replace(
             blank,
-            xyz=model.keypoints.xyz,
+            hull=KeypointHull(model.keypoints.xyz),
             semantic_ids=model.keypoints.semantic_ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
             model=_with_mesh(model, visibility),
@@ -82,38 +81,15 @@ class KeypointTask:
 
 
 class KeypointTasks(Sequence[KeypointTask]):
-    """All views of all models of a dataset in the order of their names, made when asked for.
+    """All views of all models of a dataset in the order of their names, made when asked for."""
 
-    Parameters
-    ----------
-    dataset : KeypointNet
-    views : int
-        Number of views of each model.
-    visibility : {"auto", "rays", "hull"}
-    max_models : int, optional
-        Largest number of models of each category.
-
-    Raises
-    ------
-    DataError
-        If there are no models.
-    """
-
-    def __init__(
-        self,
-        dataset: KeypointNet,
-        *,
-        views: int,
-        visibility: str = AUTO,
-        max_models: int | None = None,
-    ) -> None:
-        self._dataset = dataset
-        self._views = views
-        self._visibility = visibility
+    def __init__(self, dataset: KeypointNet, options: KeypointNetOptions) -> None:
+        self._dataset, self._visibility = dataset, options.visibility
+        self._views = options.views_per_model
         self._keys = [
             key
             for category in dataset.categories
-            for key in sorted(dataset.ids(category))[:max_models]
+            for key in sorted(dataset.ids(category))[: options.max_models]
         ]
         if not self._keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))

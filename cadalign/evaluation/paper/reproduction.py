@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +20,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.spec import SPEC as SIMULATION
-from cadalign.evaluation.summary import ALL, Summary
+from cadalign.evaluation.summary import ALL, Summary, csv_text
 from cadalign.io.files import write_text, writing
 
 _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -46,18 +44,9 @@ Announce = Callable[[str], Callable[[Progress], object]]
 
 
 def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
-    """Run everything, or what is left of it, and write the report.
+    """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
 
-    Parameters
-    ----------
-    plan : PaperPlan
-    announce : callable
-        Told the name of the next run; returns the function to tell its progress to.
-
-    Returns
-    -------
-    Path
-        ``report.md``, beside ``figures`` and ``table1.csv``.
+    ``announce`` is told the name of the next run, and gives the function to tell its progress to.
     """
     figures = plan.out / "figures"
     with writing(figures):
@@ -144,9 +133,7 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
             f"### {_DATASETS[name]}\n\n{_markdown(table)}\n\n"
             f"![rotation errors](figures/{name}_categories_rotation_error_deg.png)\n"
         )
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([["dataset", *_HEAD], *rows])
-    write_text(plan.out / "table1.csv", text.getvalue())
+    write_text(plan.out / "table1.csv", csv_text([["dataset", *_HEAD], *rows]))
     body = "\n".join(sections)
     return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
 

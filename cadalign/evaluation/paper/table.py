@@ -11,17 +11,10 @@ STATED = "AEPnP, stated in the paper"
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of the paper's Table 1, as printed.
+    """A row of the paper's Table 1, as printed: medians [degrees, model units], mean keypoints.
 
-    Parameters
-    ----------
-    rotation_error_deg, translation_error : float
-        Medians [degrees, model units].
-    scale_y_error, scale_z_error : float
-        As the paper's two last columns print them under "%". By the numbers in its own source
-        these are fractions: 0.008 means 0.8 %.
-    keypoints : float
-        Mean number of keypoints.
+    The paper prints the scale errors under "%". By the numbers in its own source they are
+    fractions: 0.008 means 0.8 %.
     """
 
     rotation_error_deg: float

@@ -33,7 +33,8 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar
+from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -79,17 +80,10 @@ COLUMNS: Columns = (
 
 @dataclass(frozen=True)
 class RetrievalExperiment:
-    """Evaluates retrieval from a saved library.
+    """Evaluates retrieval from a library's file, which all workers map into memory."""
 
-    Parameters
-    ----------
-    library : str
-        The library's file, which all workers map into memory.
-    options : RetrievalRunOptions
-    """
-
-    columns: ClassVar[Columns] = COLUMNS
-    timing_columns: ClassVar[Columns] = (*_NAMES, ("seconds", float))
+    columns = COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
 
     library: str
     options: RetrievalRunOptions
@@ -115,9 +109,8 @@ class RetrievalExperiment:
 
     def _without_match(self, task: RetrievalTask, status: str, reason: str) -> list[Outcome]:
         return [
-            Outcome(task.names(protocol, method), dict(_NO_MATCH), status, reason)
-            for protocol in self.options.protocols
-            for method in self.options.methods
+            Outcome(task.names(*names), dict(_NO_MATCH), status, reason)
+            for names in product(self.options.protocols, self.options.methods)
         ]
 
     def _outcomes(self, task: RetrievalTask) -> list[Outcome]:
@@ -127,9 +120,8 @@ class RetrievalExperiment:
         except DegenerateError as error:
             return self._without_match(task, NO_VIEW, str(error))
         return [
-            self._outcome(task, query, gt, protocol, method)
-            for protocol in self.options.protocols
-            for method in self.options.methods
+            self._outcome(task, query, gt, *names)
+            for names in product(self.options.protocols, self.options.methods)
         ]
 
     def _outcome(
@@ -147,7 +139,7 @@ class RetrievalExperiment:
             matches = library.retrieve(
                 query.points_2d,
                 query.semantic_ids,
-                query.camera,
+                KEYPOINT_CAMERA,
                 top=TOP,
                 category=None if self.options.whole_library else task.category,
                 sigma=max(task.noise_px, _LEAST_SIGMA),
@@ -181,17 +173,8 @@ def match_values(
 ) -> Row:
     """Compare matches with the truth; metrics by column.
 
-    Parameters
-    ----------
-    matches : sequence of Match
-    best : LibraryModel
-        The model of the first match.
-    gt : LibraryModel
-        The true model.
-    placed : Alignment
-        Its pose and stretch.
-    alike : collection of (category, model id)
-        The models that count as the true one.
+    ``best`` is the model of the first match, ``gt`` the true model, ``placed`` its pose and
+    stretch; ``alike`` are the models that count as the true one.
     """
     first = matches[0]
     ranks = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import tyro
 
@@ -31,7 +31,7 @@ class RetrievalRunOptions(ModelOptions):
     where it was when the same command is started again.
     """
 
-    experiment: ClassVar[str] = "retrieval"
+    experiment = "retrieval"
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout, or a library's file."""

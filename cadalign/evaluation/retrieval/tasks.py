@@ -14,7 +14,6 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANG
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
@@ -37,13 +36,7 @@ class RetrievalTask:
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
-    """Every model with every noise and number of keypoints that it has, those of a model together.
-
-    Raises
-    ------
-    InputError
-        If a category is unknown, or no model has so many keypoints.
-    """
+    """Every model with every noise and number of keypoints that it has, model by model."""
     from cadalign.datasets.models.categories import require_category
 
     names = library.categories
@@ -69,21 +62,10 @@ def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[Retr
 
 @dataclass(frozen=True, eq=False)
 class RetrievalQuery:
-    """View of a stretched model: a query to a library.
-
-    Parameters
-    ----------
-    points_2d : (n, 2) float
-        Noisy keypoints [px].
-    semantic_ids : (n,) int
-    camera : Camera
-    gt : Alignment
-        The model's true pose and stretch.
-    """
+    """View of a stretched model: noisy keypoints [px], and its true pose and stretch."""
 
     points_2d: FloatArray
     semantic_ids: IntArray
-    camera: Camera
     gt: Alignment
 
 
@@ -92,11 +74,6 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
 
     Everything random follows from the seed and the task. Visibility follows from the
     keypoints alone; see `cadalign.evaluation.instances.hull`.
-
-    Raises
-    ------
-    DegenerateError
-        If no view shows enough keypoints.
     """
     rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
@@ -107,6 +84,5 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     return RetrievalQuery(
         points_2d=pixels + task.noise_px * rng.standard_normal(pixels.shape),
         semantic_ids=model.semantic_ids[chosen],
-        camera=KEYPOINT_CAMERA,
         gt=Alignment(pose.rotation, pose.translation, stretch),
     )

@@ -16,22 +16,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class DaskWorkers:
-    """The workers of a Dask cluster.
+    """The workers of a Dask cluster, whose scheduler has an address such as ``tcp://10.0.0.1:8786``.
 
     They need the same version of cadalign, and for meshes and overlays the same folders under the
     same names. Dask itself hands a chunk whose worker dies to others, until the cluster's
     ``distributed.scheduler.allowed-failures`` is exceeded.
-
-    Parameters
-    ----------
-    address : str
-        The scheduler's, such as ``tcp://10.0.0.1:8786``.
-    timeout : float
-        Longest wait for the scheduler, and for its first worker [s].
     """
 
     address: str
-    timeout: float = 30.0
+    timeout: float = 30.0  # of the scheduler, and of its first worker [s]
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]

@@ -46,12 +46,7 @@ class _Inside:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run's folder.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """A run's folder."""
 
     path: Path
 
@@ -74,26 +69,13 @@ class RunFolder:
         """True once all results are there."""
         return self.results.is_file()
 
-    def part(self, index: int) -> Path:
-        """The results of a chunk."""
-        return self.parts / f"{index:07d}.parquet"
-
-    def part_timings(self, index: int) -> Path:
-        """The timings of a chunk."""
-        return self.parts / f"{index:07d}.timings.parquet"
-
-    def part_records(self, index: int) -> Path:
-        """The instance records of a chunk."""
-        return self.parts / f"{index:07d}.exhibits.parquet"
+    def part(self, table: Path, index: int) -> Path:
+        """A chunk's rows of the results, timings or records."""
+        kind = "" if table == self.results else f".{table.stem}"
+        return self.parts / f"{index:07d}{kind}.parquet"
 
     def make(self) -> None:
-        """Make the folder.
-
-        Raises
-        ------
-        DataError
-            If that is not possible.
-        """
+        """Make the folder."""
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
 
@@ -113,13 +95,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes out; a killed process holds no lock.
-
-        Raises
-        ------
-        DataError
-            If one is at work here.
-        """
+        """Keep other processes out; a killed process holds no lock."""
         with writing(self.path), (self.path / ".lock").open("a") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -132,13 +108,7 @@ class RunFolder:
             yield
 
     def read_config(self) -> dict[str, Any] | None:
-        """Read ``run.json``; None where there is none.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read.
-        """
+        """Read ``run.json``; None where there is none."""
         try:
             found = json.loads(self.config_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -152,13 +122,7 @@ class RunFolder:
         return found
 
     def claim(self, config: dict[str, Any]) -> None:
-        """Write ``run.json``, or see that the one that is there says the same.
-
-        Raises
-        ------
-        DataError
-            If it says something else, or the folder holds something else.
-        """
+        """Write ``run.json``, or see that the one that is there says the same."""
         wanted = json.loads(json.dumps({**config, **_versions()}))
         found = self.read_config()
         if found is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -26,21 +26,10 @@ _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run with its tables.
+    """A run with its tables: the rows that there are, of so many tasks that are done.
 
-    Parameters
-    ----------
-    folder : RunFolder
-    name : str
-        Its name beside others.
-    config : dict
-        Content of ``run.json``.
-    results : pyarrow.Table
-        The rows that there are.
-    timings : pyarrow.Table
-        The seconds of the same rows; empty where they were not kept.
-    done, total : int
-        Tasks.
+    ``name`` is its name beside others, ``config`` the content of ``run.json``; ``timings`` is empty
+    where times were not kept.
     """
 
     folder: RunFolder
@@ -53,13 +42,7 @@ class Run:
 
     @classmethod
     def open(cls, path: Path, *, name: str | None = None) -> Run:
-        """Read a run.
-
-        Raises
-        ------
-        DataError
-            If the folder is not a run's, or nothing of the run is finished.
-        """
+        """Read a run."""
         folder = RunFolder(path)
         if not path.is_dir():
             raise DataError("no such folder", where=str(path), fix=_FIX)
@@ -74,7 +57,7 @@ class Run:
             timings = [folder.timings] if folder.timings.is_file() else []
             results = read_table(folder.results)
             return cls(folder, name, config, results, _joined(timings), total, total)
-        parts = _parts(folder, folder.part)
+        parts = _parts(folder, folder.results)
         if not parts:
             raise DataError(
                 "nothing of the run is finished yet",
@@ -82,9 +65,9 @@ class Run:
                 fix="wait, or start the command that made it again: it goes on",
             )
         size = int(config.get("chunk_size", 1))
-        done = sum(min(size, total - index * size) for index, _ in parts)
-        timings = [folder.part_timings(index) for index, _ in parts]
-        results = _joined([path for _, path in parts])
+        done = sum(min(size, total - index * size) for index in parts)
+        timings = [folder.part(folder.timings, index) for index in parts]
+        results = _joined([folder.part(folder.results, index) for index in parts])
         return cls(folder, name, config, results, _joined(timings), done, total)
 
     @property
@@ -155,17 +138,17 @@ class Run:
         return count
 
     def _record_files(self) -> list[Path]:
-        whole = self.folder.records
+        folder, whole = self.folder, self.folder.records
         if self.is_finished:
             return [whole] if whole.is_file() else []
-        return [path for _, path in _parts(self.folder, self.folder.part_records)]
+        return [folder.part(whole, index) for index in _parts(folder, whole)]
 
 
-def _parts(folder: RunFolder, file_of: Callable[[int], Path]) -> list[tuple[int, Path]]:
-    """The finished chunks with the files of one of their tables, in order."""
+def _parts(folder: RunFolder, table: Path) -> list[int]:
+    """The finished chunks that have a part of a table, in order."""
     names = (path.name.removesuffix(".parquet") for path in folder.parts.glob("*.parquet"))
     indices = sorted(int(name) for name in names if name.isdecimal())
-    return [(index, file_of(index)) for index in indices if file_of(index).is_file()]
+    return [index for index in indices if folder.part(table, index).is_file()]
 
 
 def _joined(paths: Sequence[Path]) -> pa.Table:

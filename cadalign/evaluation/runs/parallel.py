@@ -36,14 +36,7 @@ KILLED_REASON = f"it killed its worker process {_STRIKES} times (a crash, or out
 
 @dataclass(frozen=True)
 class Chunk(Generic[T]):
-    """Successive tasks of a run.
-
-    Parameters
-    ----------
-    index : int
-        Which chunk of the run.
-    tasks : sequence
-    """
+    """Successive tasks of a run, which has many."""
 
     index: int
     tasks: Sequence[T]
@@ -71,15 +64,9 @@ class InProcess:
 
 @dataclass(frozen=True)
 class LocalProcesses:
-    """Worker processes on this machine, joblib's.
+    """So many worker processes on this machine, joblib's; -1 for one for each core."""
 
-    Parameters
-    ----------
-    count : int
-        Number of them; -1 for one for each core.
-    """
-
-    count: int = -1
+    count: int
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
@@ -89,7 +76,6 @@ class LocalProcesses:
         from joblib.externals.loky import get_reusable_executor
 
         count = cpu_count() if self.count < 0 else self.count
-
         used: list[Executor] = []
 
         def executor() -> Executor:
@@ -132,29 +118,10 @@ def evaluate_on(
     window: int,
     deadly: tuple[type[BaseException], ...],
 ) -> Iterator[tuple[Chunk[T], Rows]]:
-    """Evaluate chunks on an executor.
+    """Evaluate chunks on an executor, ``window`` at a time.
 
-    Parameters
-    ----------
-    executor : callable
-        Gives an executor that works; asked again after every death.
-    experiment : Experiment
-    chunks : iterable of Chunk
-        Asked for only as fast as they are evaluated.
-    window : int
-        Number of chunks under way at a time.
-    deadly : tuple of exception types
-        Raised by a future whose worker has died.
-
-    Yields
-    ------
-    chunk : Chunk
-    rows : Rows
-
-    Raises
-    ------
-    CadalignError
-        If workers cannot start at all, or the run cannot go on.
+    ``executor`` gives one that works, and is asked again after every death; ``deadly`` is raised by
+    a future whose worker has died. Chunks are asked for only as fast as they are evaluated.
     """
     _check_life(executor, experiment, deadly)
     source = iter(chunks)
@@ -186,11 +153,7 @@ def evaluate_on(
                 except CadalignError:
                     raise
                 except Exception as error:
-                    raise CadalignError(
-                        f"a worker cannot work: {reason_of(error)}",
-                        where="workers",
-                        fix="cadalign must be installed there, in the same version as here",
-                    ) from error
+                    raise _cannot_work(reason_of(error)) from error
             if suspects and not running:
                 for chunk in suspects:
                     yield chunk, _alone(executor, experiment, chunk.tasks, deadly)
@@ -236,23 +199,21 @@ def _check_life(
                     fix="is there enough memory? Try fewer workers, or none (0) to see the error",
                 ) from None
         except ImportError as error:
-            raise CadalignError(
-                f"a worker cannot work: {error}",
-                where="workers",
-                fix="cadalign must be installed there, in the same version as here",
-            ) from error
+            raise _cannot_work(str(error)) from error
         else:
             return
 
 
-def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
-    """Evaluate tasks; one that raises becomes failed rows and does not stop the others.
+def _cannot_work(reason: str) -> CadalignError:
+    return CadalignError(
+        f"a worker cannot work: {reason}",
+        where="workers",
+        fix="cadalign must be installed there, in the same version as here",
+    )
 
-    Raises
-    ------
-    AbortError
-        If the run cannot go on.
-    """
+
+def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
+    """Evaluate tasks; one that raises becomes failed rows and does not stop the others."""
     try:
         return experiment.evaluate(tasks)
     except AbortError as error:

@@ -24,7 +24,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, InProcess, LocalProcesses, Workers
 from cadalign.evaluation.runs.tables import Columns, read_table, write_rows, write_tables
-from cadalign.evaluation.runs.work import Experiment, Plan, Recording
+from cadalign.evaluation.runs.work import Experiment, Plan
 from cadalign.io.files import write_json, writing
 
 T = TypeVar("T")
@@ -47,54 +47,24 @@ def execute(
     plan: Plan[T],
     folder: RunFolder,
     *,
-    workers: Workers | None = None,
+    workers: Workers,
     on_progress: OnProgress = lambda progress: None,
 ) -> None:
-    """Do a run, or what is left of it.
-
-    Parameters
-    ----------
-    plan : Plan
-    folder : RunFolder
-    workers : Workers, optional
-        By default a process for each core.
-    on_progress : callable
-        Told of every chunk.
-
-    Raises
-    ------
-    DataError
-        If the folder holds another run, another process works on it, or it cannot be written.
-    CadalignError
-        If workers cannot work.
-    """
+    """Do a run, or what is left of it; ``on_progress`` is told of every chunk."""
     folder.make()
     total = len(plan.tasks)
     with folder.locked():
         folder.claim({**plan.config, "tasks": total, "chunk_size": plan.chunk_size})
         _sweep(folder.path)
         if not folder.is_finished:
-            _do_chunks(plan, folder, workers or LocalProcesses(), on_progress)
+            _do_chunks(plan, folder, workers, on_progress)
             _assemble(plan.experiment, folder, -(-total // plan.chunk_size))
         on_progress(Progress(total, total))
         shutil.rmtree(folder.parts, ignore_errors=True)
 
 
-def workers_of(count: int, *, dask: str | None = None) -> Workers:
-    """Choose workers by the command line's options.
-
-    Parameters
-    ----------
-    count : int
-        Processes; -1 for one for each core, 0 for none: all in this process.
-    dask : str, optional
-        Address of a Dask scheduler, whose workers are used instead.
-
-    Raises
-    ------
-    InputError
-        If the number is less than -1.
-    """
+def workers_of(count: int, dask: str | None) -> Workers:
+    """Choose workers by options; see `cadalign.evaluation.options.RunOptions`."""
     if dask is not None:
         from cadalign.evaluation.runs.cluster import DaskWorkers
 
@@ -115,20 +85,18 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
         _sweep(folder.parts)
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     starts = range(0, len(tasks), size)
-    missing = [index for index in range(len(starts)) if not folder.part(index).is_file()]
+    missing = [k for k in range(len(starts)) if not folder.part(folder.results, k).is_file()]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
-    progress_file = _ProgressFile(folder, len(tasks), done)
+    progress_file = _ProgressFile(folder.progress, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
     if not missing:
         return
     chunks = (Chunk(index, tasks[starts[index] : starts[index] + size]) for index in missing)
-    recorded = _record_columns(experiment)
     for chunk, found in workers.evaluate(experiment, chunks):
-        # The results last: they say that the chunk is done.
-        write_rows(folder.part_timings(chunk.index), experiment.timing_columns, found.timings)
-        if recorded:
-            write_rows(folder.part_records(chunk.index), recorded, found.records)
-        write_rows(folder.part(chunk.index), experiment.columns, found.rows)
+        rows = {folder.timings: found.timings, folder.records: found.records}
+        for table, columns in _tables(experiment, folder).items():
+            part = folder.part(table, chunk.index)
+            write_rows(part, columns, rows.get(table, found.rows))
         done += len(chunk.tasks)
         progress_file.note(done)
         on_progress(Progress(done, len(tasks)))
@@ -137,32 +105,26 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
 
 def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:
     """Make one table of the chunks' tables."""
-
-    def assemble(path: Path, columns: Columns, part: Callable[[int], Path]) -> None:
-        write_tables(path, columns, (read_table(part(index)) for index in range(chunks)))
-
-    assemble(folder.timings, experiment.timing_columns, folder.part_timings)
-    recorded = _record_columns(experiment)
-    if recorded:
-        assemble(folder.records, recorded, folder.part_records)
-    # The results last: they say that the run is finished.
-    assemble(folder.results, experiment.columns, folder.part)
+    for table, columns in _tables(experiment, folder).items():
+        parts = (folder.part(table, index) for index in range(chunks))
+        write_tables(table, columns, map(read_table, parts))
 
 
-def _record_columns(experiment: Experiment[Any]) -> Columns:
-    """The columns of an experiment's instance records; none if it keeps none."""
-    return experiment.record_columns if isinstance(experiment, Recording) else ()
+def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Columns]:
+    """The columns of a run's tables by file."""
+    tables = {folder.timings: experiment.timing_columns}
+    if hasattr(experiment, "record_columns"):
+        tables[folder.records] = experiment.record_columns
+    # The results last: they say that a chunk, or the run, is done.
+    return {**tables, folder.results: experiment.columns}
 
 
 class _ProgressFile:
     """Keeps ``progress.json``."""
 
-    def __init__(self, folder: RunFolder, total: int, done: int) -> None:
-        self._file = folder.progress
-        self._total = total
-        self._done_before = done
-        self._start = time.time()
-        self._written = 0.0
+    def __init__(self, file: Path, total: int, done: int) -> None:
+        self._file, self._total, self._done_before = file, total, done
+        self._start, self._written = time.time(), 0.0
 
     def note(self, done: int, *, last: bool = False) -> None:
         """Write the progress, if it was not written just now."""

@@ -19,12 +19,7 @@ Columns = tuple[tuple[str, type], ...]
 
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 16
-_TYPES: dict[type, pa.DataType] = {
-    str: pa.string(),
-    int: pa.int64(),
-    float: pa.float64(),
-    bool: pa.bool_(),
-}
+_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
 def schema_of(columns: Columns) -> pa.Schema:
@@ -33,25 +28,13 @@ def schema_of(columns: Columns) -> pa.Schema:
 
 
 def write_rows(path: Path, columns: Columns, rows: Sequence[Row]) -> None:
-    """Write rows as a Parquet file, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
+    """Write rows as a Parquet file, whole or not at all."""
     table = pa.Table.from_pylist(list(rows), schema=schema_of(columns))
     write_tables(path, columns, [table])
 
 
 def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> None:
-    """Write one Parquet file of successive tables, holding few of them in memory at a time.
-
-    Raises
-    ------
-    DataError
-        If it cannot be written.
-    """
+    """Write one Parquet file of successive tables, holding few of them in memory at a time."""
 
     def write(unfinished: Path) -> None:
         with pq.ParquetWriter(unfinished, schema_of(columns), compression="zstd") as writer:
@@ -61,17 +44,11 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
     write_whole(path, write)
 
 
-def read_table(path: Path, *, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a Parquet file.
-
-    Raises
-    ------
-    DataError
-        If it is missing or damaged.
-    """
+def read_table(path: Path) -> pa.Table:
+    """Read a Parquet file."""
     try:
         # Threads would gain nothing here and cost memory for each.
-        return pq.read_table(path, columns=columns, use_threads=False)
+        return pq.read_table(path, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
             f"not a table that can be read ({error})",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar
 
 from cadalign.errors import DataError
 from cadalign.evaluation.outcome import Outcome
@@ -22,16 +22,10 @@ T_contra = TypeVar("T_contra", contravariant=True)
 
 @dataclass(frozen=True)
 class Rows:
-    """Table rows of some tasks.
+    """Table rows of some tasks: results, and what differs from run to run.
 
-    Parameters
-    ----------
-    rows : list of dict
-        Of the result table; the same in every run.
-    timings : list of dict
-        Of the table of what differs from run to run.
-    records : list of dict
-        Of the table of instance records, for experiments that are `Recording`.
+    ``records`` are instance records, of experiments that have ``record_columns`` besides what
+    `Experiment` asks for.
     """
 
     rows: list[Row]
@@ -75,22 +69,12 @@ class Experiment(Protocol[T_contra]):
         """The rows of a task that could not be evaluated."""
 
 
-@runtime_checkable
-class Recording(Protocol):
-    """An experiment that also records its instances, the same in every run."""
-
-    @property
-    def record_columns(self) -> Columns:
-        """The columns of the table of instance records."""
-
-
 @dataclass(frozen=True)
 class Plan(Generic[T]):
     """All that a run needs to be done.
 
     Parameters
     ----------
-    experiment : Experiment
     tasks : sequence
         In the order of the result table. Sliced, and only as far as chunks are handed out.
     config : dict
@@ -103,7 +87,7 @@ class Plan(Generic[T]):
     experiment: Experiment[T]
     tasks: Sequence[T]
     config: dict[str, Any]
-    chunk_size: int = 64
+    chunk_size: int
 
 
 class AbortError(DataError):

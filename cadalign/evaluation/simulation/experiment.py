@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, ClassVar
 
 import numpy as np
 
@@ -38,61 +37,27 @@ COLUMNS: Columns = (
 
 @dataclass(frozen=True)
 class SweepTask:
-    """One random problem.
-
-    Parameters
-    ----------
-    value : float
-        Value of the quantity that is varied.
-    run : int
-    """
+    """One random problem; ``value`` is that of the quantity that is varied."""
 
     value: float
     run: int
 
 
-class SweepTasks(Sequence[SweepTask]):
-    """All problems of a sweep, value by value, made when asked for.
-
-    Parameters
-    ----------
-    values : sequence of float
-    runs : int
-        Problems for each value.
-    """
-
-    def __init__(self, values: Sequence[float], runs: int) -> None:
-        self._values = tuple(values)
-        self._runs = runs
-
-    def __len__(self) -> int:
-        return len(self._values) * self._runs
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        place, run = divmod(range(len(self))[index], self._runs)
-        return SweepTask(self._values[place], run)
+def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
+    """All problems of a sweep, value by value."""
+    return [SweepTask(value, run) for value in kind.values for run in range(kind.runs)]
 
 
 @dataclass(frozen=True)
 class SweepExperiment:
-    """Evaluates methods on random problems.
+    """Evaluates methods on random problems."""
 
-    Parameters
-    ----------
-    kind : SweepKind
-    seed : int
-    """
-
-    columns: ClassVar[Columns] = COLUMNS
+    columns = COLUMNS
     # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
-    timing_columns: ClassVar[Columns] = (
-        *(("points", int), ("run", int), ("method", str), ("seconds", float)),
-    )
+    timing_columns = (*(("points", int), ("run", int), ("method", str), ("seconds", float)),)
 
     kind: SweepKind
-    seed: int = 0
+    seed: int
 
     def warm_up(self) -> None:
         """Compile the solvers."""
@@ -114,14 +79,8 @@ class SweepExperiment:
 
     def problem(self, task: SweepTask) -> Problem:
         """The problem of a task."""
-        setting = self._setting(task)
         rng = instance_rng(self.seed, self.kind.name, repr(float(task.value)), str(task.run))
-        return simulate_problem(
-            rng,
-            points=setting["points"],
-            noise_px=setting["noise_px"],
-            outlier_share=setting["outlier_share"],
-        )
+        return simulate_problem(rng, **self._setting(task))
 
     def _evaluate_same(self, tasks: Sequence[SweepTask]) -> list[Outcome]:
         """Outcomes of tasks of one value: methods are told the standard deviation of the noise."""
@@ -132,11 +91,9 @@ class SweepExperiment:
 
     def _setting(self, task: SweepTask) -> Row:
         """Points, noise and outliers of a task."""
-        kind = self.kind
-        held = {"points": kind.points, "noise_px": kind.noise_px}
-        setting = {**held, "outlier_share": kind.outlier_share, kind.column: task.value}
-        setting["points"] = int(setting["points"])
-        return setting
+        held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
+        setting = {**held, self.kind.column: task.value}
+        return {**setting, "points": int(setting["points"])}
 
     def _run(
         self, method: str, tasks: Sequence[SweepTask], problems: Sequence[Problem], sigma: float
@@ -149,24 +106,15 @@ class SweepExperiment:
             estimates = _estimates(method, problems, sigma)
             share = (time.perf_counter() - start) / len(problems)
             timed = [(estimate, share) for estimate in estimates]
-        return [
-            self._outcome(task, method, problem, est, seconds)
-            for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True)
-        ]
-
-    def _outcome(
-        self,
-        task: SweepTask,
-        method: str,
-        problem: Problem,
-        est: Alignment | CadalignError,
-        seconds: float | None,
-    ) -> Outcome:
-        names = self._names(task, method)
-        if isinstance(est, CadalignError):
-            return replace(Outcome.failure(str(est), names), seconds=seconds)
-        errors = alignment_errors(est=est, gt=problem.alignment)
-        return Outcome(names, errors, seconds=seconds)
+        outcomes = []
+        for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True):
+            names = self._names(task, method)
+            if isinstance(est, CadalignError):
+                outcome = Outcome.failure(str(est), names)
+            else:
+                outcome = Outcome(names, alignment_errors(est=est, gt=problem.alignment))
+            outcomes.append(replace(outcome, seconds=seconds))
+        return outcomes
 
     def _names(self, task: SweepTask, method: str) -> Row:
         return {**self._setting(task), "run": task.run, "method": method}
@@ -184,7 +132,7 @@ def _estimates(
         problems[0].camera,
         **fit_options(method, sigma=sigma),
     )
-    return [batch.errors[b] if b in batch.errors else batch.alignment(b) for b in range(len(batch))]
+    return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
 
 
 def _timed(

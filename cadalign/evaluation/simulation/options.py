@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import tyro
 
@@ -15,32 +15,16 @@ from cadalign.evaluation.options import ExperimentOptions
 
 @dataclass(frozen=True)
 class SweepKind:
-    """The quantity that is varied, and those that are held.
-
-    Parameters
-    ----------
-    name : str
-    column : str
-        The column of the result table that is varied.
-    values : tuple of float
-        Its values.
-    points : int
-    noise_px : float
-        [px]
-    outlier_share : float
-    methods : tuple of str
-    runs : int
-        Problems for each value.
-    """
+    """The quantity that is varied, a column of the result table, and those that are held."""
 
     name: str
     column: str
     values: tuple[float, ...]
-    points: int = 1024
-    noise_px: float = 2.0
-    outlier_share: float = 0.0
-    methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
-    runs: int = 2000
+    points: int
+    noise_px: float
+    outlier_share: float
+    methods: tuple[str, ...]
+    runs: int
 
     @property
     def is_timed(self) -> bool:
@@ -48,36 +32,47 @@ class SweepKind:
         return self.name == "runtime"
 
 
-SWEEPS = {
-    kind.name: kind
-    for kind in (
-        SweepKind("noise", "noise_px", (0.5, *(float(noise) for noise in range(1, 11)))),
-        SweepKind("points", "points", (6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024)),
-        SweepKind(
-            "outliers",
-            "outlier_share",
-            tuple(round(0.1 * tenth, 1) for tenth in range(8)),
-            points=100,
-            methods=("ransac-optimal", "ransac-aepnp", "optimal-cauchy", "optimal", "limit"),
-            runs=500,
-        ),
-        SweepKind(
-            "runtime",
-            "points",
-            (6, 10, 20, 50, 100, 200, 500, 1024, 2048),
-            methods=("optimal", "aepnp", "aepnp-paper", "epnp"),
-            runs=100,
-        ),
-    )
-}
+_NOISE = SweepKind(
+    name="noise",
+    column="noise_px",
+    values=(0.5, *(float(noise) for noise in range(1, 11))),
+    points=1024,
+    noise_px=2.0,
+    outlier_share=0.0,
+    methods=("optimal", "aepnp", "aepnp-paper", "epnp", "limit"),
+    runs=2000,
+)
+_POINTS = replace(
+    _NOISE,
+    name="points",
+    column="points",
+    values=(6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024),
+)
+_OUTLIERS = replace(
+    _NOISE,
+    name="outliers",
+    column="outlier_share",
+    values=tuple(round(0.1 * tenth, 1) for tenth in range(8)),
+    points=100,
+    methods=("ransac-optimal", "ransac-aepnp", "optimal-cauchy", "optimal", "limit"),
+    runs=500,
+)
+_RUNTIME = replace(
+    _POINTS,
+    name="runtime",
+    values=(6, 10, 20, 50, 100, 200, 500, 1024, 2048),
+    methods=("optimal", "aepnp", "aepnp-paper", "epnp"),
+    runs=100,
+)
+SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS, _RUNTIME)}
 
 
 @dataclass(frozen=True)
 class SweepOptions(ExperimentOptions):
     """Repeat the AEPnP paper's simulation: a table, a page, and figures as PNG and PDF."""
 
-    experiment: ClassVar[str] = "simulate"
-    command: ClassVar[str] = "simulate"
+    experiment = "simulate"
+    command = "simulate"
 
     sweep: Annotated[str, tyro.conf.Suppress]
     """The quantity that is varied: noise, points, outliers or runtime."""
@@ -145,13 +140,7 @@ _CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
 
 
 def _check_values(kind: SweepKind) -> None:
-    """Check the values of a sweep.
-
-    Raises
-    ------
-    InputError
-        If one is out of range.
-    """
+    """Check the values of a sweep."""
     if not kind.values:
         raise InputError("none is given", where="values")
     settings = {column: (getattr(kind, column),) for column in _CHECKS}

@@ -16,19 +16,10 @@ SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Keypoints on a model and in an image, and the alignment that joins them.
+    """Keypoints on a model (n, 3) and in an image (n, 2) [px], and the alignment that joins them.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points.
-    points_2d : (n, 2) float
-        Their noisy observations [px].
-    camera : Camera
-    alignment : Alignment
-        The truth.
-    outliers : (n,) bool, optional
-        Which observations have nothing to do with their points; None where there are none.
+    ``outliers`` (n,) are the observations that have nothing to do with their points; None where
+    there are none.
     """
 
     points_3d: FloatArray
@@ -66,10 +57,6 @@ def simulate_problem(
     outlier_share : float
         Share of the observations, rounded to a whole number of them, that are moved to anywhere in
         the image instead.
-
-    Returns
-    -------
-    Problem
 
     Examples
     --------

@@ -8,6 +8,7 @@ and ``failed``, the number of problems and of those that the method did not solv
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
@@ -15,7 +16,7 @@ from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.simulation.experiment import ERRORS
-from cadalign.evaluation.simulation.options import SweepKind
+from cadalign.evaluation.simulation.options import SWEEPS, SweepKind
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 
 VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
@@ -26,7 +27,8 @@ def kind_of(run: Run) -> SweepKind:
     """The sweep that a run makes."""
     given = run.config["sweep"]
     lists = {name: tuple(given[name]) for name in ("values", "methods")}
-    return SweepKind(**{**given, **lists})
+    # What an older run does not say is as in this sweep.
+    return replace(SWEEPS["noise"], **{**given, **lists})
 
 
 def varied(run: Run) -> Metric:

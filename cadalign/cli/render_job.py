@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
-
 from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.cli.render import Render
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
@@ -17,24 +16,21 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
-from cadalign.io.files import write_whole
 from cadalign.render.drawing.color import ByteImage, composite
-from cadalign.render.drawing.movie import contact_sheet, write_movie
-from cadalign.render.drawing.stills import (
-    VIEWS,
-    Angles,
-    draw_still,
-    pose_in_view,
-    turntable,
-    with_keypoints,
-)
+from cadalign.render.drawing.movie import contact_sheet
+from cadalign.render.drawing.pictures import keypoint_picture
+from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_view, turntable
 from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
 from cadalign.render.scene import Scene
 from cadalign.render.select import make_renderer
-from cadalign.render.views.camera_files import CameraView, read_camera_views
+from cadalign.render.views.camera_files import read_camera_views
+from cadalign.render.views.visibility import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
 _MAX_FRAMES = 10_000
+
+LabelledView = tuple[str, Angles | tuple[Camera, Alignment]]
+"""A label, and angles or a whole camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,99 +39,68 @@ class RenderJob:
 
     scene: Scene
     renderer: Renderer
-    views: tuple[tuple[str, Angles | tuple[Camera, Alignment]], ...]
-    """Labels, and angles or whole cameras."""
+    options: Render
+    views: tuple[LabelledView, ...]
     camera: Camera
-    out: Path
-    style: str
     background: tuple[int, int, int] | None
     """None is transparent."""
     keypoints: FloatArray | None
     scale: FloatArray
-    samples: int
 
     @classmethod
-    def prepare(
-        cls,
-        *,
-        model: Path,
-        out: Path,
-        views: tuple[str, ...],
-        size: str,
-        style: str,
-        background: str,
-        keypoints: Path | None,
-        scale: tuple[float, float, float],
-        fov: float,
-        samples: int,
-        renderer: str,
-    ) -> RenderJob:
-        """Check the arguments of the command line and read the files that they name."""
-        width, height = parse_size(size)
-        camera = Camera.from_fov(width, height, fov_x=fov)
+    def prepare(cls, options: Render) -> RenderJob:
+        """Check the options of the command line and read the files that they name."""
+        width, height = parse_size(options.size)
+        camera = Camera.from_fov(width, height, fov_x=options.fov)
         check_image_size(camera)
-        if out.suffix.lower() not in (".png", ".mp4"):
+        ending = options.out.suffix.lower()
+        if ending not in (".png", ".mp4"):
             raise InputError(
-                f"{out.name} is neither a PNG nor an MP4 file",
+                f"{options.out.name} is neither a PNG nor an MP4 file",
                 where="--out",
                 fix="give such a name",
             )
-        color = parse_background(background)
-        movie = out.suffix.lower() == ".mp4"
-        factors = as_floats(scale, name="--scale", shape=(3,))
-        if (factors <= 0).any():
-            raise InputError(f"{scale} is not positive", where="--scale")
-        chosen = tuple(view for word in views for view in _views(word, factors))
-        if not chosen:
+        background = parse_background(options.background)
+        scale = as_floats(options.scale, name="--scale", shape=(3,))
+        if (scale <= 0).any():
+            raise InputError(f"{options.scale} is not positive", where="--scale")
+        views = tuple(view for word in options.view for view in _views(word, scale))
+        if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
-        if color is None and (movie or len(chosen) > 1 or keypoints is not None):
+        file = options.keypoints
+        if background is None and (ending == ".mp4" or len(views) > 1 or file is not None):
             raise InputError(
                 "only a still without keypoints can be transparent", where="--background"
             )
-        mesh = load_mesh(model)
+        mesh = load_mesh(options.model)
         return cls(
             scene=Scene(mesh),
             # Depth, normals, triangles and lines are cast in any case.
-            renderer=make_renderer(renderer if style == "color" else "raycast"),
-            views=chosen,
+            renderer=make_renderer(options.renderer if options.style == "color" else "raycast"),
+            options=options,
+            views=views,
             camera=camera,
-            out=out,
-            style=style,
-            background=color,
-            keypoints=None if keypoints is None else read_keypoints(keypoints, model, mesh),
-            scale=factors,
-            samples=samples,
+            background=background,
+            keypoints=None if file is None else read_keypoints(file, options.model, mesh),
+            scale=scale,
         )
 
     @property
     def drawn_by(self) -> str:
         """Name of the renderer that really draws the model."""
-        return self.renderer.drawn_by(self.scene, samples=self.samples)
-
-    @property
-    def is_movie(self) -> bool:
-        """True for a turntable, False for a still."""
-        return self.out.suffix.lower() == ".mp4"
+        return self.renderer.drawn_by(self.scene, samples=self.options.samples)
 
     def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
         """One picture, (h, w, 3) uint8, or (h, w, 4) on a transparent background."""
-        color = draw_still(
-            self.renderer, self.scene, camera, pose, style=self.style, samples=self.samples
-        )
+        style, samples = self.options.style, self.options.samples
+        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
         if self.background is None:
             return color
         image = composite(color, self.background)
-        if self.keypoints is not None:
-            image = with_keypoints(image, self.scene, camera, pose, self.keypoints)
-        return image
-
-    def write_picture(self, image: ByteImage) -> None:
-        """Write a PNG file, whole or not at all."""
-        write_whole(self.out, lambda path: Image.fromarray(image).save(path, format="PNG"))
-
-    def write_movie(self, frames: Iterable[ByteImage], *, fps: float) -> None:
-        """Write an MP4 file, whole or not at all."""
-        write_movie(self.out, frames, fps=fps)
+        if self.keypoints is None:
+            return image
+        visible = visible_keypoints(self.scene, self.keypoints, camera, pose)
+        return keypoint_picture(image, camera, self.keypoints, pose, visible=visible)
 
 
 def draw_picture(job: RenderJob) -> ByteImage:
@@ -154,8 +119,9 @@ def draw_picture(job: RenderJob) -> ByteImage:
     return contact_sheet(images, [label for label, _ in job.views], background=background)
 
 
-def draw_movie(job: RenderJob, *, seconds: float, fps: float) -> tuple[Iterator[ByteImage], int]:
+def draw_movie(job: RenderJob) -> tuple[Iterator[ByteImage], int]:
     """Draw a turntable that starts in the first view: its frames, and their number."""
+    seconds, fps = job.options.seconds, job.options.fps
     frames = seconds * fps
     if not 1 <= frames <= _MAX_FRAMES:
         raise InputError(
@@ -208,13 +174,7 @@ def parse_background(text: str) -> tuple[int, int, int] | None:
 
 
 def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
-    """Read keypoints (k, 3) from a list of [x, y, z] or as `ModelKeypoints.load` does.
-
-    Raises
-    ------
-    DataError
-        If the file is neither, or has no keypoints of this model.
-    """
+    """Read keypoints (k, 3) from a list of [x, y, z] or as `ModelKeypoints.load` does."""
     data = read_json(path)
     if isinstance(data, dict) or (isinstance(data, list) and data and isinstance(data[0], dict)):
         return ModelKeypoints.load(path, mesh=mesh, model=model).xyz
@@ -224,21 +184,15 @@ def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
         raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None
 
 
-def _views(word: str, scale: FloatArray) -> list[tuple[str, Angles | tuple[Camera, Alignment]]]:
+def _views(word: str, scale: FloatArray) -> list[LabelledView]:
     """The views that a word names, with labels."""
     if word == "all":
         return [(name, Angles(*angles)) for name, angles in VIEWS.items()]
-    if word not in VIEWS and (word.endswith(".json") or Path(word).exists()):
-        return [
-            _from_file(word, number, view, scale)
-            for number, view in enumerate(read_camera_views(word))
-        ]
-    return [(word, Angles.parse(word))]
-
-
-def _from_file(
-    word: str, number: int, view: CameraView, scale: FloatArray
-) -> tuple[str, tuple[Camera, Alignment]]:
-    check_image_size(view.camera)
-    pose = Alignment(view.cam_from_world.rotation, view.cam_from_world.translation, scale)
-    return view.name or f"{Path(word).stem} {number}", (view.camera, pose)
+    if word in VIEWS or not (word.endswith(".json") or Path(word).exists()):
+        return [(word, Angles.parse(word))]
+    views: list[LabelledView] = []
+    for number, view in enumerate(read_camera_views(word)):
+        check_image_size(view.camera)
+        pose = Alignment(view.cam_from_world.rotation, view.cam_from_world.translation, scale)
+        views.append((view.name or f"{Path(word).stem} {number}", (view.camera, pose)))
+    return views

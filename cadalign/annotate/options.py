@@ -1,0 +1,25 @@
+"""Options of an annotation session; the command line shows the text below each field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """Photos, model, and the files beside them."""
+
+    image: Path
+    """A photo, or a folder of photos."""
+    model: Path
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""
+    observation: Path | None = None
+    """Observation file of a single photo, continued if it exists; by default beside the photo."""
+    out: Path | None = None
+    """Folder for the observations; by default the photos'."""
+    camera: Path | None = None
+    """JSON file of the calibrated camera (COLMAP's form, Open3D's or NeRF's). Without one the focal
+    length is estimated."""
+    keypoints: Path | None = None
+    """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""

@@ -1,0 +1,68 @@
+"""Parts that the scripts share: arguments, tables, errors of an ideal estimator, output files."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from cadalign.errors import CadalignError
+from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.simulation.problems import Problem
+from cadalign.io.files import write_json
+from cadalign.io.images import write_image
+
+LIMIT_DRAWS = 20
+
+
+@dataclass
+class Benchmark:
+    """Arguments of all benchmarks; benchmark_focal.py writes bench/focal.json."""
+
+    out: Path = Path("bench", Path(sys.argv[0]).stem.removeprefix("benchmark_") + ".json")
+    """JSON file to write."""
+
+
+def new_table(title: str, *columns: str) -> Table:
+    """A table whose columns stand to the right, as numbers do."""
+    table = Table(title=title)
+    for column in columns:
+        table.add_column(column, justify="right")
+    return table
+
+
+def ideal_errors(
+    problems: Iterable[Problem], rng: np.random.Generator, **options: Any
+) -> dict[str, np.ndarray]:
+    """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
+    draws = []
+    for problem in problems:
+        try:
+            bound = cramer_rao_bound(
+                problem.points_3d, problem.camera, problem.alignment, **options
+            )
+        except CadalignError:
+            continue
+        draws.append(sample_limit(bound, rng=rng, draws=LIMIT_DRAWS))
+    return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
+
+
+def write_results(path: Path, results: Any) -> None:
+    """Write a benchmark's figures and say where."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, results)
+    print(f"written to {path}")
+
+
+def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
+    """Write pictures of one height side by side, shrunk to a width [px] in all."""
+    row = np.hstack(pictures)
+    height = round(row.shape[0] * width / row.shape[1])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from cadalign.errors import InputError
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+
+_NUMBERS = (float, int, np.integer, np.floating)
 
 
 def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
@@ -37,6 +40,10 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
         If it is not numeric, has another shape, or holds NaN or infinite values.
     """
     try:
+        if np.asarray(value).dtype.kind in "cmM":  # complex numbers and times
+            raise TypeError(f"they are {np.asarray(value).dtype}")
+        if np.ma.is_masked(value):
+            raise TypeError("some are masked")
         array = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         what = f"not an array of numbers ({str(error)[:200]})"
@@ -52,6 +59,16 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     if not np.isfinite(array).all():
         raise InputError(describe_non_finite(array), where=name, fix="remove or repair these")
     return array
+
+
+def is_number(value: Any) -> bool:
+    """True for a finite real number, of NumPy or not."""
+    if not isinstance(value, _NUMBERS) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond all floats
+        return False
 
 
 def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:

@@ -61,7 +61,7 @@ def ideal_errors(
             )
         except CadalignError:
             continue
-        draws.append(sample_limit(bound, problem.alignment, rng=rng, draws=LIMIT_DRAWS))
+        draws.append(sample_limit(bound, rng=rng, draws=LIMIT_DRAWS))
     return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
 
 

@@ -89,7 +89,11 @@ def _statistic(
     others = others[result.alignment.apply(points_3d[others])[:, 2] > 0]
     if len(others) and result.covariance is not None:
         jacobian = projection_jacobian(
-            points_3d[others], result.camera, result.alignment, unknowns=len(result.covariance)
+            points_3d[others],
+            result.camera,
+            result.alignment,
+            known_axis=result.known_axis,
+            unknowns=len(result.covariance),
         )
         expected[others] += predicted_covariances(jacobian, result.covariance)
     finite = np.nan_to_num(residuals, posinf=1e9)

@@ -105,7 +105,9 @@ def updated_variances(
     A measurement with the derivatives J turns the covariance C into
     C - C J' (J C J' + sigma^2)^-1 J C.
     """
-    jacobian = projection_jacobian(points_3d, camera, alignment, unknowns=len(covariance))
+    jacobian = projection_jacobian(
+        points_3d, camera, alignment, known_axis="x", unknowns=len(covariance)
+    )
     innovation = predicted_covariances(jacobian, covariance) + sigma**2 * np.eye(2)
     gain = covariance @ jacobian.transpose(0, 2, 1)
     shrunk = np.einsum("nka,nab,nkb->nk", gain, np.linalg.inv(innovation), gain)

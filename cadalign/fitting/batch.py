@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -97,9 +98,7 @@ class BatchResult:
         squares = np.append((residuals**2).sum(axis=1), 0.0)
         means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
         return cls(
-            rotation=poses[:, :9].reshape(-1, 3, 3),
-            translation=poses[:, 9:12],
-            scale=poses[:, 12:],
+            *_split(poses),
             rms=np.where(failed, np.nan, np.sqrt(means)),
             covariance=covariance,
             focal_length=np.where(failed, np.nan, focals),
@@ -132,9 +131,7 @@ class BatchResult:
                 if fit.covariance is not None:
                     covariance[b] = fit.covariance
         return cls(
-            rotation=poses[:, :9].reshape(-1, 3, 3),
-            translation=poses[:, 9:12],
-            scale=poses[:, 12:],
+            *_split(poses),
             rms=rms,
             covariance=covariance,
             focal_length=focals,
@@ -147,27 +144,25 @@ class BatchResult:
     @classmethod
     def joined(cls, parts: Sequence[BatchResult]) -> BatchResult:
         """Put the results of successive parts of a batch together."""
-        rows = np.cumsum([0, *(len(part.residuals) for part in parts)]).tolist()
-        first_problem = np.cumsum([0, *(len(part) for part in parts)]).tolist()
-        covariances = [part.covariance for part in parts if part.covariance is not None]
+
+        def join(name: str) -> Any:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        joined = ("rotation", "translation", "scale", "rms", "focal_length", "residuals", "inliers")
+        sizes = np.concatenate([np.diff(part.offsets) for part in parts])
+        first_problem = np.cumsum([0, *map(len, parts)]).tolist()
         return cls(
-            rotation=np.concatenate([part.rotation for part in parts]),
-            translation=np.concatenate([part.translation for part in parts]),
-            scale=np.concatenate([part.scale for part in parts]),
-            rms=np.concatenate([part.rms for part in parts]),
-            covariance=np.concatenate(covariances) if covariances else None,
-            focal_length=np.concatenate([part.focal_length for part in parts]),
-            residuals=np.concatenate([part.residuals for part in parts]),
-            inliers=np.concatenate([part.inliers for part in parts]),
-            offsets=np.concatenate(
-                [
-                    [0],
-                    *(part.offsets[1:] + row for part, row in zip(parts, rows, strict=False)),
-                ]
-            ),
+            **{name: join(name) for name in joined},
+            covariance=None if parts[0].covariance is None else join("covariance"),
+            offsets=np.concatenate([[0], np.cumsum(sizes)]),
             errors={
                 first + b: error
                 for part, first in zip(parts, first_problem, strict=False)
                 for b, error in part.errors.items()
             },
         )
+
+
+def _split(poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations, translations and scales of packed poses (B, 15)."""
+    return poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]

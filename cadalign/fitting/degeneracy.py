@@ -5,39 +5,33 @@ from __future__ import annotations
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.fitting.options import FitOptions
-from cadalign.solvers.constants import NOT_FOUND, TOO_FEW
-from cadalign.solvers.linear import describe_plane
+from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
+from cadalign.solvers.linear import aepnp_error, describe_plane, out_of_range_error
 
 
 def solver_error(
     status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
 ) -> DegenerateError:
-    """Convert a solver's status to an exception.
-
-    Parameters
-    ----------
-    status : int
-        See `cadalign.solvers.constants`.
-    undetermined : int
-        Number of an unknown of the solvers that is not determined, or -1.
-    points_3d : (n, 3) float
-    options : FitOptions
-    """
+    """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
     if status == TOO_FEW:
-        return _too_few_error(len(points_3d), options)
+        method = f"the method {options.method!r}"
+        fix = f"give at least {options.min_points}"
+        if options.method == "optimal":
+            method = f"{options.unknowns} unknowns"
+            fix += ", fewer unknowns by stretch=, or a prior"
+        what = f"{len(points_3d)} keypoints are too few for {method}"
+        return DegenerateError(what, where="points_3d", fix=fix)
+    if status == OUT_OF_RANGE:
+        return out_of_range_error()
     if status == NOT_FOUND:
         return DegenerateError(
             "no alignment with all keypoints in front of the camera was found",
             where="points_2d",
             fix="check that points_3d and points_2d correspond, row by row, and the camera",
         )
-    reason = describe_plane(points_3d)
     if undetermined < 0:
-        return DegenerateError(
-            reason or "the points lie nearly in one plane",
-            where="points_3d",
-            fix="a linear solver needs keypoints that span a volume",
-        )
+        return aepnp_error(points_3d)
+    reason = describe_plane(points_3d)
     if undetermined < 3:
         missing = "the rotation"
     elif undetermined < 6:
@@ -65,13 +59,3 @@ def no_redundancy_error(count: int) -> DegenerateError:
         where="sigma",
         fix="give sigma, or more keypoints",
     )
-
-
-def _too_few_error(count: int, options: FitOptions) -> DegenerateError:
-    if options.method == "optimal":
-        what = f"{count} keypoints are too few for {options.unknowns} unknowns"
-        fix = f"give at least {options.min_points}, fewer unknowns by stretch=, or a prior"
-    else:
-        what = f"{count} keypoints are too few for the method {options.method!r}"
-        fix = f"give at least {options.min_points}"
-    return DegenerateError(what, where="points_3d", fix=fix)

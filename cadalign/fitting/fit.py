@@ -12,12 +12,12 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import CadalignError, InputError
+from cadalign.arrays import BoolArray, FloatArray, as_floats
+from cadalign.errors import CadalignError, InputError, quote
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
-from cadalign.fitting.problems import Problems, pack_many, pack_one
+from cadalign.fitting.problems import Problems, each_of, pack_many, pack_one
 from cadalign.fitting.result import Alternative, FitResult, FitStats
 from cadalign.fitting.robust import find_consensus, residuals_of
 from cadalign.fitting.solutions import Solutions
@@ -30,6 +30,7 @@ LEAST_LIKELIHOOD = 1e-3
 _INLIER_ROUNDS = 5
 
 
+@np.errstate(all="ignore")  # what is not finite is refused
 def fit(
     points_3d: npt.ArrayLike,
     points_2d: npt.ArrayLike,
@@ -136,12 +137,13 @@ def fit(
         focal_prior=focal_prior,
     )
     problems = pack_one(points_3d, points_2d, camera)
+    _check_ransac(ransac, confidences)
     if ransac is None:
-        _refuse_confidences(confidences)
         return _fit_all(problems, options, start)
     return _fit_robustly(problems, options, ransac, confidences, start)
 
 
+@np.errstate(all="ignore")
 def fit_batch(
     points_3d: Sequence[npt.ArrayLike] | FloatArray,
     points_2d: Sequence[npt.ArrayLike] | FloatArray,
@@ -217,22 +219,19 @@ def fit_batch(
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
     if per_problem:
-        sigmas = list(sigma)  # type: ignore[arg-type]
-        if len(sigmas) != len(problems):
-            raise InputError(f"{len(problems)} problems but {len(sigmas)} values", where="sigma")
-    if ransac is None:
-        _refuse_confidences(confidences)
-    elif confidences is not None and len(confidences) != len(problems):
-        raise InputError(
-            f"{len(problems)} problems but {len(confidences)} sets", where="confidences"
-        )
+        sigmas = list(each_of(sigma, "sigma", len(problems), "values"))
+    _check_ransac(ransac, confidences)
+    if confidences is not None:
+        confidences = each_of(confidences, "confidences", len(problems), "sets")
+    if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
+        what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
+        raise InputError(what, where="workers")
     if workers == -1:
         workers = os.cpu_count() or 1
-    if workers < 1:
-        raise InputError(f"must be >= 1, or -1 for all cores, not {workers}", where="workers")
     bounds = np.linspace(0, len(problems), workers + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
+    @np.errstate(all="ignore")  # holds for one thread only
     def run(part: tuple[int, int]) -> BatchResult:
         some = problems.part(*part)
         own = None if sigmas is None else sigmas[part[0] : part[1]]
@@ -248,8 +247,11 @@ def fit_batch(
         return BatchResult.joined(list(pool.map(run, parts)))
 
 
-def _refuse_confidences(confidences: object) -> None:
-    if confidences is not None:
+def _check_ransac(ransac: object, confidences: object) -> None:
+    if ransac is not None and not isinstance(ransac, RansacOptions):
+        what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
+        raise InputError(what, where="ransac")
+    if ransac is None and confidences is not None:
         raise InputError(
             "given without ransac",
             where="confidences",
@@ -331,7 +333,8 @@ def _fit_inliers(
     """The optimum for some of the only problem's keypoints."""
     sigma = options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
-        sigma = np.asarray(sigma)[inliers]
+        shape = (len(inliers),) if np.ndim(sigma) == 1 else (len(inliers), 2, 2)
+        sigma = as_floats(sigma, name="sigma", shape=shape)[inliers]
     some = Problems(
         problems.points_3d[inliers],
         problems.points_2d[inliers],
@@ -393,5 +396,5 @@ def _alternatives(
             _camera(problems, solutions, k),
         )
         for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD
+        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
     )

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_floats
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, as_floats, is_number
+from cadalign.errors import InputError, quote
 from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import pinhole_rays
@@ -21,34 +21,17 @@ def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:
 
 
 def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
-    """Weights that turn errors of the rays into errors of unit covariance.
+    """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
 
-    Parameters
-    ----------
-    sigma : float, (n,) float, (n, 2, 2) float or None
-        Standard deviation of all keypoints, of each, or covariance of each [px]; None for 1 px.
-    rays : (n, 2) float
-        Their normalised image coordinates.
-    camera : Camera
-
-    Returns
-    -------
-    (1 or n, 3) float
-        (a, b, c) such that (a du + b dv, c dv) has unit covariance for the error (du, dv) of a
-        ray: the upper Cholesky factor of its information matrix. Lens distortion enters by its
-        derivative.
-
-    Raises
-    ------
-    InputError
-        If a standard deviation is not positive, a covariance is not positive definite, or the
-        shape is wrong.
+    A row (a, b, c) is such that (a du + b dv, c dv) has unit covariance for the error (du, dv) of a
+    ray: the upper Cholesky factor of its information matrix. Lens distortion enters by its
+    derivative. A sigma of None counts as 1 px.
     """
     if sigma is None:
         sigma = 1.0
     if isinstance(sigma, int | float) and not camera.distortion:
-        if not 0 < sigma < np.inf:
-            raise InputError(f"{sigma} is not a standard deviation", where="sigma", fix=_FIX)
+        if not (is_number(sigma) and sigma > 0):
+            raise InputError(f"{quote(sigma)} is not a standard deviation", where="sigma", fix=_FIX)
         return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
     information = _pixel_information(sigma, len(rays))
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)

@@ -5,14 +5,15 @@ The command line nests these dataclasses, and shows the text below each field as
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, is_number
+from cadalign.errors import InputError, quote
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
 
@@ -21,6 +22,8 @@ FOCALS = ("known", "estimate")
 AXES = ("x", "y", "z")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
+
+_LEAST, _MOST = 1e-100, 1e100  # whose squares do not overflow
 
 Sigma = float | npt.ArrayLike
 
@@ -59,26 +62,25 @@ class FitOptions:
     """Prior on a focal length to be estimated, from EXIF data for example."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise _unknown("method", self.method, METHODS)
-        if self.loss not in LOSSES:
-            raise _unknown("loss", self.loss, LOSSES)
-        if self.known_axis not in AXES:
-            raise _unknown("known_axis", self.known_axis, AXES)
-        if self.focal not in FOCALS:
-            raise _unknown("focal", self.focal, FOCALS)
-        if not isinstance(self.loss_scale, int | float) or not 0 < self.loss_scale < np.inf:
-            raise InputError(f"{self.loss_scale} is not positive", where="loss_scale")
-        prior = self.scale_prior_sigma
-        if prior is not None and not 0 < prior < np.inf:
-            raise InputError(f"{prior} is not positive", where="scale_prior_sigma")
+        _check_known("method", self.method, METHODS)
+        _check_known("loss", self.loss, LOSSES)
+        _check_known("known_axis", self.known_axis, AXES)
+        _check_known("focal", self.focal, FOCALS)
+        _check_positive("loss_scale", self.loss_scale)
+        if self.scale_prior_sigma is not None:
+            _check_positive("scale_prior_sigma", self.scale_prior_sigma)
+        if self.sigma is not None and not is_number(self.sigma):
+            try:
+                np.ndim(self.sigma)
+            except ValueError:
+                raise InputError("its entries are not of one shape", where="sigma") from None
         if self.stretch is not None:
             self._check_stretch(self.stretch)
         if self.focal == "estimate" or self.focal_prior is not None:
             self._check_focal()
         if self.method != "optimal" and (
             self.loss != "linear"
-            or prior is not None
+            or self.scale_prior_sigma is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
         ):
             raise InputError(
@@ -147,7 +149,7 @@ class FitOptions:
     @property
     def prior_weight(self) -> float:
         """Inverse variance of the prior on the log scales; 0 for none."""
-        return 0.0 if self.scale_prior_sigma is None else self.scale_prior_sigma**-2
+        return 0.0 if self.scale_prior_sigma is None else float(self.scale_prior_sigma) ** -2
 
     @property
     def estimates_in_rounds(self) -> bool:
@@ -201,17 +203,25 @@ class RansacOptions:
     the best hypothesis as the minimal solver left it."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.max_reproj_error < np.inf:
-            raise InputError(f"{self.max_reproj_error} is not positive", where="max_reproj_error")
+        _check_positive("max_reproj_error", self.max_reproj_error)
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < least:
-                raise InputError(f"{value!r} is not a number of at least {least}", where=name)
-        if not 0 < self.success_prob < 1:
-            raise InputError(f"{self.success_prob} is not between 0 and 1", where="success_prob")
-        if self.minimal not in MINIMAL_SOLVERS:
-            raise _unknown("minimal", self.minimal, MINIMAL_SOLVERS)
+            if not isinstance(value, int | np.integer) or not least <= value < 2**63:
+                raise InputError(f"{quote(value)} is not a number of at least {least}", where=name)
+        if not is_number(self.success_prob) or not 0 < self.success_prob < 1:
+            what = f"{quote(self.success_prob)} is not between 0 and 1"
+            raise InputError(what, where="success_prob")
+        _check_known("minimal", self.minimal, MINIMAL_SOLVERS)
 
 
-def _unknown(name: str, value: object, known: Iterable[str]) -> InputError:
-    return InputError(f"unknown {name} {value!r}", where=name, fix=f"known are {', '.join(known)}")
+def _check_known(name: str, value: object, known: Collection[str]) -> None:
+    if not isinstance(value, str) or value not in known:
+        fix = f"known are {', '.join(known)}"
+        raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
+
+
+def _check_positive(name: str, value: Any) -> None:
+    if not is_number(value) or not value > 0:
+        raise InputError(f"{quote(value)} is not positive", where=name)
+    if not _LEAST <= value <= _MOST:
+        raise InputError(f"{value} is not between {_LEAST:g} and {_MOST:g}", where=name)

@@ -12,49 +12,26 @@ from cadalign.geometry.projection import perspective
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.projection import ray_derivatives
 
-_WITHOUT_FOCAL, _WITH_FOCAL = UNKNOWNS, UNKNOWNS + 1
-
 
 def projection_jacobian(
     points_3d: FloatArray,
     camera: Camera,
     alignment: Alignment,
     *,
-    known_axis: str = "x",
-    unknowns: int = _WITHOUT_FOCAL,
+    known_axis: str,
+    unknowns: int,
 ) -> FloatArray:
-    """Derivatives of projected points by the unknowns, in the order of `FitResult.covariance`.
+    """Derivatives (n, 2, unknowns) of projected points, in the order of `FitResult.covariance`.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points, in front of the camera [model units].
-    camera : Camera
-    alignment : Alignment
-    known_axis : {"x", "y", "z"}
-    unknowns : int
-        8, or 9 with the logarithm of the focal length.
-
-    Returns
-    -------
-    (n, 2, unknowns) float
-        [px] per rad, model unit, and unit of a logarithm.
-
-    Raises
-    ------
-    InputError
-        If the number of unknowns is another, or a point lies behind the camera.
-
-    Examples
-    --------
-    >>> camera = Camera.from_fov(640, 480, fov_x=60.0)
-    >>> pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
-    >>> float(projection_jacobian(np.zeros((1, 3)), camera, pose)[0, 0, 3] / camera.fx)
-    0.25
+    In pixels per rad, model unit, and unit of a logarithm; 9 unknowns include that of the focal
+    length. Refuses points behind the camera.
     """
-    if unknowns not in (_WITHOUT_FOCAL, _WITH_FOCAL):
+    if unknowns not in (UNKNOWNS, UNKNOWNS + 1):
         raise InputError(f"{unknowns} is neither 8 nor 9", where="unknowns")
-    rays = _rays_ahead(points_3d, alignment)
+    in_camera = alignment.apply(points_3d)
+    if not (in_camera[:, 2] > 0).all():
+        raise InputError("a point lies behind the camera", where="points_3d")
+    rays = perspective(in_camera)
     # The kernel takes the known axis first, and has the scales of the other two in cyclic order.
     first = "xyz".index(known_axis)
     order = [first, (first + 1) % 3, (first + 2) % 3]
@@ -66,17 +43,10 @@ def projection_jacobian(
         of_rays = of_rays[:, :, [0, 1, 2, 3, 4, 5, 7, 6]]
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
     jacobian = to_pixels @ of_rays
-    if unknowns == _WITH_FOCAL:
+    if unknowns > UNKNOWNS:
         off_center = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
         jacobian = np.concatenate([jacobian, off_center[:, :, None]], axis=2)
     return np.asarray(jacobian)
-
-
-def _rays_ahead(points_3d: FloatArray, alignment: Alignment) -> FloatArray:
-    in_camera = alignment.apply(points_3d)
-    if not (in_camera[:, 2] > 0).all():
-        raise InputError("a point lies behind the camera", where="points_3d")
-    return perspective(in_camera)
 
 
 def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

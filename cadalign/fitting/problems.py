@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,16 +20,8 @@ from cadalign.solvers.projection import all_finite
 class Problems:
     """The correspondences of one or many problems, one after the other.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points of all problems.
-    points_2d : (n, 2) float
-        Image points [px].
-    offsets : (B + 1,) int
-        Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``.
-    cameras : tuple of Camera
-        One for all problems, or one each.
+    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of ``points_3d`` (n, 3) and
+    ``points_2d`` (n, 2) [px]; there is one camera for all, or one each.
     """
 
     points_3d: FloatArray
@@ -83,13 +76,7 @@ class Problems:
 
 
 def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera) -> Problems:
-    """Check one problem's arguments.
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, a value is NaN or infinite, or lengths don't match.
-    """
+    """Check one problem's arguments."""
     model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
     _check_camera(camera)
     return Problems(model, image, np.array([0, len(model)]), (camera,))
@@ -100,21 +87,12 @@ def pack_many(
     points_2d: Sequence[npt.ArrayLike] | FloatArray,
     camera: Camera | Sequence[Camera],
 ) -> Problems:
-    """Check the arguments of many problems, of the same or of different sizes.
-
-    Raises
-    ------
-    InputError
-        As `pack_one`, naming the problem.
-    """
+    """Check the arguments of many problems, of the same or of different sizes."""
+    points_3d = each_of(points_3d, "points_3d", None, "")
     count = len(points_3d)
-    if len(points_2d) != count:
-        raise InputError(
-            f"{count} problems but {len(points_2d)} sets of image points", where="points_2d"
-        )
-    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
-    if not isinstance(camera, Camera) and len(cameras) != count:
-        raise InputError(f"{count} problems but {len(cameras)} cameras", where="camera")
+    points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
+    given = isinstance(camera, Camera)
+    cameras = (camera,) if given else tuple(each_of(camera, "camera", count, "cameras"))
     for single in cameras:
         _check_camera(single)
     if not count:
@@ -138,9 +116,21 @@ def pack_many(
     )
 
 
+def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
+    """A sequence of one entry for each of ``count`` problems, which messages name ``entries``."""
+    try:
+        each = value if isinstance(value, np.ndarray) and value.ndim else list(value)
+    except TypeError:
+        what = f"expected a sequence of one entry per problem, got {type(value).__name__}"
+        raise InputError(what, where=name) from None
+    if count is not None and len(each) != count:
+        raise InputError(f"{count} problems but {len(each)} {entries}", where=name)
+    return each
+
+
 def _is_stack(value: object, last: int) -> bool:
     return (
-        isinstance(value, np.ndarray)
+        type(value) is np.ndarray
         and value.ndim == 3
         and value.shape[2] == last
         and value.dtype.kind == "f"
@@ -152,35 +142,25 @@ def _check_camera(camera: object) -> None:
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
 
 
-def _as_kernels_want(points: npt.ArrayLike) -> FloatArray:
-    """A contiguous and writable array of floats, the given one where it is that already.
-
-    Kernels are compiled for writable arrays; a frozen one would compile them again.
-    """
-    if type(points) is np.ndarray and points.dtype == np.float64 and points.flags.carray:
-        return points
-    return np.require(points, np.float64, ["C", "W"])
+def _is_plain(points: npt.ArrayLike, dimension: int) -> bool:
+    """True for a writable array of the right form: frozen ones would compile the kernels again."""
+    return (
+        type(points) is np.ndarray
+        and points.dtype == np.float64
+        and points.flags.carray
+        and points.ndim == 2
+        and points.shape[1] == dimension
+    )
 
 
 def _check_pair(
     points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, name_3d: str, name_2d: str
 ) -> tuple[FloatArray, FloatArray]:
-    """Writable arrays (n, 3) and (n, 2) of finite numbers, or an `InputError`."""
-    try:
-        model = _as_kernels_want(points_3d)
-        image = _as_kernels_want(points_2d)
-        valid = (
-            model.ndim == 2
-            and image.ndim == 2
-            and model.shape[1] == 3
-            and image.shape[1] == 2
-            and all_finite(model, image)
-        )
-    except (TypeError, ValueError):
-        valid = False
-    if not valid:  # take the slow checks, whose errors say what is wrong
-        model = as_points(points_3d, name=name_3d, dimension=3)
-        image = as_points(points_2d, name=name_2d, dimension=2)
+    """Writable arrays (n, 3) and (n, 2) of finite numbers; the given ones where they are that."""
+    model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
+    if not (_is_plain(model, 3) and _is_plain(image, 2) and all_finite(model, image)):
+        model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
+        image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
     if len(model) != len(image):
         raise InputError(
             f"{len(model)} model points but {len(image)} image points",

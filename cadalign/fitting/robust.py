@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.fitting.focal.grid import FocalViews, focal_views, log_focal_prior
+from cadalign.fitting.focal.grid import focal_views, log_focal_prior
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.fitting.problems import Problems
@@ -18,10 +18,10 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
-from cadalign.solvers.evidence import Keypoints, ScalePrior
+from cadalign.solvers.evidence import Keypoints, ScalePrior, Views
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective
-from cadalign.solvers.ransac import Settings, Views, ransac_kernel
+from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
 _CHANCE = 0.1  # expected number of models with as much support by chance
@@ -33,32 +33,12 @@ def find_consensus(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions,
-    confidences: npt.ArrayLike | None = None,
+    confidences: npt.ArrayLike | None,
 ) -> FitResult:
-    """Estimate one alignment by LO-RANSAC.
-
-    Parameters
-    ----------
-    problems : Problems
-        One problem.
-    options : FitOptions
-        Known axis, stretch, scale prior and focal length.
-    ransac : RansacOptions
-    confidences : (n,) float, optional
-        Confidences of the keypoints; samples are drawn from the highest first.
-
-    Returns
-    -------
-    FitResult
-        The best hypothesis as the search left it, with its inliers.
+    """The best hypothesis of LO-RANSAC for the only problem, with its inliers.
 
     Raises
     ------
-    InputError
-        If there are too few keypoints, a confidence is negative or NaN, or the minimal solver needs
-        a known focal length.
-    DegenerateError
-        If all keypoints lie in one plane.
     NoConsensusError
         If no alignment has more support than chance gives; it carries the best score reached.
     """
@@ -91,7 +71,8 @@ def find_consensus(
             ),
             ScalePrior(options.prior_weight),
         ),
-        Views(views.rays, views.whitening, np.log(views.focals)),
+        views,
+        np.log(views.focals),
         log_focal_prior(camera, options),
         Settings(
             threshold=float(ransac.max_reproj_error),
@@ -151,13 +132,13 @@ def find_consensus(
     )
 
 
-def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> FocalViews:
+def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
     """Rays and weights, in pixels, at the camera's focal length or at those to be tried."""
     if options.focal == "estimate":
-        return focal_views(points_2d, camera, options.focal_prior)
+        return focal_views(points_2d, camera, options.focal_prior, None)
     camera.require_focal()
     rays = rays_of(points_2d, camera)
-    return FocalViews(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
+    return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
 
 
 def _are_in_one_plane(points: FloatArray) -> bool:
@@ -187,18 +168,8 @@ def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) 
     estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
     ``size`` keypoints, all choices of k keypoints and of a sample among them are counted, and the
     chance that the others lie within the largest of the k errors; the least such number over k
-    (over the smallest dozen and all of them, which is where it lies).
-
-    Parameters
-    ----------
-    errors : (k,) float
-        Lengths of the supporting keypoints' residuals [px].
-    count : int
-        Number of keypoints in all.
-    size : int
-        Number of keypoints that determine a model.
-    area : float
-        Area over which outliers are scattered [px^2].
+    (over the smallest dozen and all of them, which is where it lies). ``errors`` (k,) are those of
+    the supporting keypoints [px], and outliers are scattered over ``area`` [px^2].
     """
     if len(errors) <= size:
         return math.inf

@@ -18,26 +18,10 @@ _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
 class Solutions(NamedTuple):
     """Minima of every problem, the best first.
 
-    Parameters
-    ----------
-    poses : (B, k, 15) float
-        Packed alignments, see `cadalign.solvers.unknowns`.
-    costs : (B, k) float
-        Their whitened squared errors; infinite where there is none.
-    covariances : (B, 8, 8) or (B, 9, 9) float or None
-        Of the best: rotation vector, translation, log scales, log focal length.
-    statuses : (B,) int
-        See `cadalign.solvers.constants`.
-    info : (B, 4) int
-        Minima, iterations, hypotheses, undetermined unknown or -1.
-    focals : (B, k) float, optional
-        Focal lengths of the poses [px], where they were estimated.
-    sigmas : (B,) float, optional
-        Estimated standard deviations of the keypoints [px].
-    residuals : (n, 2) float
-        Projected minus observed keypoints of the best [px].
-    errors : mapping of int to CadalignError
-        Reasons why problems have no solution, by problem.
+    ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
+    there is none; ``covariances`` (B, 8, 8) or (B, 9, 9) and ``residuals`` (n, 2) [px] are those of
+    the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined
+    unknown or -1. ``focals`` (B, k) and ``sigmas`` (B,) [px] are there where they were estimated.
     """
 
     poses: FloatArray

@@ -15,7 +15,7 @@ from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.solutions import Solutions
-from cadalign.solvers.constants import OK, POSE_SIZE
+from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.projection import reproject_batch
@@ -32,7 +32,6 @@ _EXACT_COST = 1e-6
 _ONE_MINIMUM = np.array([1, 0, 1, -1])
 
 Errors = dict[int, CadalignError]
-Baseline = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 
 def solve(
@@ -67,10 +66,7 @@ def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors
     """Those found on the way, and otherwise those of the statuses."""
     errors = {
         b: solver_error(
-            int(found.statuses[b]),
-            int(found.info[b, 3]),
-            problems.points_3d[problems.rows(b)],
-            options,
+            found.statuses[b], found.info[b, 3], problems.points_3d[problems.rows(b)], options
         )
         for b in np.flatnonzero(found.statuses).tolist()
         if b not in found.errors
@@ -135,17 +131,10 @@ def _search(
     noises: FloatArray,
 ) -> Solutions:
     """Search at known focal lengths; ``noises`` (B,) multiply prior deviations and loss scales."""
-    minima = optimal_batch(
-        points,
-        rays,
-        whitening,
-        problems.offsets,
-        LOSSES[options.loss],
-        options.loss_scale * noises,
-        options.prior_weight * noises**2,
-        options.free,
-        options.min_points,
-    )
+    given = points, rays, whitening, problems.offsets
+    scales = options.loss_scale * noises, options.prior_weight * noises**2
+    loss = LOSSES[options.loss]
+    minima = optimal_batch(*given, loss, *scales, options.free, options.min_points)
     return Solutions(*minima, errors=errors)
 
 
@@ -178,10 +167,7 @@ def _with_estimated_sigmas(
 def _estimate_sigmas(
     problems: Problems, options: FitOptions, points: FloatArray, found: Solutions
 ) -> FloatArray:
-    """Standard deviations (B,) of the keypoints from their residuals [px].
-
-    From the sum of squares, or from the median where the loss is robust.
-    """
+    """Standard deviations (B,) [px] from the sum of squares, or the median for a robust loss."""
     seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
     residuals, _ = _residuals(seen, points, found)
     sigmas = np.ones(len(problems))
@@ -201,13 +187,9 @@ def _residuals(
     problems: Problems, points: FloatArray, found: Solutions
 ) -> tuple[FloatArray, IntArray]:
     """Projected minus observed keypoints (n, 2) [px], and the statuses (B,) that follow."""
+    given = points, problems.points_2d, problems.offsets
     residuals, statuses = reproject_batch(
-        points,
-        problems.points_2d,
-        problems.offsets,
-        found.poses,
-        problems.calibrations,
-        found.statuses,
+        *given, found.poses, problems.calibrations, found.statuses
     )
     for b, camera in enumerate(problems.each_camera()):
         if camera.distortion and statuses[b] == OK and b not in found.errors:
@@ -215,14 +197,13 @@ def _residuals(
             pixels = problems.points_2d[rows] + residuals[rows]
             rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
             residuals[rows] = camera.pixels_from_normalized(rays) - problems.points_2d[rows]
+            if not np.isfinite(residuals[rows]).all():
+                statuses[b] = OUT_OF_RANGE
     return residuals, statuses
 
 
 def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
-    """Put solutions that all fit exactly into the order of least stretch.
-
-    ``exact`` (B,) marks the problems with as many equations as unknowns.
-    """
+    """Order solutions that fit exactly by stretch, where ``exact`` (B,) marks such problems."""
     order = np.tile(np.arange(found.costs.shape[1]), (len(found.costs), 1))
     for b in np.flatnonzero(exact).tolist():
         count = int((found.costs[b, : found.info[b, 0]] < _EXACT_COST).sum())
@@ -237,7 +218,10 @@ def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
 
 def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
     """Solve with a baseline, which is not compiled."""
-    solver = _baseline(options.method)
+    if options.method == "epnp":
+        from cadalign.solvers.opencv import epnp as solver  # takes longer to import than the rest
+    else:
+        from cadalign.solvers.paper import aepnp_paper as solver
     rays, errors = _rays(problems)
     poses = np.zeros((len(problems), 1, POSE_SIZE))
     for b in range(len(problems)):
@@ -248,16 +232,6 @@ def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray)
         except CadalignError as error:
             errors.setdefault(b, error)
     return _one_minimum(poses, np.zeros(len(problems), dtype=np.int64), errors)
-
-
-def _baseline(method: str) -> Baseline:
-    if method == "epnp":
-        from cadalign.solvers.opencv import epnp  # OpenCV takes longer to import than all the rest
-
-        return epnp
-    from cadalign.solvers.paper import aepnp_paper
-
-    return aepnp_paper
 
 
 def _one_minimum(poses: FloatArray, statuses: IntArray, errors: Errors) -> Solutions:

@@ -37,7 +37,7 @@ class Uncertainty:
     rotation_deg: float
     translation: tuple[float, float, float]
     scale: tuple[float, float, float]
-    focal: float = 0.0
+    focal: float
 
 
 def uncertainty_of(covariance: FloatArray, known_axis: str) -> Uncertainty:
@@ -67,26 +67,12 @@ def warnings_of(
     std: Uncertainty,
     *,
     redundancy: int,
-    doubt: str | None = None,
+    doubt: str | None,
 ) -> tuple[str, ...]:
     """Warn about stretch and motion that the keypoints leave uncertain, with the reason.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        The keypoints that the alignment was fitted to.
-    alignment : Alignment
-    std : Uncertainty
-        Its predicted standard deviations.
-    redundancy : int
-        Equations minus unknowns.
-    doubt : str, optional
-        Warning about an estimated focal length that looks well determined but is doubtful.
-
-    Returns
-    -------
-    tuple of str
-        Empty where everything is well determined.
+    ``redundancy`` counts the equations minus the unknowns; ``doubt`` is a warning about an
+    estimated focal length that looks well determined.
     """
     warnings = []
     if redundancy <= 0:

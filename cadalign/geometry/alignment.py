@@ -12,6 +12,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, as_points, read_only
 from cadalign.errors import InputError
 
+_FIELDS = ("rotation", "translation", "scale")
 _ORTHONORMAL_TOLERANCE = 1e-6
 
 
@@ -70,7 +71,7 @@ class Alignment:
             )
         if (scale <= 0).any():
             raise InputError(f"{scale.tolist()} is not positive", where="scale")
-        for name, value in (("rotation", rotation), ("translation", translation), ("scale", scale)):
+        for name, value in zip(_FIELDS, (rotation, translation, scale), strict=True):
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
@@ -92,14 +93,10 @@ class Alignment:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Alignment):
             return NotImplemented
-        return bool(
-            (self.rotation == other.rotation).all()
-            and (self.translation == other.translation).all()
-            and (self.scale == other.scale).all()
-        )
+        return bool((self.packed == other.packed).all())
 
     def __hash__(self) -> int:
-        return hash((self.rotation.tobytes(), self.translation.tobytes(), self.scale.tobytes()))
+        return hash(self.packed.tobytes())
 
     @property
     def linear(self) -> FloatArray:
@@ -155,11 +152,7 @@ class Alignment:
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Write the alignment as plain lists, for JSON."""
-        return {
-            "rotation": self.rotation.tolist(),
-            "translation": self.translation.tolist(),
-            "scale": self.scale.tolist(),
-        }
+        return {name: getattr(self, name).tolist() for name in _FIELDS}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
@@ -172,7 +165,7 @@ class Alignment:
         """
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}", where="alignment")
-        missing = [key for key in ("rotation", "translation", "scale") if key not in data]
+        missing = [key for key in _FIELDS if key not in data]
         if missing:
             raise InputError(f"missing {', '.join(missing)}", where="alignment")
-        return cls(data["rotation"], data["translation"], data["scale"])
+        return cls(*(data[key] for key in _FIELDS))

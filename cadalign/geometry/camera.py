@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_points
+from cadalign.arrays import FloatArray, as_points, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.distortion import distort, undistort
@@ -74,13 +73,13 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             size = getattr(self, name)
-            if not _is_number(size) or int(size) != size or size < 1:
+            if not is_number(size) or int(size) != size or size < 1:
                 what = f"{quote(size)} is not a size"
                 raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
             object.__setattr__(self, name, int(size))
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
-            if not _is_number(value):
+            if not is_number(value):
                 raise InputError(f"{quote(value)} is not a finite number", where=f"camera.{name}")
             object.__setattr__(self, name, float(value))
         for name in ("fx", "fy"):
@@ -118,7 +117,7 @@ class Camera:
         >>> round(Camera.from_fov(640, 480, fov_x=90.0).fx, 6)
         320.0
         """
-        if not _is_number(fov_x) or not 0 < fov_x < 180:
+        if not is_number(fov_x) or not 0 < fov_x < 180:
             raise InputError(f"{quote(fov_x)} is not between 0 and 180 degrees", where="fov_x")
         focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -155,7 +154,7 @@ class Camera:
         >>> camera.with_focal(700).fy
         700.0
         """
-        if not _is_number(width) or not _is_number(height) or min(width, height) < 1:
+        if not is_number(width) or not is_number(height) or min(width, height) < 1:
             raise InputError(
                 f"{quote(width)} x {quote(height)} is not a size",
                 where="camera.width",
@@ -382,7 +381,7 @@ class Camera:
         focals = [name for name in names if name.startswith("f")]
         is_known = any(values[name] is not None for name in focals)
         for name, value in values.items():
-            if not _is_number(value) and (is_known or name not in focals):
+            if not is_number(value) and (is_known or name not in focals):
                 what = f"{name} is {quote(value)}, not a finite number"
                 raise InputError(what, where="camera.params")
         coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
@@ -395,12 +394,3 @@ class Camera:
 
 
 _SIZE_FIX = "give the image size in whole pixels"
-
-
-def _is_number(value: Any) -> bool:
-    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # a whole number beyond all floats
-        return False

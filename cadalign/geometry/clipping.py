@@ -14,23 +14,10 @@ _PARALLEL = 1e-14  # share of an edge's length that its direction must have acro
 def clipped_edges(
     extents: FloatArray, clip: FloatArray, axes: FloatArray, center: FloatArray, ends: FloatArray
 ) -> int:
-    """Find the ends of those parts of a box's edges that lie inside another box.
+    """Write the ends of those parts of a box's edges that lie inside another box; their number.
 
-    Parameters
-    ----------
-    extents, clip : (3,) float
-        Side lengths of the box and of the one that clips it.
-    axes : (3, 3) float
-        Axes of the box, as columns, in the frame of the one that clips it.
-    center : (3,) float
-        Its centre there.
-    ends : (24, 3) float
-        Receives the points, in that frame.
-
-    Returns
-    -------
-    int
-        How many there are.
+    The boxes have the side lengths ``extents`` and ``clip``; ``axes`` (columns), ``center`` and
+    ``ends`` (24, 3) of the first are in the frame of the second.
     """
     count = 0
     start = np.empty(3)

@@ -89,21 +89,10 @@ def opengl_projection(
     far: float,
     window: tuple[int, int, int, int] | None = None,
 ) -> FloatArray:
-    """The projection matrix of a camera; its lens distortion has no place in one.
+    """The projection matrix (4, 4) of a camera; its lens distortion has no place in one.
 
-    Parameters
-    ----------
-    camera : Camera
-    near, far : float
-        Depths of the clipping planes [model units], ``0 < near < far``.
-    window : tuple of 4 int, optional
-        Left, top, width and height [px] of the part of the image that fills the viewport; by
-        default all of it.
-
-    Returns
-    -------
-    (4, 4) float
-        From OpenGL's camera axes to clip coordinates.
+    It leads from OpenGL's camera axes to clip coordinates, between the depths ``near`` and ``far``.
+    The window (left, top, width, height) [px] fills the viewport; by default all of the image does.
 
     Examples
     --------

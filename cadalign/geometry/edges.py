@@ -14,14 +14,9 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 class MeshEdges:
     """The edges of a triangle mesh.
 
-    Parameters
-    ----------
-    ends : (e, 2) int
-        Vertices, the lower number first.
-    opposite : (e, 2) int
-        The third vertices of two triangles at the edge; the same one twice at a border.
-    creased : (e,) bool
-        Borders, edges of more than two triangles, and edges at which the surface bends.
+    ``ends`` (e, 2) are vertices, the lower number first; ``opposite`` (e, 2) the third vertices of
+    two triangles at the edge, the same one twice at a border. ``creased`` (e,) are borders, edges
+    of more than two triangles, and edges at which the surface bends.
     """
 
     ends: IntArray
@@ -30,15 +25,9 @@ class MeshEdges:
 
 
 def mesh_edges(vertices: FloatArray, faces: IntArray, *, crease_angle: float) -> MeshEdges:
-    """Find the edges of a mesh whose triangles may face either way.
+    """Find the edges of a mesh whose triangles, sharing vertices, may face either way.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-    faces : (m, 3) int
-        Triangles that share vertices at their common edges.
-    crease_angle : float
-        Triangles whose planes meet at a larger angle [degrees] make a crease.
+    Triangles whose planes meet at a larger angle than ``crease_angle`` [degrees] make a crease.
 
     Examples
     --------

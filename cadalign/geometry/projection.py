@@ -1,8 +1,4 @@
-"""Perspective projection of camera-frame points.
-
-The compiled projection of model points by a pose, with its derivatives, is
-`cadalign.solvers.projection`.
-"""
+"""Perspective projection of camera-frame points; that of the kernels is in `cadalign.solvers`."""
 
 from __future__ import annotations
 

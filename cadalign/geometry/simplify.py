@@ -22,15 +22,8 @@ _MOST_TRIES = 6
 class Simplified:
     """A mesh with fewer triangles.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        [model units]
-    faces : (m, 3) int
-    source : (m,) int
-        For each triangle, one of the full mesh that it replaces.
-    wires : (k, 2) int
-        Lines left of parts too thin for triangles: no triangle has these as a side.
+    ``source`` (m,) has, for each triangle, one of the full mesh that it replaces. ``wires`` (k, 2)
+    are lines left of parts too thin for triangles: no triangle has these as a side.
     """
 
     vertices: FloatArray
@@ -44,13 +37,8 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
 
     As in Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes"
     (1993). Of triangles in one place the first remains. A triangle that becomes a line remains as a
-    wire, so that masts and railings don't vanish.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    cells : float
-        Cells along the longest side of the mesh, at most `FINEST`.
+    wire, so that masts and railings don't vanish. ``cells``, at most `FINEST`, are those along the
+    longest side of the mesh.
 
     Examples
     --------
@@ -87,12 +75,6 @@ def simplify(mesh: Mesh, *, max_faces: int) -> Simplified:
 
     The grid is made coarser or finer until about as many triangles are left as may be. If none has
     a fitting number, the largest triangles of the mesh remain.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    max_faces : int
-        At least 1.
 
     Examples
     --------

@@ -29,3 +29,5 @@ DEGENERATE: Final = 2
 """The points do not span a volume."""
 NOT_FOUND: Final = 3
 """No alignment with all points in front of the camera."""
+OUT_OF_RANGE: Final = 4
+"""The numbers of the solution overflow."""

@@ -48,10 +48,7 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 @kernel
 def _invert_information(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write (J' W J)^-1 for centred points; see `covariance_of`.
-
-    Returns -1, or the number of the first unknown that the others leave undetermined.
-    """
+    """Write (J' W J)^-1 for centred points; see `covariance_of`."""
     information = np.empty((UNKNOWNS, UNKNOWNS))
     gradient = np.empty(UNKNOWNS)
     rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
@@ -73,8 +70,7 @@ def _invert_information(objective: Objective, pose: FloatArray, covariance: Floa
         column[:] = 0.0
         column[k] = 1.0
         solve_cholesky(information, UNKNOWNS, column)
-        for m in range(UNKNOWNS):
-            covariance[m, k] = column[m]
+        covariance[:, k] = column
     return -1
 
 

@@ -27,18 +27,10 @@ BLOCK = 32
 
 
 class Keypoints(NamedTuple):
-    """Keypoints of the model and their places in one image.
+    """Model points (n, 3), their observed rays (n, 2), and the loss on their whitened residuals.
 
-    Parameters
-    ----------
-    points : (n, 3) float
-        Model points.
-    rays : (n, 2) float
-        Observed normalised image coordinates.
-    whitening : (1 or n, 3) float
-        (a, b, c) such that (a du + b dv, c dv) has unit covariance for an error (du, dv).
-    loss, loss_scale : int, float
-        The loss on the length of a whitened residual, and the length at which it starts to bend.
+    A row (a, b, c) of ``whitening`` (1 or n, 3) is such that (a du + b dv, c dv) has unit
+    covariance for an error (du, dv) of a ray. The loss starts to bend at the length ``loss_scale``.
     """
 
     points: FloatArray
@@ -55,20 +47,20 @@ class ScalePrior(NamedTuple):
 
 
 class LogFocalPrior(NamedTuple):
-    """Bounds and Gaussian prior of the log focal length, relative to a reference.
-
-    Parameters
-    ----------
-    low, high : float
-        Bounds.
-    center, weight : float
-        Mean and inverse variance; the weight 0 for no prior.
-    """
+    """Bounds, mean and inverse variance (0 for no prior) of the log of a relative focal length."""
 
     low: float
     high: float
     center: float
     weight: float
+
+
+class Views(NamedTuple):
+    """Rays (k, n, 2) and whitening (k, 1 or n, 3) of keypoints at k rising focal lengths [px]."""
+
+    focals: FloatArray
+    rays: FloatArray
+    whitening: FloatArray
 
 
 @inlined

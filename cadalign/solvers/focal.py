@@ -22,10 +22,10 @@ from cadalign.solvers.evidence import (
     keypoint_rows,
 )
 from cadalign.solvers.linalg import cholesky, solve_cholesky
-from cadalign.solvers.linear import MIN_POINTS, affine_rows, moments
+from cadalign.solvers.linear import affine_rows
 from cadalign.solvers.objective import Objective, evaluate, with_keypoints
 from cadalign.solvers.projection import project_point, scalars_of
-from cadalign.solvers.refine import refine
+from cadalign.solvers.refine import least_information, refine
 from cadalign.solvers.unknowns import move_pose
 
 _ROUNDS = 60
@@ -35,7 +35,6 @@ _CONVERGED_STEP = 1e-9
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
 _HALVINGS = 12
-_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 
 
 @kernel
@@ -46,14 +45,9 @@ def linear_focal(points: FloatArray, rays: FloatArray) -> float:
     for two of its columns m and n, (m_x n_x + m_y n_y) / ratio^2 + m_z n_z = 0; the least-squares
     solution over the three pairs. NaN where the points do not span a volume or no ratio is real.
     """
-    if points.shape[0] < MIN_POINTS:
-        return np.nan
-    mean = np.empty(5)
-    products = np.empty((10, 4))
-    moments(points, rays, mean, products)
     spread = np.empty(3)
     rows = np.empty((3, 4))
-    if affine_rows(mean, products, spread, rows) != OK:
+    if affine_rows(points, rays, np.empty(5), spread, rows) != OK:
         return np.nan
     mixed = squares = 0.0
     for i in range(3):
@@ -93,20 +87,9 @@ def focal_system(
 ) -> tuple[float, float]:
     """Build the Gauss-Newton system of all 9 unknowns at a pose, without the focal length's prior.
 
-    Parameters
-    ----------
-    here : Objective
-        What `at_focal` gives for the ratio.
-    slopes, ratio : (n, 2) or (0, 2) float, float
-        As for `at_focal`.
-    pose : (15,) float
-    hessian, gradient : (9, 8), (8,) float
-        Receive the 8 x 8 system, and in the last row the focal length's products with the others.
-
-    Returns
-    -------
-    information, slope : float
-        The focal length's own entries of J' W J and J' W r.
+    ``here`` is what `at_focal` gives for the ratio. ``hessian`` (9, 8) and ``gradient`` (8,)
+    receive the system of the other 8, and in the last row the focal length's products with them;
+    its own entries of J' W J and J' W r are returned.
     """
     rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
     evaluate(here, pose, rows, hessian[:UNKNOWNS], gradient)
@@ -146,25 +129,10 @@ def refine_focal(
     pose: FloatArray,
     log_ratio: float,
 ) -> tuple[float, float, int]:
-    """Improve ``pose`` (15,) in place, and the focal length with it.
+    """Improve ``pose`` (15,) in place, and log_ratio with it, in at most ``max_rounds`` steps.
 
-    Parameters
-    ----------
-    objective, slopes
-        As for `at_focal`.
-    prior : LogFocalPrior
-        Bounds and prior of log_ratio.
-    max_rounds : int
-        Largest number of steps of the focal length.
-    pose : (15,) float
-    log_ratio : float
-        The start.
-
-    Returns
-    -------
-    cost, log_ratio : float
-        At the minimum; the cost is infinite if a point lies behind the camera at the start.
-    iterations : int
+    ``objective`` and ``slopes`` are as for `at_focal`. Returns the cost, infinite if a point lies
+    behind the camera at the start, log_ratio, and the iterations of the pose.
     """
     hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
     gradient = np.empty(UNKNOWNS)
@@ -181,10 +149,13 @@ def refine_focal(
         curvature = own + prior.weight
         whole = curvature
         # The pose follows the focal length by shift, which lessens both slope and curvature.
-        if not _factor(hessian[:UNKNOWNS]):
+        floor = least_information(hessian)
+        for k in range(UNKNOWNS):
+            hessian[k, k] += floor
+        if not cholesky(hessian, UNKNOWNS, 0.0):
             return cost, log_ratio, iterations
         shift[:] = -hessian[UNKNOWNS]
-        solve_cholesky(hessian[:UNKNOWNS], UNKNOWNS, shift)
+        solve_cholesky(hessian, UNKNOWNS, shift)
         for k in range(UNKNOWNS):
             curvature += hessian[UNKNOWNS, k] * shift[k]
             slope += gradient[k] * shift[k]
@@ -217,14 +188,3 @@ def refine_focal(
         if decrease <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost:
             break
     return cost, log_ratio, iterations
-
-
-@kernel
-def _factor(hessian: FloatArray) -> bool:
-    """Factor an 8 x 8 system in place; unknowns without evidence are held."""
-    floor = 1e-300
-    for k in range(UNKNOWNS):
-        floor = max(floor, _LEAST_INFORMATION * hessian[k, k])
-    for k in range(UNKNOWNS):
-        hessian[k, k] += floor
-    return cholesky(hessian, UNKNOWNS, 0.0)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.errors import DegenerateError
-from cadalign.solvers.constants import DEGENERATE, OK, POSE_SIZE, TOO_FEW
+from cadalign.solvers.constants import DEGENERATE, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
 from cadalign.solvers.linalg import (
     cholesky,
     eigenvectors_4,
@@ -17,9 +17,10 @@ from cadalign.solvers.linalg import (
     rotation_from_quaternion,
     solve_cholesky,
 )
-from cadalign.solvers.unknowns import pack_pose
+from cadalign.solvers.unknowns import is_pose, pack_pose
 
 MIN_POINTS = 6
+SPAN_FIX = "a linear solver needs keypoints that span a volume"
 _CANCELLATION = 1e-13  # share of a second moment below which the rest is rounding error
 _FLATNESS = 1e-7  # smallest over largest spread of points that still span a volume
 _NEWTON_STEPS = 10
@@ -56,12 +57,15 @@ def aepnp(
     Raises
     ------
     DegenerateError
-        If there are fewer than 6 points, or they lie in one plane.
+        If there are fewer than 6 points, they lie in one plane, or numbers overflow.
     """
     points = np.ascontiguousarray(points_3d, dtype=np.float64)
     directions = np.ascontiguousarray(rays, dtype=np.float64)
     pose = np.empty(POSE_SIZE)
-    if aepnp_kernel(points, directions, pose) != OK:
+    status = aepnp_kernel(points, directions, pose)
+    if status == OUT_OF_RANGE:
+        raise out_of_range_error()
+    if status != OK:
         raise aepnp_error(points)
     return pose[:9].reshape(3, 3), pose[9:12], pose[12:]
 
@@ -77,7 +81,16 @@ def aepnp_error(points_3d: FloatArray) -> DegenerateError:
     return DegenerateError(
         describe_plane(points_3d) or "the points lie nearly in one plane",
         where="points_3d",
-        fix="a linear solver needs keypoints that span a volume",
+        fix=SPAN_FIX,
+    )
+
+
+def out_of_range_error() -> DegenerateError:
+    """The error for a solution whose numbers overflow."""
+    return DegenerateError(
+        "the alignment is beyond the range of floating-point numbers",
+        where="points_3d",
+        fix="give the model and the image in other units, and check for outlying values",
     )
 
 
@@ -85,6 +98,8 @@ def describe_plane(points_3d: FloatArray) -> str | None:
     """Describe how the points fail to span a volume; None if they span one."""
     mean = points_3d.mean(axis=0)
     rows = np.vstack([points_3d - mean, np.zeros((3, 3))])  # at least three
+    if not np.isfinite(rows).all():
+        return None
     _, spread, axes = np.linalg.svd(rows, full_matrices=False)
     if spread[0] <= 1e-14 * np.abs(points_3d).max(initial=0.0):
         return "all points are the same"
@@ -101,7 +116,7 @@ def describe_plane(points_3d: FloatArray) -> str | None:
 
 
 @fast_sums
-def moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
+def _moments(points: FloatArray, rays: FloatArray, mean: FloatArray, products: FloatArray) -> None:
     """Add up the 40 sums into which all data enter.
 
     Row k of ``products`` (10, 4) is the k-th of the products 11, 1x, 1y, 1z, xx, xy, xz, yy, yz,
@@ -253,14 +268,10 @@ def aepnp_batch(
 @kernel
 def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
     """Compiled `aepnp`: writes the packed pose (15,), returns a status."""
-    if points.shape[0] < MIN_POINTS:
-        return TOO_FEW
     mean = np.empty(5)
-    products = np.empty((10, 4))
-    moments(points, rays, mean, products)
     spread = np.empty(3)
     rows = np.empty((3, 4))
-    status = affine_rows(mean, products, spread, rows)
+    status = affine_rows(points, rays, mean, spread, rows)
     if status != OK:
         return status
     rotation = np.empty((3, 3))
@@ -274,18 +285,22 @@ def aepnp_kernel(points: FloatArray, rays: FloatArray, pose: FloatArray) -> int:
         for j in range(3):
             translation[i] -= rotation[i, j] * scale[j] * mean[j]
     pack_pose(rotation, translation, scale, pose)
-    return OK
+    return OK if is_pose(pose) else OUT_OF_RANGE
 
 
 @kernel
 def affine_rows(
-    mean: FloatArray, products: FloatArray, spread: FloatArray, rows: FloatArray
+    points: FloatArray, rays: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray
 ) -> int:
     """Solve for the affine map to the camera frame, up to a factor; returns a status.
 
-    Row i of ``rows`` (3, 4) times (1, x - mean) is coordinate i. ``spread`` (3,) receives the
-    points' extent along their axes.
+    Row i of ``rows`` (3, 4) times (1, x - mean) is coordinate i; ``mean`` (5,) is as in `_moments`,
+    and ``spread`` (3,) receives the points' extent along their axes.
     """
+    if points.shape[0] < MIN_POINTS:
+        return TOO_FEW
+    products = np.empty((10, 4))
+    _moments(points, rays, mean, products)
     factor = np.empty((4, 4))
     _unpack(products, 0, factor)
     largest = 0.0

@@ -55,6 +55,7 @@ def ap4p(
     solutions = np.empty((MAX_SOLUTIONS, POSE_SIZE))
     count = ap4p_kernel(points, directions, solutions)
     found = solutions[:count]
+    found = found[np.isfinite(found).all(axis=1)]
     found = found[np.argsort((np.log(found[:, 12:]) ** 2).sum(axis=1), kind="stable")]
     return found[:, :9].reshape(-1, 3, 3), found[:, 9:12].copy(), found[:, 12:].copy()
 
@@ -89,13 +90,12 @@ def solve_subset(
 ) -> int:
     """Solve from the points with the 4 numbers ``chosen``; see `ap4p_kernel`."""
     some = np.empty((4, 3))
-    directions = np.empty((4, 3))
+    directions = np.ones((4, 3))
     for i in range(4):
         for c in range(3):
             some[i, c] = points[chosen[i], c]
-        directions[i, 0] = rays[chosen[i], 0]
-        directions[i, 1] = rays[chosen[i], 1]
-        directions[i, 2] = 1.0
+        for c in range(2):
+            directions[i, c] = rays[chosen[i], c]
     return ap4p_kernel(some, directions, solutions)
 
 
@@ -206,8 +206,8 @@ def _intersect_quadrics(quadrics: FloatArray, depths: FloatArray) -> int:
     if not best > 0.0:
         return 0
     table = np.empty((3, 7))
-    _solve_for_monomials(quadrics, x, y, z, 0, table)
-    matrix = np.zeros((9, 5))
+    _solve_for_monomials(quadrics, x, y, z, table)
+    matrix = np.zeros((12, 5))
     determinant = np.zeros(9)
     _eliminate(table, matrix, determinant)
     roots = np.empty(2 * MAX_SOLUTIONS)
@@ -224,8 +224,13 @@ def _intersect_quadrics(quadrics: FloatArray, depths: FloatArray) -> int:
         if point[0] > 0 and point[1] > 0 and point[2] > 0 and point[3] > 0:
             for i in range(4):
                 point[i] /= largest
-            if not _listed(depths, found):
-                found += 1
+            is_new = True
+            for k in range(found):
+                difference = 0.0
+                for i in range(4):
+                    difference = max(difference, abs(depths[k, i] - point[i]))
+                is_new = is_new and difference >= _SAME
+            found += is_new
     return found
 
 
@@ -241,92 +246,72 @@ def _minor(quadrics: FloatArray, a: int, b: int, c: int) -> float:
 
 
 @kernel
-def _solve_for_monomials(
-    quadrics: FloatArray, x: int, y: int, z: int, w: int, table: FloatArray
-) -> None:
-    """Solve the quadrics for y^2, yz and z^2 (the rows of ``table``).
-
-    Columns: the coefficients of w^2, xw, x^2 | yw, xy | zw, xz.
-    """
-    columns = (
-        _entry(w, w),
-        _entry(x, w),
-        _entry(x, x),
-        _entry(y, w),
-        _entry(x, y),
-        _entry(z, w),
-        _entry(x, z),
-    )
+def _solve_for_monomials(quadrics: FloatArray, x: int, y: int, z: int, table: FloatArray) -> None:
+    """Solve for y^2, yz and z^2 (rows of ``table``): coefficients of 1, x, x^2 | y, xy | z, xz."""
+    products = ((0, 0), (x, 0), (x, x), (y, 0), (x, y), (z, 0), (x, z))
     a, b, c = _entry(y, y), _entry(y, z), _entry(z, z)
     determinant = _minor(quadrics, a, b, c)
     for k in range(7):
-        column = columns[k]
+        column = _entry(products[k][0], products[k][1])
         table[0, k] = -_minor(quadrics, column, b, c) / determinant
         table[1, k] = -_minor(quadrics, a, column, c) / determinant
         table[2, k] = -_minor(quadrics, a, b, column) / determinant
+
+
+# With y^2 = a0 + a1 y + a2 z, yz = b0 + b1 y + b2 z, z^2 = c0 + c1 y + c2 z, polynomials in x, the
+# identities z (y^2) = y (yz), y (z^2) = z (yz) and (yz)^2 = (y^2)(z^2) become linear in (y, z, 1).
+_KNOWN = ("a0", "a1", "a2", "b0", "b1", "b2", "c0", "c1", "c2")
+_PLACES = np.array([0, 3, 5, 7, 10, 12, 14, 17, 19, 21])  # of their coefficients in a flat table
+_SUMS = (
+    "1 a2 c1 -1 b1 b2",  # y, z and 1 in the first identity
+    "1 a1 b2 1 a2 c2 -1 b1 a2 -1 b2 b2",
+    "1 a1 b0 1 a2 c0 -1 b1 a0 -1 b2 b0",
+    "1 c1 a1 1 c2 b1 -1 b1 b1 -1 b2 c1",  # in the second
+    "1 c1 a2 -1 b1 b2",
+    "1 c1 a0 1 c2 b0 -1 b1 b0 -1 b2 c0",
+    "2 b0 b1 -1 a0 c1 -1 a1 c0",  # in the third
+    "2 b0 b2 -1 a0 c2 -1 a2 c0",
+    "1 b0 b0 -1 a0 c0",
+    "1 b1 b1 -1 a1 c1",  # y^2, yz and z^2 in the third
+    "2 b1 b2 -1 a1 c2 -1 a2 c1",
+    "1 b2 b2 -1 a2 c2",
+)
+
+
+def _products() -> IntArray:
+    """Expand `_SUMS` into rows: sum, power of x, factor, and places of the two coefficients."""
+    rows = []
+    for row, text in enumerate(_SUMS):
+        words = text.split()
+        for factor, *pair in zip(words[::3], words[1::3], words[2::3], strict=True):
+            a, b = (range(*_PLACES[_KNOWN.index(name) :][:2]) for name in pair)
+            rows += [(row, i - a[0] + j - b[0], int(factor), i, j) for i in a for j in b]
+    return np.array(rows)
+
+
+_PRODUCTS = _products()
 
 
 @kernel
 def _eliminate(table: FloatArray, matrix: FloatArray, determinant: FloatArray) -> None:
     """Turn the three identities between the monomials into a 3 x 3 matrix over polynomials in x.
 
-    With y^2 = a0 + a1 y + a2 z, yz = b0 + b1 y + b2 z, z^2 = c0 + c1 y + c2 z, the identities
-    z (y^2) = y (yz), y (z^2) = z (yz) and (yz)^2 = (y^2)(z^2) become linear in (y, z, 1). Rows
-    3 r ... 3 r + 2 of ``matrix`` (9, 5) are the coefficients of y, z and 1 in identity r; its
-    determinant has degree 8.
+    Rows 3 r ... 3 r + 2 of ``matrix`` (12, 5) receive the coefficients of y, z and 1 in identity r;
+    their determinant has degree 8. The last three rows are scratch space.
     """
-    a0, a1, a2 = table[0, 0:3], table[0, 3:5], table[0, 5:7]
-    b0, b1, b2 = table[1, 0:3], table[1, 3:5], table[1, 5:7]
-    c0, c1, c2 = table[2, 0:3], table[2, 3:5], table[2, 5:7]
-
-    multiply_add(matrix[0], a2, c1, 1.0)
-    multiply_add(matrix[0], b1, b2, -1.0)
-    multiply_add(matrix[1], a1, b2, 1.0)
-    multiply_add(matrix[1], a2, c2, 1.0)
-    multiply_add(matrix[1], b1, a2, -1.0)
-    multiply_add(matrix[1], b2, b2, -1.0)
-    multiply_add(matrix[2], a1, b0, 1.0)
-    multiply_add(matrix[2], a2, c0, 1.0)
-    multiply_add(matrix[2], b1, a0, -1.0)
-    multiply_add(matrix[2], b2, b0, -1.0)
-
-    multiply_add(matrix[3], c1, a1, 1.0)
-    multiply_add(matrix[3], c2, b1, 1.0)
-    multiply_add(matrix[3], b1, b1, -1.0)
-    multiply_add(matrix[3], b2, c1, -1.0)
-    multiply_add(matrix[4], c1, a2, 1.0)
-    multiply_add(matrix[4], b1, b2, -1.0)
-    multiply_add(matrix[5], c1, a0, 1.0)
-    multiply_add(matrix[5], c2, b0, 1.0)
-    multiply_add(matrix[5], b1, b0, -1.0)
-    multiply_add(matrix[5], b2, c0, -1.0)
+    known = table.reshape(21)
+    for t in range(_PRODUCTS.shape[0]):
+        row, power, factor = _PRODUCTS[t, 0], _PRODUCTS[t, 1], _PRODUCTS[t, 2]
+        matrix[row, power] += factor * known[_PRODUCTS[t, 3]] * known[_PRODUCTS[t, 4]]
     for k in range(3):
-        matrix[0, k] -= b0[k]
-        matrix[1, k] += a0[k]
-        matrix[3, k] += c0[k]
-        matrix[4, k] -= b0[k]
-
-    squares = np.zeros((3, 3))  # the coefficients of y^2, yz and z^2 in the third identity
-    multiply_add(squares[0], b1, b1, 1.0)
-    multiply_add(squares[0], a1, c1, -1.0)
-    multiply_add(squares[1], b1, b2, 2.0)
-    multiply_add(squares[1], a1, c2, -1.0)
-    multiply_add(squares[1], a2, c1, -1.0)
-    multiply_add(squares[2], b2, b2, 1.0)
-    multiply_add(squares[2], a2, c2, -1.0)
-    multiply_add(matrix[6], b0, b1, 2.0)
-    multiply_add(matrix[6], a0, c1, -1.0)
-    multiply_add(matrix[6], a1, c0, -1.0)
-    multiply_add(matrix[7], b0, b2, 2.0)
-    multiply_add(matrix[7], a0, c2, -1.0)
-    multiply_add(matrix[7], a2, c0, -1.0)
-    multiply_add(matrix[8], b0, b0, 1.0)
-    multiply_add(matrix[8], a0, c0, -1.0)
+        matrix[0, k] -= table[1, k]
+        matrix[1, k] += table[0, k]
+        matrix[3, k] += table[2, k]
+        matrix[4, k] -= table[1, k]
     for k in range(3):
-        multiply_add(matrix[6], squares[k], table[k, 3:5], 1.0)
-        multiply_add(matrix[7], squares[k], table[k, 5:7], 1.0)
-        multiply_add(matrix[8], squares[k], table[k, 0:3], 1.0)
-
+        multiply_add(matrix[6], matrix[9 + k, :3], table[k, 3:5], 1.0)
+        multiply_add(matrix[7], matrix[9 + k, :3], table[k, 5:7], 1.0)
+        multiply_add(matrix[8], matrix[9 + k, :3], table[k, 0:3], 1.0)
     product = np.zeros(7)
     for k in range(3):  # expand along the first identity
         p, q = (k + 1) % 3, (k + 2) % 3
@@ -372,7 +357,7 @@ def _polish(quadrics: FloatArray, point: FloatArray) -> bool:
     """Improve an intersection, at point[0] = 1, by Newton's method; False where it is not one."""
     jacobian = np.empty((3, 3))
     values = np.empty(3)
-    saved = np.empty(3)
+    change = np.empty(3)
     a, b, c, d = point[0], point[1], point[2], point[3]
     error = np.inf
     for iteration in range(_POLISH_STEPS + 1):
@@ -394,41 +379,19 @@ def _polish(quadrics: FloatArray, point: FloatArray) -> bool:
         if determinant == 0.0:
             break
         for k in range(3):  # Cramer's rule
+            for r in range(3):  # swap them, and back below
+                jacobian[r, k], values[r] = values[r], jacobian[r, k]
+            change[k] = _minor(jacobian, 0, 1, 2) / determinant
             for r in range(3):
-                saved[r] = jacobian[r, k]
-                jacobian[r, k] = values[r]
-            change = _minor(jacobian, 0, 1, 2) / determinant
-            for r in range(3):
-                jacobian[r, k] = saved[r]
-            if k == 0:
-                b -= change
-            elif k == 1:
-                c -= change
-            else:
-                d -= change
+                jacobian[r, k], values[r] = values[r], jacobian[r, k]
+        b, c, d = b - change[0], c - change[1], d - change[2]
     point[1], point[2], point[3] = b, c, d
     return error < _EXACT
 
 
 @kernel
-def _listed(depths: FloatArray, last: int) -> bool:
-    """True if row ``last`` repeats an earlier row."""
-    for k in range(last):
-        difference = 0.0
-        for i in range(4):
-            difference = max(difference, abs(depths[k, i] - depths[last, i]))
-        if difference < _SAME:
-            return True
-    return False
-
-
-@kernel
 def _pose_from_depths(
-    points: FloatArray,
-    rays: FloatArray,
-    weights: FloatArray,
-    depths: FloatArray,
-    pose: FloatArray,
+    points: FloatArray, rays: FloatArray, weights: FloatArray, depths: FloatArray, pose: FloatArray
 ) -> bool:
     """Pack rotation, translation and scale; False for a mirrored or inexact solution."""
     columns = np.zeros((3, 3))
@@ -449,7 +412,7 @@ def _pose_from_depths(
             cosine += columns[c, j] * columns[c, (j + 1) % 3]
         if not abs(cosine) < _ORTHOGONAL:
             return False
-    rotation = np.empty((3, 3))
+    rotation = pose[:9].reshape(3, 3)
     polish_rotation(columns, rotation)
     for j in range(3):
         pose[12 + j] = lengths[j] / lengths[0]
@@ -460,6 +423,4 @@ def _pose_from_depths(
             for j in range(3):
                 total -= rotation[c, j] * pose[12 + j] * points[i, j]
         pose[9 + c] = total / 4.0
-        for j in range(3):
-            pose[3 * c + j] = rotation[c, j]
     return True

@@ -25,15 +25,7 @@ from cadalign.solvers.unknowns import hold_fixed
 
 
 class Objective(NamedTuple):
-    """Unknowns and evidence of one problem.
-
-    Parameters
-    ----------
-    free : (8,) float
-        0 for an unknown that keeps its value, 1 for the others.
-    keypoints : Keypoints
-    scale_prior : ScalePrior
-    """
+    """Evidence of one problem; ``free`` (8,) is 0 for an unknown that keeps its value, else 1."""
 
     free: FloatArray
     keypoints: Keypoints

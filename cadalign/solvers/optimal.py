@@ -10,6 +10,7 @@ from cadalign.solvers.constants import (
     DEGENERATE,
     NOT_FOUND,
     OK,
+    OUT_OF_RANGE,
     POSE_SIZE,
     TOO_FEW,
     UNKNOWNS,
@@ -78,6 +79,8 @@ def optimal_batch(
             statuses[b] = DEGENERATE
         elif info[b, 0] == 0:
             statuses[b] = NOT_FOUND
+        elif not np.isfinite(covariances[b]).all():
+            statuses[b] = OUT_OF_RANGE
     return poses, costs, covariances, statuses, info
 
 
@@ -85,23 +88,7 @@ def optimal_batch(
 def optimal_kernel(
     objective: Objective, poses: FloatArray, costs: FloatArray, covariance: FloatArray
 ) -> tuple[int, int, int, int]:
-    """Find the minima of the whitened reprojection error, the best first.
-
-    Parameters
-    ----------
-    objective : Objective
-    poses, costs : (MAX_MINIMA, 15), (MAX_MINIMA,) float
-        Receive the minima.
-    covariance : (8, 8) float
-        Receives the covariance of the best: rotation vector [rad], translation, log scales.
-
-    Returns
-    -------
-    minima, iterations, hypotheses : int
-        How many minima were found, in how many refinement steps, from how many starts.
-    undetermined : int
-        -1, or the number of an unknown that the points do not determine.
-    """
+    """Write the minima of one problem, the best first, and its covariance; returns the `info`."""
     points = objective.keypoints.points
     center, unit = center_and_unit(points)
     if not unit > 0:

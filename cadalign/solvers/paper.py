@@ -7,11 +7,16 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.solvers.linear import MIN_POINTS, aepnp_error, describe_plane
+from cadalign.solvers.linear import (
+    MIN_POINTS,
+    SPAN_FIX,
+    aepnp_error,
+    describe_plane,
+    out_of_range_error,
+)
 
-_FIX = "a linear solver needs keypoints that span a volume"
 
-
+@np.errstate(all="ignore")
 def aepnp_paper(
     points_3d: npt.ArrayLike, rays: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -41,7 +46,7 @@ def aepnp_paper(
     Raises
     ------
     DegenerateError
-        If there are fewer than 6 points, or an axis comes out with no length.
+        If there are fewer than 6 points, an axis comes out with no length, or numbers overflow.
     """
     points = np.asarray(points_3d, dtype=float)
     count = len(points)
@@ -55,7 +60,10 @@ def aepnp_paper(
     system[1::2, :, 1] = weights
     system[1::2, :, 2] = -v[:, None] * weights
     matrix = system.reshape(2 * count, 12)
-    _, vectors = np.linalg.eigh(matrix.T @ matrix)
+    squares = matrix.T @ matrix
+    if not np.isfinite(squares).all():
+        raise out_of_range_error()
+    _, vectors = np.linalg.eigh(squares)
     control_points = vectors[:, 0].reshape(4, 3)
     if (weights @ control_points[:, 2]).sum() < 0:
         control_points = -control_points
@@ -63,11 +71,8 @@ def aepnp_paper(
     axes = (control_points[:3] - origin).T
     lengths = np.linalg.norm(axes, axis=0)
     if not (lengths > 1e-12 * np.abs(control_points).max()).all():
-        raise DegenerateError(
-            "an axis of the model came out with no length",
-            where="points_3d",
-            fix=_FIX,
-        )
+        what = "an axis of the model came out with no length"
+        raise DegenerateError(what, where="points_3d", fix=SPAN_FIX)
     left, _, right = np.linalg.svd(axes / lengths)
     rotation = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     return rotation, origin / lengths[0], lengths / lengths[0]

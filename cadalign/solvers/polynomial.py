@@ -74,23 +74,10 @@ def real_roots(
 
     The roots of a derivative separate those of the function above it: starting from the highest
     derivative but one, every stretch between neighbouring critical points holds at most one root.
-
-    Parameters
-    ----------
-    coefficients : (degree + 1,) float
-        From the constant upwards; the degree is at least 2.
-    start, end : float
-        The interval.
-    touching : float
-        An extremum counts as a root where its value is below this share of the sum of the terms'
-        magnitudes: a double root that rounding or noise has lifted off zero.
-    roots : (2 * degree,) float
-        Receives the roots.
-
-    Returns
-    -------
-    int
-        How many there are.
+    ``coefficients`` (degree + 1,) run from the constant upwards, with a degree of at least 2. An
+    extremum counts as a root where its value is below the share ``touching`` of the sum of the
+    terms' magnitudes: a double root that rounding or noise has lifted off zero. Returns the number
+    of ``roots`` (2 * degree,).
     """
     derivative = np.empty(degree + 1)
     critical = np.empty(degree + 2)
@@ -125,8 +112,7 @@ def real_roots(
                     found += 1
             low = high
             low_value = high_value
-        for k in range(new):
-            critical[k] = following[k]
+        critical, following = following, critical
         count = new
     for k in range(count):
         roots[found] = critical[k]

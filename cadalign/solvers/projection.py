@@ -10,7 +10,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.constants import NOT_FOUND, OK, UNKNOWNS
+from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
+from cadalign.solvers.unknowns import is_pose
 
 Scalars = tuple[float, ...]
 Triple = tuple[float, float, float]
@@ -19,23 +20,8 @@ Triple = tuple[float, float, float]
 @inlined
 def scalars_of(pose: FloatArray) -> Scalars:
     """The 15 numbers of a packed pose as a tuple."""
-    return (
-        pose[0],
-        pose[1],
-        pose[2],
-        pose[3],
-        pose[4],
-        pose[5],
-        pose[6],
-        pose[7],
-        pose[8],
-        pose[9],
-        pose[10],
-        pose[11],
-        pose[12],
-        pose[13],
-        pose[14],
-    )
+    rotation = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
+    return rotation + (pose[9], pose[10], pose[11], pose[12], pose[13], pose[14])
 
 
 @inlined
@@ -58,10 +44,9 @@ def write_derivatives(
     first: int,
     second: int,
 ) -> None:
-    """Write the derivatives of (a u + b v, c v) by the 8 unknowns, for ``weights`` (a, b, c).
+    """Write the derivatives by unknown k, for ``weights`` (a, b, c), into row k < 8 of ``rows``.
 
-    Row k of ``rows`` is unknown k; column ``first`` receives the derivatives of a u + b v, column
-    ``second`` those of c v.
+    Column ``first`` receives those of a u + b v, column ``second`` those of c v.
     """
     x, y, z = point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
     ax, ay, az = pose[1] * y, pose[4] * y, pose[7] * y  # by log s_y
@@ -120,21 +105,26 @@ def reproject_batch(
 
     Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``; ``poses`` (B, k, 15) are packed;
     ``cameras`` (1 or B, 4) holds fx, fy, cx, cy. Also returns the statuses (B,), in which a solved
-    problem with a point behind the camera becomes NOT_FOUND.
+    problem with a point behind the camera becomes NOT_FOUND, and one that overflows OUT_OF_RANGE.
     """
     residuals = np.empty((points.shape[0], 2))
     checked = statuses.copy()
     for b in range(offsets.shape[0] - 1):
         pose = scalars_of(poses[b, 0])
         nearest = np.inf
+        squares = 0.0
         camera = cameras[b if cameras.shape[0] > 1 else 0]
         for i in range(offsets[b], offsets[b + 1]):
             u, v, depth = project_point(pose, (points[i, 0], points[i, 1], points[i, 2]))
             nearest = min(nearest, depth)
             residuals[i, 0] = u * camera[0] + camera[2] - points_2d[i, 0]
             residuals[i, 1] = v * camera[1] + camera[3] - points_2d[i, 1]
-        if checked[b] == OK and not nearest > 0:
-            checked[b] = NOT_FOUND
+            squares += residuals[i, 0] ** 2 + residuals[i, 1] ** 2
+        if checked[b] == OK:
+            if not nearest > 0:
+                checked[b] = NOT_FOUND
+            elif not (squares < np.inf and is_pose(poses[b, 0])):
+                checked[b] = OUT_OF_RANGE
     return residuals, checked
 
 

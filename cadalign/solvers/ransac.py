@@ -19,6 +19,7 @@ from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
 from cadalign.solvers.evidence import (
     Keypoints,
     LogFocalPrior,
+    Views,
     relative_to,
     squared_error,
     take_keypoints,
@@ -48,41 +49,12 @@ _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 
 
-class Views(NamedTuple):
-    """The keypoints' images at each focal length that is tried.
-
-    Parameters
-    ----------
-    rays, whitening : (k, n, 2), (k, 1 or n, 3) float
-        Normalised image coordinates, and the weights that turn their errors into pixels.
-    log_focals : (k,) float
-        Logarithms of the focal lengths; one of any value where it is known.
-    """
-
-    rays: FloatArray
-    whitening: FloatArray
-    log_focals: FloatArray
-
-
 class Settings(NamedTuple):
     """Options of the search; see `cadalign.RansacOptions`.
 
-    Parameters
-    ----------
-    threshold : float
-        Largest reprojection error of an inlier [px].
-    minimal, size : int
-        Minimal solver, AP4P or AEPNP, and its number of points.
-    max_iterations, min_iterations, success_prob, seed
-    exhaustive : bool
-        Try every subset once, in order, instead of drawing.
-    guided : bool
-        Draw from the first points first.
-    optimize : bool
-        Optimise new best hypotheses locally, and, at a known focal length, the last one on all its
-        inliers.
-    estimate_focal : bool
-        The focal length is unknown.
+    ``size`` is the minimal solver's number of points, ``threshold`` in pixels. An exhaustive search
+    tries every subset once, in order; a guided one draws from the first points first. At a known
+    focal length, ``optimize`` also refines the last hypothesis on all its inliers.
     """
 
     threshold: float
@@ -102,6 +74,7 @@ class Settings(NamedTuple):
 def ransac_kernel(
     objective: Objective,
     views: Views,
+    log_focals: FloatArray,
     focal_prior: LogFocalPrior,
     settings: Settings,
     pose: FloatArray,
@@ -109,24 +82,10 @@ def ransac_kernel(
 ) -> tuple[float, float, int, int]:
     """Find the pose, and the focal length where it is unknown, with the lowest truncated score.
 
-    Parameters
-    ----------
-    objective : Objective
-        The model points, by falling confidence where the search is guided, loss and scale prior;
-        the rays and weights are those of the views.
-    views : Views
-    focal_prior : LogFocalPrior
-        Bounds and prior of the log focal length.
-    settings : Settings
-    pose, inliers : (15,) float, (n,) bool
-        Receive the result.
-
-    Returns
-    -------
-    score : float
-        Sum of squared errors, each at most the threshold's square [px^2].
-    log_focal : float
-    iterations, hypotheses : int
+    The objective has the points, by falling confidence where the search is guided; its rays and
+    weights are those of the views, which have one log focal length of any value where it is known.
+    Returns the score, a sum of squared errors, each at most the threshold's square [px^2], the log
+    focal length, and the numbers of iterations and hypotheses.
     """
     n = objective.keypoints.points.shape[0]
     size = settings.size
@@ -144,7 +103,7 @@ def ransac_kernel(
     random_support = _RANDOM_SUPPORT
     best = np.inf
     best_support = 0
-    best_focal = views.log_focals[0]
+    best_focal = log_focals[0]
     best_view = _view(objective, views, 0)
     iterations = 0
     hypotheses = 0
@@ -162,7 +121,7 @@ def ransac_kernel(
                 grow_pool(growth, size, n, iterations // 2)
             draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
-        for f in range(views.log_focals.shape[0]):
+        for f in range(log_focals.shape[0]):
             view = _view(objective, views, f)
             found = _solve_sample(view.keypoints, settings.minimal, chosen, candidates)
             hypotheses += found
@@ -181,7 +140,7 @@ def ransac_kernel(
                 if not score < best:
                     continue
                 best, best_support, best_view = score, support, view
-                best_focal = views.log_focals[f]
+                best_focal = log_focals[f]
                 pose[:] = candidates[k]
                 if settings.optimize:
                     trial[:] = candidates[k]

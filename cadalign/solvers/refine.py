@@ -20,15 +20,19 @@ _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known o
 
 
 @kernel
-def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple[float, int, bool]:
-    """Improve ``pose`` (15,) in place.
+def least_information(hessian: FloatArray) -> float:
+    """What is added to the diagonal to hold unknowns without evidence where they are."""
+    least = 1e-300
+    for k in range(UNKNOWNS):
+        least = max(least, _LEAST_INFORMATION * hessian[k, k])
+    return least
 
-    Returns
-    -------
-    cost : float
-        At the final pose; infinite if a point lies behind the camera at the start.
-    iterations : int
-    converged : bool
+
+@kernel
+def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple[float, int, bool]:
+    """Improve ``pose`` (15,) in place; returns the cost, the iterations, and if they converged.
+
+    The cost is infinite if a point lies behind the camera at the start.
     """
     hessian = np.empty((UNKNOWNS, UNKNOWNS))
     gradient = np.empty(UNKNOWNS)
@@ -62,10 +66,7 @@ def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple
             growth *= 2.0
         if not cost < np.inf or done or iterations >= max_iterations:
             return cost, iterations, done
-        # Holds unknowns without evidence where they are.
-        floor = 1e-300
-        for k in range(UNKNOWNS):
-            floor = max(floor, _LEAST_INFORMATION * hessian[k, k])
+        floor = least_information(hessian)
         solved = False
         while not solved:
             if damping > _LARGEST_DAMPING:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
 from cadalign.solvers.minimal import MAX_SOLUTIONS, solve_subset
+from cadalign.solvers.projection import Triple
+from cadalign.solvers.sampling import next_subset
 from cadalign.solvers.unknowns import pack_pose
 
 _DRAWS_PER_SUBSET = 4
@@ -37,18 +39,13 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
     n = points.shape[0]
     wanted = subsets.shape[0]
     total = n * (n - 1) * (n - 2) * (n - 3) // 24
+    draw = np.arange(4)
     if total <= wanted:
-        row = 0
-        for a in range(n - 3):
-            for b in range(a + 1, n - 2):
-                for c in range(b + 1, n - 1):
-                    for d in range(c + 1, n):
-                        subsets[row, 0], subsets[row, 1] = a, b
-                        subsets[row, 2], subsets[row, 3] = c, d
-                        row += 1
+        for row in range(total):
+            subsets[row] = draw
+            next_subset(draw, n)
         return int(total)
     volumes = np.full(wanted, -1.0)
-    draw = np.empty(4, dtype=np.int64)
     state = np.uint64(88172645463325252)
     for _ in range(_DRAWS_PER_SUBSET * wanted):
         k = 0
@@ -75,25 +72,17 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
     return int(wanted)
 
 
+@inlined
+def _difference(points: FloatArray, i: int, j: int) -> Triple:
+    return points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+
+
 @kernel
 def _volume(points: FloatArray, chosen: IntArray) -> float:
     """Six times the volume of a tetrahedron."""
-    a, b, c, d = chosen[0], chosen[1], chosen[2], chosen[3]
-    ux, uy, uz = (
-        points[b, 0] - points[a, 0],
-        points[b, 1] - points[a, 1],
-        points[b, 2] - points[a, 2],
-    )
-    vx, vy, vz = (
-        points[c, 0] - points[a, 0],
-        points[c, 1] - points[a, 1],
-        points[c, 2] - points[a, 2],
-    )
-    wx, wy, wz = (
-        points[d, 0] - points[a, 0],
-        points[d, 1] - points[a, 1],
-        points[d, 2] - points[a, 2],
-    )
+    ux, uy, uz = _difference(points, chosen[1], chosen[0])
+    vx, vy, vz = _difference(points, chosen[2], chosen[0])
+    wx, wy, wz = _difference(points, chosen[3], chosen[0])
     return float(
         abs(ux * (vy * wz - vz * wy) - uy * (vx * wz - vz * wx) + uz * (vx * wy - vy * wx))
     )
@@ -118,13 +107,13 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
         alpha = 2.0 * np.pi * (k + 0.5) / np.sqrt(2.0)
         beta = 2.0 * np.pi * (k + 0.5) / 1.533751168755204288118041
         low, high = np.sqrt(s), np.sqrt(1.0 - s)
-        rotation_from_quaternion(
+        w, x, y, z = (
             low * np.sin(alpha),
             low * np.cos(alpha),
             high * np.sin(beta),
             high * np.cos(beta),
-            rotation,
         )
+        rotation_from_quaternion(w, x, y, z, rotation)
         matrix[:] = 0.0
         right[:] = 0.0
         for i in range(points.shape[0]):

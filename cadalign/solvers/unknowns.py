@@ -16,6 +16,7 @@ from cadalign.solvers.linalg import polish_rotation
 
 _LARGEST_STRETCH = 1e3
 _LARGEST_LOG_STEP = 2.0
+_ROTATION_ERROR = 1e-10
 
 
 @kernel
@@ -80,11 +81,22 @@ def uncenter(pose: FloatArray, center: FloatArray, unit: float) -> None:
 @kernel
 def orthonormalize(pose: FloatArray) -> None:
     """Remove the rounding errors of the steps from the rotation, in place."""
-    rotation = np.empty((3, 3))
-    polish_rotation(pose[:9].reshape(3, 3), rotation)
+    rotation = pose[:9].reshape(3, 3)
+    polish_rotation(rotation, rotation)
+
+
+@kernel
+def is_pose(pose: FloatArray) -> bool:
+    """True if all numbers are finite, the scales positive, and the rotation is one."""
+    error = 0.0
     for i in range(3):
         for j in range(3):
-            pose[3 * i + j] = rotation[i, j]
+            product = -1.0 if i == j else 0.0
+            for k in range(3):
+                product += pose[3 * i + k] * pose[3 * j + k]
+            error = max(error, abs(product)) if product == product else np.inf
+        error += 0.0 * (pose[9 + i] + pose[12 + i])
+    return error < _ROTATION_ERROR and min(pose[12], pose[13], pose[14]) > 0.0
 
 
 @kernel

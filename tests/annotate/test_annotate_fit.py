@@ -264,23 +264,24 @@ def test_projection_jacobian_matches_differences(seed: int) -> None:
         camera = LENS_CAMERA.with_focal(LENS_CAMERA.fx * np.exp(step[8]))
         return camera.project(points @ linear.T + pose.translation + step[3:6])
 
-    jacobian = projection_jacobian(points, LENS_CAMERA, pose, unknowns=9)
+    jacobian = projection_jacobian(points, LENS_CAMERA, pose, known_axis="x", unknowns=9)
     for unknown in range(9):
         step = np.zeros(9)
         step[unknown] = 1e-6
         difference = (project(step) - project(-step)) / 2e-6
         np.testing.assert_allclose(jacobian[:, :, unknown], difference, rtol=1e-5, atol=1e-4)
     np.testing.assert_array_equal(
-        projection_jacobian(points, LENS_CAMERA, pose), jacobian[:, :, :8]
+        projection_jacobian(points, LENS_CAMERA, pose, known_axis="x", unknowns=8),
+        jacobian[:, :, :8],
     )
 
 
 def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
     pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
     with pytest.raises(InputError, match=r"^unknowns: 7 is neither 8 nor 9$"):
-        projection_jacobian(np.zeros((1, 3)), LENS_CAMERA, pose, unknowns=7)
+        projection_jacobian(np.zeros((1, 3)), LENS_CAMERA, pose, known_axis="x", unknowns=7)
     with pytest.raises(InputError, match=r"^points_3d: a point lies behind the camera$"):
-        projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose)
+        projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose, known_axis="x", unknowns=8)
 
 
 # --- text -----------------------------------------------------------------------------------

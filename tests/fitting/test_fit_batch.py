@@ -244,6 +244,12 @@ def first_with(row: int, value: float) -> list[np.ndarray]:
         ({"sigma": [1.0] * 5}, "sigma: 6 problems but 5 values"),
         ({"workers": 0}, "workers: must be >= 1, or -1 for all cores, not 0"),
         ({"workers": -2}, "workers: must be >= 1, or -1 for all cores, not -2"),
+        ({"workers": 2.5}, "workers: must be >= 1, or -1 for all cores, not 2.5"),
+        ({"workers": "2"}, "workers: must be >= 1, or -1 for all cores, not '2'"),
+        (
+            {"points_3d": None},
+            "points_3d: expected a sequence of one entry per problem, got NoneType",
+        ),
         (
             {"method": "best"},
             "method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp",

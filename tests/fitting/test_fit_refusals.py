@@ -9,8 +9,8 @@ import pytest
 from support.problems import problem_of
 from support.refusals import refusal
 
-from cadalign import Camera, fit
-from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign import Camera, RansacOptions, fit
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
 METHODS = ["optimal", "aepnp", "aepnp-paper", "epnp"]
@@ -95,6 +95,16 @@ def with_value(array: np.ndarray, row: int, value: float) -> np.ndarray:
             [["a", 0, 0]] * 8,
             GOOD.points_2d,
             "points_3d: not an array of numbers (could not convert string to float: 'a')",
+        ),
+        (
+            GOOD.points_3d.astype(complex),
+            GOOD.points_2d,
+            "points_3d: not an array of numbers (they are complex128)",
+        ),
+        (
+            np.ma.masked_greater(GOOD.points_3d, 0.0),
+            GOOD.points_2d,
+            "points_3d: not an array of numbers (some are masked)",
         ),
     ],
 )
@@ -242,7 +252,24 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ({"loss": "l1"}, "loss: unknown loss 'l1'; known are linear, huber, cauchy"),
         ({"loss_scale": 0}, "loss_scale: 0 is not positive"),
         ({"loss_scale": np.nan}, "loss_scale: nan is not positive"),
+        ({"loss_scale": "2"}, "loss_scale: '2' is not positive"),
         ({"scale_prior_sigma": -0.1}, "scale_prior_sigma: -0.1 is not positive"),
+        ({"scale_prior_sigma": "0.3"}, "scale_prior_sigma: '0.3' is not positive"),
+        (
+            {"scale_prior_sigma": 1e-200},
+            "scale_prior_sigma: 1e-200 is not between 1e-100 and 1e+100",
+        ),
+        ({"sigma": [[1.0], [1.0, 2.0]]}, "sigma: its entries are not of one shape"),
+        (
+            {"sigma": 10**400},
+            f"sigma: {quote(10**400)} is not a standard deviation; " + SIGMA_FIX,
+        ),
+        ({"loss": ["huber"]}, "loss: unknown loss ['huber']; known are linear, huber, cauchy"),
+        ({"ransac": True}, "ransac: expected a cadalign.RansacOptions, got bool"),
+        (
+            {"ransac": RansacOptions(), "sigma": np.ones(3)},
+            "sigma: shape (3,), expected (8)",
+        ),
         (
             {"stretch": "x"},
             "stretch: 'x' are not axes that can stretch where x is known; "
@@ -283,3 +310,32 @@ def test_noise_of_keypoints_that_always_fit_cannot_be_estimated() -> None:
         "sigma: 4 keypoints fit exactly, so their noise cannot be estimated; "
         "give sigma, or more keypoints"
     )
+
+
+def test_matrices_and_numbers_of_any_width_are_taken() -> None:
+    given = [GOOD.points_2d, GOOD.camera]
+    expected = fit(GOOD.points_3d, *given, loss="huber")
+    result = fit(np.asmatrix(GOOD.points_3d), *given, loss="huber", loss_scale=np.float32(2.0))
+    assert type(result.points_3d) is np.ndarray
+    assert result.alignment == expected.alignment
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("size", [1e20, 1e80, 1e160, 1e300])
+def test_numbers_beyond_the_range_give_a_rotation_or_a_clear_error(
+    method: str, size: float
+) -> None:
+    for points_3d, points_2d in (
+        (size * GOOD.points_3d, GOOD.points_2d),
+        (GOOD.points_3d, size * GOOD.points_2d),
+        (size * GOOD.points_3d, size * GOOD.points_2d),
+    ):
+        try:
+            result = fit(points_3d, points_2d, GOOD.camera, method=method)
+        except DegenerateError:
+            continue
+        rotation = result.alignment.rotation
+        assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
+        assert np.isfinite(result.alignment.translation).all()
+        assert np.isfinite(result.rms)

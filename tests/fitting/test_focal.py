@@ -18,6 +18,7 @@ from cadalign.datasets import Bundler, Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.fitting.focal import search
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.focal import linear_focal
 
@@ -77,7 +78,7 @@ def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
         bound = cramer_rao_bound(
             problem.points_3d, SIMULATION_CAMERA, gt, sigma=1.0, focal="estimate"
         )
-        limits.append(sample_limit(bound, gt, rng=rng, draws=20))
+        limits.append(sample_limit(bound, rng=rng, draws=20))
         est = batch.alignment(b)
         errors.append(
             (
@@ -549,3 +550,24 @@ def test_pixels_that_no_lens_reaches_are_refused() -> None:
     points_2d = np.array([[1e7, 1e7], [0, 0], [600, 400], [3, 470], [300, 5], [1e6, 3]])
     with pytest.raises(InputError, match="the lens distortion cannot be undone"):
         fit(np.random.default_rng(0).uniform(-1, 1, (6, 3)), points_2d, camera, focal="estimate")
+
+
+def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The lens model may fail at the focal length found, where it did not at those tried."""
+    covariance = search._covariance
+    seen = []
+
+    def fails_once(*arguments: Any) -> Any:
+        seen.append(arguments)
+        if len(seen) == 1:
+            raise InputError("the lens distortion cannot be undone", where="points_2d")
+        return covariance(*arguments)
+
+    monkeypatch.setattr(search, "_covariance", fails_once)
+    problem = problem_of(3, points=8, noise_px=0.0)
+    given = [problem.points_3d] * 2, [problem.points_2d] * 2
+    batch = fit_batch(*given, problem.camera, focal="estimate")
+    assert batch.solved.tolist() == [False, True]
+    assert isinstance(batch.errors[0], InputError)

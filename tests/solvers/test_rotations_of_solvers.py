@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from cadalign import Camera, FitResult, RansacOptions, fit
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.solvers import aepnp, aepnp_paper
 
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -62,3 +65,18 @@ def test_boxes_and_flat_boxes_give_rotations(options: dict[str, object]) -> None
         found += [result.alignment, *(other.alignment for other in result.alternatives)]
     assert len(found) > 50
     assert max(departure(alignment.rotation) for alignment in found) < 1e-9
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("solver", [aepnp, aepnp_paper])
+def test_linear_solvers_never_return_nan(solver: Callable[..., tuple[np.ndarray, ...]]) -> None:
+    rng = np.random.default_rng(8)
+    for size in 10.0 ** np.arange(0, 300, 10):
+        try:
+            rotation, translation, scale = solver(
+                rng.uniform(-1, 1, (8, 3)) * size, rng.uniform(-1, 1, (8, 2)) * size
+            )
+        except DegenerateError:
+            continue
+        assert departure(rotation) < 1e-9
+        assert np.isfinite([translation, scale]).all()

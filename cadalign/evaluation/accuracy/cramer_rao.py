@@ -32,25 +32,9 @@ def cramer_rao_bound(
 ) -> FloatArray:
     """The least covariance that any unbiased estimate of an alignment can have.
 
-    The inverse of the Fisher information (J' W J)^-1 at the truth, for independent Gaussian noise
-    of the keypoints.
-
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Model points.
-    gt : Alignment
-        The truth, with the scale 1 along x.
-    sigma : float, (n,) float or (n, 2, 2) float
-        The keypoints' noise, as for `cadalign.fit` [px].
-    focal : {"known", "estimate"}
-        Known to the estimator or not; the camera's is the truth.
-
-    Returns
-    -------
-    (8, 8) or (9, 9) float
-        Rotation vector in the camera frame [rad], translation [model units], log s_y and log s_z,
-        and, where it is estimated, the logarithm of the focal length.
+    The inverse of the Fisher information (J' W J)^-1 at the truth, which has the scale 1 along x,
+    for independent Gaussian noise of the keypoints; in the order of `FitResult.covariance`, (8, 8)
+    or (9, 9). ``sigma`` and ``focal`` are as for `cadalign.fit`.
     """
     in_camera = gt.apply(points_3d)
     rays = perspective(in_camera)
@@ -68,16 +52,12 @@ def cramer_rao_bound(
 
 
 def sample_limit(
-    bound: FloatArray, gt: Alignment, *, rng: np.random.Generator, draws: int
+    bound: FloatArray, *, rng: np.random.Generator, draws: int
 ) -> dict[str, FloatArray]:
     """Errors of an ideal estimator: draws from a Gaussian with the bound as its covariance.
 
-    Returns
-    -------
-    dict
-        ``rotation_error_deg``, ``translation_error``, ``scale_y_error``, ``scale_z_error``, each
-        (draws,) float, in the units of `cadalign.metrics`; ``focal_error``, relative, if the
-        focal length is unknown.
+    By name, each (draws,) float in the units of `cadalign.metrics`; ``focal_error``, relative, only
+    if the focal length is unknown.
     """
     errors = rng.multivariate_normal(np.zeros(len(bound)), bound, size=draws, method="eigh")
     focal = {"focal_error": np.abs(np.expm1(errors[:, 8]))} if len(bound) > UNKNOWNS else {}
@@ -90,19 +70,17 @@ def sample_limit(
 
 
 def limit_estimate(
-    points_3d: FloatArray,
-    points_2d: FloatArray,
-    camera: Camera,
-    gt: Alignment,
+    points_3d: FloatArray, points_2d: FloatArray, camera: Camera, gt: Alignment
 ) -> Alignment:
     """Estimate of an ideal estimator from noisy observations (n, 2) [px], to first order.
 
     The Gauss-Newton step from the truth, (J' J)^-1 J' e with the noise e of the observations. Over
     the noise its errors have exactly the Cramer-Rao bound as their covariance; the noise is that of
-    the compared methods, so that no chance enters the comparison. The camera has no lens
-    distortion, and the truth the scale 1 along x.
+    the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
+    x, the camera no lens distortion.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt).reshape(-1, UNKNOWNS)
+    jacobian = projection_jacobian(points_3d, camera, gt, known_axis="x", unknowns=UNKNOWNS)
+    jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
     norms = np.linalg.norm(jacobian, axis=0)
     if len(noise) < UNKNOWNS or not (norms > 0).all():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,57 +12,27 @@ from cadalign.fitting.focal.prior import FocalPrior, focal_bounds, focal_grid
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import FitOptions, Sigma
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.evidence import LogFocalPrior
-
-
-@dataclass(frozen=True, eq=False)
-class FocalViews:
-    """Rays and weights at rising focal lengths.
-
-    Parameters
-    ----------
-    focals : (k,) float
-        [px]
-    rays : (k, n, 2) float
-        Normalised image coordinates.
-    whitening : (k, 1 or n, 3) float
-        See `cadalign.fitting.noise.whitening_of`.
-    """
-
-    focals: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
+from cadalign.solvers.evidence import LogFocalPrior, Views
 
 
 def focal_views(
-    points_2d: FloatArray,
-    camera: Camera,
-    prior: FocalPrior | None,
-    *,
-    sigma: Sigma | None = None,
-) -> FocalViews:
-    """The keypoints at the focal lengths of `focal_grid`, as far as the lens can be undone there.
-
-    Raises
-    ------
-    InputError
-        If it can be undone at none.
-    """
+    points_2d: FloatArray, camera: Camera, prior: FocalPrior | None, sigma: Sigma | None
+) -> Views:
+    """The keypoints at the focal lengths of `focal_grid` at which the lens can be undone."""
     found = []
     problem: InputError | None = None
     for focal in focal_grid(camera, prior).tolist():
         try:
-            found.append((focal, *focal_view(points_2d, camera, focal, sigma=sigma)))
+            found.append((focal, *focal_view(points_2d, camera, focal, sigma)))
         except InputError as error:
             problem = error
     if not found and problem is not None:
         raise problem
-    focals, rays, whitening = zip(*found, strict=True)
-    return FocalViews(np.array(focals), np.array(rays), np.array(whitening))
+    return Views(*map(np.array, zip(*found, strict=True)))
 
 
 def focal_view(
-    points_2d: FloatArray, camera: Camera, focal: float, *, sigma: Sigma | None = None
+    points_2d: FloatArray, camera: Camera, focal: float, sigma: Sigma | None
 ) -> tuple[FloatArray, FloatArray]:
     """Rays (n, 2) and weights (1 or n, 3) at one focal length [px]."""
     camera = camera.with_focal(focal)

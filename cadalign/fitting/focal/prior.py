@@ -119,15 +119,7 @@ def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
 
 
 def focal_doubt(camera: Camera, prior: FocalPrior | None) -> str | None:
-    """Warning about an estimated focal length that is doubtful, or None.
-
-    Parameters
-    ----------
-    camera : Camera
-        With the estimate.
-    prior : FocalPrior, optional
-        The prior of the estimate.
-    """
+    """Warning about a camera whose estimated focal length is doubtful, or None."""
     if prior is not None:
         off = math.log(camera.fx / prior.focal)
         if abs(off) > _CONTRADICTING_SIGMAS * prior.relative_sigma:

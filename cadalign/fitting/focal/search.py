@@ -10,21 +10,23 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.fitting.focal.grid import (
-    FocalViews,
-    focal_slopes,
-    focal_view,
-    focal_views,
-    log_focal_prior,
-)
+from cadalign.fitting.focal.grid import focal_slopes, focal_view, focal_views, log_focal_prior
 from cadalign.fitting.focal.prior import focal_bounds
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.solutions import Solutions
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.constants import DEGENERATE, NOT_FOUND, OK, POSE_SIZE, TOO_FEW, UNKNOWNS
+from cadalign.solvers.constants import (
+    DEGENERATE,
+    NOT_FOUND,
+    OK,
+    OUT_OF_RANGE,
+    POSE_SIZE,
+    TOO_FEW,
+    UNKNOWNS,
+)
 from cadalign.solvers.covariance import focal_covariance
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, relative_to
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views, relative_to
 from cadalign.solvers.focal import linear_focal, refine_focal
 from cadalign.solvers.objective import Objective
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
@@ -51,7 +53,7 @@ class _Task:
     noise: float
 
     def objective(self, focal: float) -> Objective:
-        view = focal_view(self.points_2d, self.camera, focal, sigma=self.sigma)
+        view = focal_view(self.points_2d, self.camera, focal, self.sigma)
         loss_scale = self.options.loss_scale * self.noise
         return Objective(
             self.options.free,
@@ -82,16 +84,8 @@ def search_focal(
 ) -> Solutions:
     """Find the minima over alignment and focal length for every problem.
 
-    Parameters
-    ----------
-    problems : Problems
-    options : FitOptions
-    points : (n, 3) float
-        Model points, the known axis first.
-    sigmas : sequence of B, optional
-        Take the place of the options' sigma.
-    noises : (B,) float
-        Standard deviations that priors and loss scales are multiplied by.
+    The model ``points`` have the known axis first; ``sigmas`` take the place of the options' sigma;
+    priors and loss scales are multiplied by ``noises`` (B,).
     """
     count = len(problems)
     poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))
@@ -112,19 +106,22 @@ def search_focal(
             continue
         try:
             minima, iterations, hypotheses = _minima(task)
-        except InputError as error:
+            undetermined, covariances[b] = _covariance(task, minima[0]) if minima else (-1, 0.0)
+        except InputError as error:  # the lens model cannot be undone
             errors[b] = error
+            continue
+        except np.linalg.LinAlgError:
+            statuses[b] = OUT_OF_RANGE
             continue
         for k, minimum in enumerate(minima[:MAX_MINIMA]):
             poses[b, k], costs[b, k], focals[b, k] = minimum.pose, minimum.cost, minimum.focal
-        undetermined = -1
-        if minima:
-            undetermined, covariances[b] = _covariance(task, minima[0])
         info[b] = len(minima), iterations, hypotheses, undetermined
         if not minima:
             statuses[b] = NOT_FOUND
         elif undetermined >= 0:
             statuses[b] = DEGENERATE
+        elif not np.isfinite(covariances[b]).all():
+            statuses[b] = OUT_OF_RANGE
     return Solutions(poses, costs, covariances, statuses, info, focals=focals, errors=errors)
 
 
@@ -158,9 +155,8 @@ def _uncentered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray
 
 def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
     """Starts: the optima at fixed focal lengths that no neighbouring one improves on."""
-    views = _with_linear_guess(
-        task, focal_views(task.points_2d, task.camera, task.options.focal_prior, sigma=task.sigma)
-    )
+    given = task.points_2d, task.camera
+    views = _with_linear_guess(task, focal_views(*given, task.options.focal_prior, task.sigma))
     focals = views.focals
     count, n = len(focals), len(task.points)
     poses, costs, _, _, info = optimal_batch(
@@ -188,7 +184,7 @@ def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
     return starts, int(info[:, 1].sum()), int(info[:, 2].sum())
 
 
-def _with_linear_guess(task: _Task, views: FocalViews) -> FocalViews:
+def _with_linear_guess(task: _Task, views: Views) -> Views:
     """The views, and among them that of the linear solver's focal length, where it has one."""
     middle = len(views.focals) // 2
     focal = float(views.focals[middle] * linear_focal(task.points, views.rays[middle]))
@@ -196,11 +192,11 @@ def _with_linear_guess(task: _Task, views: FocalViews) -> FocalViews:
     if not low < focal < high:
         return views
     try:
-        rays, whitening = focal_view(task.points_2d, task.camera, focal, sigma=task.sigma)
+        rays, whitening = focal_view(task.points_2d, task.camera, focal, task.sigma)
     except InputError:  # the lens model cannot be undone there
         return views
     place = int(np.searchsorted(views.focals, focal))
-    return FocalViews(
+    return Views(
         np.insert(views.focals, place, focal),
         np.insert(views.rays, place, rays, axis=0),
         np.insert(views.whitening, place, whitening, axis=0),

@@ -92,7 +92,7 @@ class Renderer(Protocol):
     ) -> Frame:
         """Draw one frame; see `RaycastRenderer.render`."""
 
-    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+    def drawn_by(self, scene: Scene, *, samples: int) -> str:
         """Name of the renderer that draws a scene's frames: another where this one cannot."""
 
 

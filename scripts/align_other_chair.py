@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tyro
-from common import write_row
+from common import Picture, write_row
 
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.wireframe import Wireframe
@@ -41,12 +41,10 @@ PHOTO_GROUND = (206, 208, 212)
 LINE = (35, 208, 255)
 
 
-@dataclass
-class Arguments:
+@dataclass(kw_only=True)
+class Arguments(Picture):
     """Align one sample chair to a photo of another."""
 
-    out: Path = Path("docs/other_chair.png")
-    """Where to write the picture."""
     photo_of: str = "006"
     """The sample chair in the photo."""
     model: str = "000"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,14 +20,25 @@ from cadalign.io.files import write_json
 from cadalign.io.images import write_image
 
 LIMIT_DRAWS = 20
+STEM = Path(sys.argv[0]).stem
 
 
 @dataclass
 class Benchmark:
     """Arguments of all benchmarks; benchmark_focal.py writes bench/focal.json."""
 
-    out: Path = Path("bench", Path(sys.argv[0]).stem.removeprefix("benchmark_") + ".json")
+    out: Path = Path("bench", STEM.removeprefix("benchmark_") + ".json")
     """JSON file to write."""
+
+
+@dataclass
+class Picture:
+    """Arguments of the scripts that make a picture; make_overview.py writes docs/overview.png."""
+
+    out: Path = Path(
+        "docs", re.sub(r"^make_|^align_|_picture$", "", Path(sys.argv[0]).stem) + ".png"
+    )
+    """Where to write the picture."""
 
 
 def new_table(title: str, *columns: str) -> Table:
@@ -38,14 +50,14 @@ def new_table(title: str, *columns: str) -> Table:
 
 
 def ideal_errors(
-    problems: Iterable[Problem], rng: np.random.Generator, **options: Any
+    problems: Iterable[Problem], rng: np.random.Generator, *, sigma: float, focal: str
 ) -> dict[str, np.ndarray]:
     """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
     draws = []
     for problem in problems:
         try:
             bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, **options
+                problem.points_3d, problem.camera, problem.alignment, sigma=sigma, focal=focal
             )
         except CadalignError:
             continue

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from common import Picture
 from playwright.sync_api import Page, sync_playwright
 
 from cadalign.io.observation import Observation
@@ -24,14 +25,12 @@ READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.me
     && annotator.photo.picture)"""
 
 
-@dataclass
-class Arguments:
+@dataclass(kw_only=True)
+class Arguments(Picture):
     """Make the README's picture of the annotator."""
 
     files: Path
     """Where `align_other_chair.py` has written its files."""
-    out: Path = Path("docs/annotator.png")
-    """Where to write the picture."""
 
 
 def main(arguments: Arguments) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from common import write_row
+from common import Picture, write_row
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
@@ -19,8 +19,8 @@ from cadalign.render import RaycastRenderer, draw_overlay
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
 
 
-@dataclass
-class Arguments:
+@dataclass(kw_only=True)
+class Arguments(Picture):
     """Make the README's picture."""
 
     out: Path = Path("docs/overview.png")

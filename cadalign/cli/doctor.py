@@ -7,6 +7,7 @@ import sys
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from cadalign.cli.options import JsonOption
 from cadalign.cli.output import new_console
 
 if TYPE_CHECKING:
@@ -14,14 +15,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Doctor:
+class Doctor(JsonOption):
     """Check the renderers and their speed, and show how to enable missing ones.
 
     Also shows the processor cores and the cache of compiled solvers.
     """
-
-    json: bool = False
-    """Print JSON."""
 
     def run(self) -> int:
         """Run the checks; returns the exit code, 0 if ray casting works."""

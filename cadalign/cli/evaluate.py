@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from cadalign.cli.options import named_as_flags
+from cadalign.cli.options import JsonOption, named_as_flags
 from cadalign.cli.runs import conclude, run_progress
 from cadalign.errors import DataError
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
@@ -28,13 +28,10 @@ _EXIT_CODES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunCommand(RunOptions):
+class RunCommand(JsonOption, RunOptions):
     """Command of an experiment; see `command_of`."""
 
     options_type: ClassVar[type[ExperimentOptions]]
-
-    json: bool = False
-    """Print the summary as JSON."""
 
     def __post_init__(self) -> None:
         """Check nothing: options check themselves once the command runs, and refuse in one line."""
@@ -97,13 +94,11 @@ def one_of(commands: dict[str, Any]) -> Any:
 
 
 @dataclass(frozen=True)
-class EvaluateShow:
+class EvaluateShow(JsonOption):
     """Show a finished run again: its summary, and its figures drawn anew."""
 
     run_folder: Annotated[Path, tyro.conf.Positional]
     """The run's folder."""
-    json: bool = False
-    """Print the summary as JSON."""
 
     def run(self) -> int:
         """Show the run; returns the exit code, that of the run."""

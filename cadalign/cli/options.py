@@ -42,11 +42,17 @@ def named_as_flags(
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObservationCommand:
-    """Options of the commands on an observation file."""
+class JsonOption:
+    """The option of the commands that print a table or JSON."""
 
     json: bool = False
     """Print the result as JSON."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationCommand(JsonOption):
+    """Options of the commands on an observation file."""
+
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
 

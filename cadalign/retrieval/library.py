@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
 from cadalign.errors import DataError, InputError
-from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
@@ -162,24 +161,11 @@ class Library:
         semantic_ids: npt.ArrayLike,
         camera: Camera,
         *,
-        top: int = 10,
-        category: str | None = None,
-        method: str = "optimal",
-        sigma: Sigma = 1.0,
-        shape_sigma: float = 0.0,
-        loss: str = "linear",
-        loss_scale: float = 2.0,
-        stretch: str | None = None,
-        scale_prior_sigma: float | None = 0.4,
-        max_stretch: float = 4.0,
-        symmetries: bool = False,
-        missing_prob: float = 0.5,
-        spurious: float = 0.01,
         mask: npt.ArrayLike | None = None,
         image: npt.ArrayLike | None = None,
         exclude: Collection[ModelKey] = (),
-        exhaustive: bool = False,
         workers: int = -1,
+        **options: Any,
     ) -> list[Match]:
         """Rank the models by how well each, posed and stretched, explains an image's keypoints.
 
@@ -198,9 +184,6 @@ class Library:
             ``category`` each model reads them in its own category's sense.
         camera : Camera
             The calibrated camera. Lens distortion is honoured.
-        top, category, method, sigma, shape_sigma, loss, loss_scale, stretch, scale_prior_sigma, \
-        max_stretch, symmetries, missing_prob, spurious, exhaustive
-            Options, described at `cadalign.retrieval.options.RetrievalOptions`.
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
@@ -212,6 +195,10 @@ class Library:
             Models to leave out.
         workers : int
             Number of threads; -1 for one per core.
+        **options
+            Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
+            category, method, sigma, shape_sigma, loss, loss_scale, stretch, scale_prior_sigma,
+            max_stretch, symmetries, missing_prob, spurious, exhaustive.
 
         Returns
         -------
@@ -226,26 +213,14 @@ class Library:
         DegenerateError
             If no model shares at least 4 keypoints with the image, or none can be aligned.
         """
-        options = RetrievalOptions(
-            top=top,
-            category=category,
-            method=method,
-            sigma=sigma,
-            shape_sigma=shape_sigma,
-            loss=loss,
-            loss_scale=loss_scale,
-            stretch=stretch,
-            scale_prior_sigma=scale_prior_sigma,
-            max_stretch=max_stretch,
-            symmetries=symmetries,
-            missing_prob=missing_prob,
-            spurious=spurious,
-            exhaustive=exhaustive,
-        )
-        observed = observe(points_2d, semantic_ids, camera, options)
-        candidates = gather_candidates(self._table, observed, options, exclude)
-        ranking = rank(candidates, observed, options, workers)
-        matches = make_matches(self._table, candidates, observed, ranking, top)
+        try:
+            chosen = RetrievalOptions(**options)
+        except TypeError as error:
+            raise InputError(f"unknown option ({error})", where="options") from None
+        observed = observe(points_2d, semantic_ids, camera, chosen)
+        candidates = gather_candidates(self._table, observed, chosen, exclude)
+        ranking = rank(candidates, observed, chosen, workers)
+        matches = make_matches(self._table, candidates, observed, ranking, chosen.top)
         if mask is None and image is None:
             return matches
         from cadalign.retrieval.silhouettes import mask_of, rerank

@@ -28,7 +28,7 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
+from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
 
@@ -218,5 +218,5 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
 def _scores(third: FloatArray) -> FloatArray:
     """Scores, from visibility flags where they are that."""
     if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
-        return np.choose(third.astype(int), [0.0, OCCLUDED_SCORE, 1.0])
+        return np.choose(third.astype(int), list(VISIBILITY_SCORES))
     return third

@@ -33,13 +33,12 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.datasets.detections.image_keypoints import OCCLUDED_SCORE, ImageKeypoints
+from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import reading
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
-_VISIBILITY_SCORES = (0.0, OCCLUDED_SCORE, 1.0)
 
 
 _COLUMNS: dict[str, Any] = {
@@ -123,7 +122,7 @@ def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageK
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     scores = columns.get("score")
     if "visibility" in columns:
-        scores = [_VISIBILITY_SCORES[int(flag)] for flag in columns["visibility"]]
+        scores = [VISIBILITY_SCORES[int(flag)] for flag in columns["visibility"]]
     names, ids, sigma = (columns.get(name) for name in ("name", "semantic_id", "sigma"))
     return ImageKeypoints(
         points_2d=np.column_stack([columns["u"], columns["v"]]),

@@ -14,8 +14,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.observation import Observation
 
-OCCLUDED_SCORE = 0.5
-"""How much a keypoint is trusted whose visibility flag says that it is labelled but hidden."""
+VISIBILITY_SCORES = (0.0, 0.5, 1.0)
+"""Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
 
 
 @dataclass(frozen=True, eq=False)

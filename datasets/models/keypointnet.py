@@ -160,10 +160,7 @@ class KeypointNet:
     """
 
     def __init__(
-        self,
-        root: str | os.PathLike[str],
-        *,
-        shapenet_root: str | os.PathLike[str] | None = None,
+        self, root: str | os.PathLike[str], *, shapenet_root: str | os.PathLike[str] | None = None
     ) -> None:
         self.root = Path(root)
         if not self.root.is_dir():

@@ -204,11 +204,7 @@ class ModelKeypoints:
 
     @classmethod
     def load(
-        cls,
-        path: str | os.PathLike[str],
-        *,
-        mesh: Mesh | None = None,
-        model: Path | None = None,
+        cls, path: str | os.PathLike[str], *, mesh: Mesh | None = None, model: Path | None = None
     ) -> ModelKeypoints:
         """Read a file of model keypoints, or one model's of KeypointNet's annotations.
 
@@ -290,7 +286,7 @@ class ModelKeypoints:
         """
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
 
-    def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
+    def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
         """Content of the file, the model's path relative to ``folder``."""
         data: dict[str, Any] = {"format": FORMAT, "version": VERSION}
         if self.model is not None:

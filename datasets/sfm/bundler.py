@@ -65,10 +65,7 @@ class Bundler(CorrespondenceSet):
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        sizes: ImageSize | Sequence[ImageSize] | None = None,
+        self, path: str | os.PathLike[str], *, sizes: ImageSize | Sequence[ImageSize] | None = None
     ) -> None:
         file = _find_file(Path(path))
         self._model = _read_bundler(file)

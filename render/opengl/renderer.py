@@ -78,7 +78,7 @@ class PyrenderRenderer:
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+    def drawn_by(self, scene: Scene, *, samples: int) -> str:
         """ "pyrender", or "raycast" for transparent models and frames without antialiasing."""
         return self.name if scene.surface.opaque and samples > 1 else self._fallback.name
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 from weakref import ref
 
@@ -77,10 +76,7 @@ class GlStage:
     def look(self, camera: Camera, window: tuple[int, int, int, int]) -> None:
         """Choose the part of an image that is drawn: left, top, width, height [px]."""
         self._camera.projection = opengl_projection(
-            replace(camera, distortion=()),
-            near=self._camera.near,
-            far=self._camera.far,
-            window=window,
+            camera, near=self._camera.near, far=self._camera.far, window=window
         )
 
     def _add_light(self, power: float, pose: FloatArray) -> Any:

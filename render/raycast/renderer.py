@@ -111,7 +111,7 @@ class RaycastRenderer:
             darken_corners(color, geometry, posed, self.studio)
         return Frame(geometry.depth, geometry.face_id, geometry.normal, color)
 
-    def drawn_by(self, scene: Scene, *, samples: int = 8) -> str:
+    def drawn_by(self, scene: Scene, *, samples: int) -> str:
         """The renderer's own name."""
         return self.name
 

@@ -86,11 +86,9 @@ def look_at(
     if distance <= 0:
         raise InputError(f"{distance:g} is not positive", where="distance")
     rotation = _looking_rotation(*values[[0, 1, 3]])
-    stretched = as_floats(target, name="target", shape=(3,)) * as_floats(
-        scale, name="scale", shape=(3,)
-    )
-    translation = np.array([0, 0, distance]) - rotation @ stretched
-    return Alignment(rotation, translation, as_floats(scale, name="scale", shape=(3,)))
+    stretch = as_floats(scale, name="scale", shape=(3,))
+    stretched = as_floats(target, name="target", shape=(3,)) * stretch
+    return Alignment(rotation, np.array([0, 0, distance]) - rotation @ stretched, stretch)
 
 
 def sample_view(

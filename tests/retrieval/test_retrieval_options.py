@@ -6,19 +6,25 @@ import inspect
 import re
 from dataclasses import fields
 
-from cadalign import Library
+import numpy as np
+import pytest
+
+from cadalign import Camera, Library
+from cadalign.errors import InputError
+from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.options import RetrievalOptions
 
-NOT_OPTIONS = {"mask", "image", "exclude", "workers"}
+
+def test_retrieve_names_every_option() -> None:
+    text = inspect.getdoc(Library.retrieve) or ""
+    assert all(re.search(rf"\b{field.name}\b", text) for field in fields(RetrievalOptions))
 
 
-def test_keywords_of_retrieve_are_the_fields_of_the_options() -> None:
-    keywords = {
-        name: parameter.default
-        for name, parameter in inspect.signature(Library.retrieve).parameters.items()
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY and name not in NOT_OPTIONS
-    }
-    assert keywords == {field.name: field.default for field in fields(RetrievalOptions)}
+def test_unknown_option_is_refused() -> None:
+    model = LibraryModel("box", "0", np.eye(4, 3), np.arange(4), np.array([[0, 0, 0], [1, 1, 1]]))
+    library = Library.from_models([model])
+    with pytest.raises(InputError, match=r"unknown option.*'tops'"):
+        library.retrieve(np.zeros((4, 2)), np.arange(4), Camera(64, 48, 60, 60, 32, 24), tops=3)
 
 
 def test_every_option_has_its_help_below_it() -> None:

@@ -30,7 +30,7 @@ def corner_normals(
     start = np.cumsum(valence) - valence
     result = normals.copy()
     for count in np.unique(valence):
-        if count == 1 or count > _MAX_VALENCE:
+        if count < 2 or count > _MAX_VALENCE:  # no face uses a point of valence 0
             continue
         first = start[valence == count]
         step = max(1, _PAIRS_AT_ONCE // int(count) ** 2)

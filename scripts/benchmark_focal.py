@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
-from common import Benchmark, ideal_errors, new_table, write_results
+from common import SeededBenchmark, ideal_errors, new_table, write_results
 from rich.console import Console
 
 import cadalign
@@ -32,15 +32,13 @@ ROBUST_POINTS = 100
 
 
 @dataclass
-class Arguments(Benchmark):
+class Arguments(SeededBenchmark):
     """Measure fits with an unknown focal length."""
 
     problems: int = 1000
     """Random problems per row of accuracy."""
     robust_problems: int = 40
     """Random problems per share of outliers."""
-    seed: int = 0
-    """Seed of the problems."""
 
 
 def main(arguments: Arguments) -> None:

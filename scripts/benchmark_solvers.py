@@ -15,7 +15,7 @@ from timeit import repeat
 import cv2
 import numpy as np
 import tyro
-from common import Benchmark, ideal_errors, new_table, write_results
+from common import SeededBenchmark, ideal_errors, new_table, write_results
 from rich.console import Console
 
 import cadalign
@@ -41,7 +41,7 @@ Source = tuple[str, float, Callable[[np.random.Generator], Problem]]
 
 
 @dataclass
-class Arguments(Benchmark):
+class Arguments(SeededBenchmark):
     """Measure the solvers' accuracy and speed."""
 
     problems: int = 2000
@@ -50,8 +50,6 @@ class Arguments(Benchmark):
     """Timed calls per figure; the median counts."""
     keypointnet: Path | None = None
     """Folder with KeypointNet's annotations, for rows on real keypoints."""
-    seed: int = 0
-    """Seed of the problems."""
 
 
 def main(arguments: Arguments) -> None:

@@ -32,6 +32,14 @@ class Benchmark:
 
 
 @dataclass
+class SeededBenchmark(Benchmark):
+    """Arguments of the benchmarks on random problems."""
+
+    seed: int = 0
+    """Seed of everything random."""
+
+
+@dataclass
 class Picture:
     """Arguments of the scripts that make a picture; make_overview.py writes docs/overview.png."""
 

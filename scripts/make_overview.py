@@ -23,8 +23,6 @@ MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003")
 class Arguments(Picture):
     """Make the README's picture."""
 
-    out: Path = Path("docs/overview.png")
-    """Where to write it."""
     width: int = 1600
     """Width in pixels."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,11 +28,16 @@ class LiveAlignment:
     It is provisional if the pairs alone did not suffice: stretch or focal length were assumed.
     """
 
-    result: FitResult | None = None  # None without enough pairs, or if they are degenerate
-    message: str = ""  # reason for a missing result, or an assumption that was made
-    outliers: dict[int, float] = field(default_factory=dict)  # see `find_outliers`
-    sigma: float = _LEAST_SIGMA  # of the pairs [px], larger if the residuals are
-    provisional: bool = False
+    result: FitResult | None  # None without enough pairs, or if they are degenerate
+    message: str  # reason for a missing result, or an assumption that was made
+    outliers: dict[int, float]  # see `find_outliers`
+    sigma: float  # of the pairs [px], larger if the residuals are
+    provisional: bool
+
+    @classmethod
+    def missing(cls, message: str) -> LiveAlignment:
+        """No alignment, for the reason that the message gives."""
+        return cls(None, message, {}, _LEAST_SIGMA, provisional=False)
 
     @property
     def cautious(self) -> FitResult | None:
@@ -56,8 +61,8 @@ def align(
     count = len(points_3d)
     if count < LEAST_PAIRS:
         missing = LEAST_PAIRS - count
-        return LiveAlignment(
-            message=f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
+        return LiveAlignment.missing(
+            f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
     fitter = _Fitter(points_3d, points_2d, sigma, intrinsics, choice, None)
     message = ""
@@ -72,9 +77,9 @@ def align(
         try:
             result = fitter.fit()
         except CadalignError:
-            return LiveAlignment(message=f"No alignment yet: {error.what}.")
+            return LiveAlignment.missing(f"No alignment yet: {error.what}.")
     except CadalignError as error:
-        return LiveAlignment(message=f"No alignment: {error}.")
+        return LiveAlignment.missing(f"No alignment: {error}.")
     unknowns = 8 if result.covariance is None else len(result.covariance)
     whitened = result.residuals if sigma is None else result.residuals / sigma[:, None]
     redundancy = 2 * count - unknowns

@@ -23,7 +23,7 @@ from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Document as JsonDocument
 from cadalign.io.documents import (
-    Index,
+    Labelled,
     PathText,
     Point2,
     convert,
@@ -40,11 +40,10 @@ SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
 
 
-class _Half(JsonDocument):
+class _Half(Labelled, kw_only=True):
     """Pair with only the photo half or the model half."""
 
     uv: Point2 | None = None
-    semantic_id: Index | None = None
 
     def __post_init__(self) -> None:
         if self.uv is None and self.semantic_id is None:
@@ -55,7 +54,7 @@ class _Unfinished(JsonDocument):
     """File of the pairs with only one half placed."""
 
     pairs: list[_Half]
-    format: str = ""
+    format: str
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ class Session:
         if state._live is not None and state._live[0] is document:
             return state._live[1:]
         if not self.ready:
-            return LiveAlignment(message="Solvers and model are being prepared."), None
+            return LiveAlignment.missing("Solvers and model are being prepared."), None
         pairs = document.complete_pairs
         live = align(
             self.registry.xyz(pair.keypoint for pair in pairs if pair.keypoint is not None),

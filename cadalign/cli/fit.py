@@ -51,8 +51,6 @@ class Fit(ObservationCommand):
 
     observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image and model."""
-    out: Path | None = None
-    """Folder to write to; by default <observation>_fit beside the file."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object."""
     robust: bool = False

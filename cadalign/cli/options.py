@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.errors import CadalignError, InputError
@@ -53,6 +54,8 @@ class JsonOption:
 class ObservationCommand(JsonOption):
     """Options of the commands on an observation file."""
 
+    out: Path | None = None
+    """Folder to write to; by default, fit writes to <observation>_fit beside the file."""
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class _RetrievalOptions(RetrievalOptions):
     """Ranking of the models; the observation file supplies the standard deviation."""
 
-    sigma: tyro.conf.Suppress[Sigma] = RetrievalOptions.sigma
+    sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
 
     def __post_init__(self) -> None:
         with named_as_flags(self, kind=OptionError):
@@ -44,8 +44,6 @@ class Retrieve(ObservationCommand):
     """JSON file with camera and keypoints, optionally image."""
     library: Path
     """File that `cadalign library build` wrote."""
-    out: Path | None = None
-    """Folder to write to."""
     robust: bool = False
     """Not available here: use --loss cauchy against outliers."""
     mask: Path | None = None
@@ -134,4 +132,4 @@ def _print_table(matches: Sequence[Match]) -> None:
         heads += ("IoU",)
         shown = ["-" if overlap is None else f"{overlap:.3f}" for overlap in overlaps]
         rows = [(*row, overlap) for row, overlap in zip(rows, shown, strict=True)]
-    print_table(ConsoleTable("", labels, heads, rows, narrow=True, grouped=False))
+    print_table(ConsoleTable("", labels, heads, rows, "", narrow=True, grouped=False))

@@ -112,6 +112,7 @@ class Spec:
                 (line.group, line.method, *(c.text(line.number(c.key)) for c in columns))
                 for line in lines
             ],
+            note="",
         )
 
     def shown_columns(self, lines: Summaries) -> list[Metric]:

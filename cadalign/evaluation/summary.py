@@ -83,7 +83,7 @@ class ConsoleTable:
     labels: tuple[str, ...]
     heads: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    note: str = ""
+    note: str
     narrow: bool = False
     grouped: bool = True
     wraps: bool = False

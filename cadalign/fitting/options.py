@@ -29,7 +29,28 @@ Sigma = float | npt.ArrayLike
 
 
 @dataclass(frozen=True)
-class FitOptions:
+class AlignmentOptions:
+    """Options of every estimate of an alignment, of a fit and of a retrieval."""
+
+    method: str = "optimal"
+    """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without stretch);
+    a fit also knows aepnp (linear) and aepnp-paper (linear, as published)."""
+    sigma: Sigma | None = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint; None, for a fit, estimates it from the residuals: the choice for a model that is only
+    similar to the object."""
+    loss: str = "linear"
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    tolerate outliers."""
+    loss_scale: float = 2.0
+    """Length at which a robust loss begins to bend [sigma]."""
+    stretch: str | None = None
+    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
+    "none"."""
+
+
+@dataclass(frozen=True)
+class FitOptions(AlignmentOptions):
     """Options of a fit.
 
     Raises
@@ -38,20 +59,6 @@ class FitOptions:
         If a value is out of range or unknown, or options exclude each other.
     """
 
-    method: str = "optimal"
-    """Solver: optimal (maximum likelihood, searched globally), aepnp (linear), aepnp-paper (linear,
-    as published) or epnp (OpenCV's, without stretch)."""
-    sigma: Sigma | None = 1.0
-    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
-    keypoint; None estimates it from the residuals, for a model that is only similar to the
-    object."""
-    loss: str = "linear"
-    """Loss on the length of a whitened residual: linear (squared), huber or cauchy."""
-    loss_scale: float = 2.0
-    """Length at which a robust loss begins to bend [sigma]."""
-    stretch: str | None = None
-    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
-    "none"."""
     scale_prior_sigma: float | None = None
     """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1."""
     known_axis: str = "x"

@@ -107,12 +107,12 @@ class FitResult:
     inliers: npt.NDArray[np.bool_]
     method: str
     camera: Camera
-    sigma: float | None = None
-    covariance: FloatArray | None = None
-    known_axis: str = "x"
-    stretched_axes: str = "yz"
-    focal: str = "known"
-    focal_prior: FocalPrior | None = None
+    sigma: float | None
+    covariance: FloatArray | None
+    known_axis: str
+    stretched_axes: str
+    focal: str
+    focal_prior: FocalPrior | None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = FitStats(0, 0, 0.0)
 

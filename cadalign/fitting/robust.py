@@ -124,6 +124,8 @@ def find_consensus(
         inliers=kept,
         method=f"ransac-{ransac.minimal}",
         camera=camera,
+        sigma=None,
+        covariance=None,
         known_axis=options.known_axis,
         stretched_axes=options.stretched_axes,
         focal=options.focal,

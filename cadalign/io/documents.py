@@ -47,6 +47,12 @@ class Document(Struct, forbid_unknown_fields=True):
     """Base of declared formats; unknown fields are refused."""
 
 
+class Labelled(Document, kw_only=True):
+    """Base of what may name a keypoint by its semantic id."""
+
+    semantic_id: Index | None = None
+
+
 class ForeignDocument(Struct):
     """Base of declared formats of other programs; unknown fields are ignored."""
 
@@ -74,7 +80,7 @@ def read_json(path: Path) -> Any:
     raise DataError(f"not valid JSON: {reason}", where=where)
 
 
-def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | Any:
+def convert(data: Any, kind: type[T] | Any, where: str = "") -> T | Any:
     """Convert parsed JSON to a `Document`, or to any type of which its fields can be.
 
     ``where`` is the place of ``data``: a `DataError` names the path of the field below it, as
@@ -85,8 +91,8 @@ def convert(data: Any, kind: type[T] | Any, *, where: str | None = None) -> T | 
     except msgspec.ValidationError as error:
         plain = _plain(data)
         if plain is not data:
-            return convert(plain, kind, where=where)
-        raise _located(error, data, kind, where or "") from None
+            return convert(plain, kind, where)
+        raise _located(error, data, kind, where) from None
 
 
 @contextmanager

@@ -38,7 +38,7 @@ from cadalign.errors import DataError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
     Document,
-    Index,
+    Labelled,
     NotNegative,
     PathText,
     Point2,
@@ -54,13 +54,12 @@ from cadalign.io.documents import (
 from cadalign.io.files import write_json
 
 
-class _Keypoint(Document):
+class _Keypoint(Labelled, kw_only=True):
     """One entry of ``keypoints``, as the module's documentation describes it."""
 
     xyz: Point3
     uv: Point2
     sigma: Positive | None = None
-    semantic_id: Index | None = None
     name: Text | None = None
     confidence: NotNegative | None = None
 

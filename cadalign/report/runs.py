@@ -47,7 +47,7 @@ def _read(path: Path, name: str) -> Run:
     config = RunFolder(path).read_config() if path.is_dir() else None
     if config is not None:
         spec_of_config(config, path)  # refuse what is unknown, however far it is
-    return Run.open(path, name=name)
+    return Run.open(path, name)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -62,12 +62,13 @@ def observe(
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
     """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
     count = len(pixels)
-    dimensions = np.ndim(options.sigma)
+    sigma = options.sigma if options.sigma is not None else np.nan  # None is refused
+    dimensions = np.ndim(sigma)
     if dimensions == 3:
-        covariances = as_floats(options.sigma, name="sigma", shape=(count, 2, 2))[order]
+        covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))[order]
     else:
         shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
-        deviations = np.broadcast_to(as_floats(options.sigma, name="sigma", shape=shape), count)
+        deviations = np.broadcast_to(as_floats(sigma, name="sigma", shape=shape), count)
         if not (deviations > 0).all():
             raise InputError("all values must be > 0", where="sigma")
         covariances = deviations[order][:, None, None] ** 2 * np.eye(2)

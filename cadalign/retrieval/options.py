@@ -32,34 +32,22 @@ import math
 from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.fitting.options import FitOptions, Sigma
+from cadalign.fitting.options import AlignmentOptions, FitOptions
 
 METHODS = ("optimal", "epnp")
 
 
 @dataclass(frozen=True)
-class RetrievalOptions:
+class RetrievalOptions(AlignmentOptions):
     """Options of a retrieval."""
 
     top: int = 10
     """Largest number of matches to return."""
     category: str | None = None
     """Name or synset id of the only category to compare with; by default all."""
-    method: str = "optimal"
-    """Method of alignment: optimal stretches models, epnp (OpenCV's) does not."""
-    sigma: Sigma = 1.0
-    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
-    keypoint."""
     shape_sigma: float = 0.0
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
-    loss: str = FitOptions.loss
-    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
-    tolerate outliers and search all models, which takes longer."""
-    loss_scale: float = FitOptions.loss_scale
-    """Length at which a robust loss begins to bend [sigma]."""
-    stretch: str | None = FitOptions.stretch
-    """Axes that stretch: yz (the default), y, z or none."""
     scale_prior_sigma: float | None = 0.4
     """Standard deviation of a Gaussian prior on the logarithm of each stretch; None for no
     prior."""

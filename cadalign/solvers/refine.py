@@ -21,7 +21,7 @@ _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known o
 
 @kernel
 def least_information(hessian: FloatArray) -> float:
-    """What is added to the diagonal to hold unknowns without evidence where they are."""
+    """Addition to the diagonal that holds unknowns without evidence where they are."""
     least = 1e-300
     for k in range(UNKNOWNS):
         least = max(least, _LEAST_INFORMATION * hessian[k, k])

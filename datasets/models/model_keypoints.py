@@ -42,6 +42,7 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import (
     Document,
     Index,
+    Labelled,
     PathText,
     Point3,
     Text,
@@ -62,12 +63,11 @@ _SUM_TOLERANCE = 0.01
 _WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
-class _Entry(Document):
+class _Entry(Labelled, kw_only=True):
     """One keypoint of the file, as the module's documentation describes it."""
 
     name: Text
     xyz: Point3 | None = None
-    semantic_id: Index | None = None
     face_index: Index | None = None
     barycentric: Point3 | None = None
 

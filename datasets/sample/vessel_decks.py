@@ -1,4 +1,4 @@
-"""What stands on the decks of sample vessels: bridges and cargo, deck houses, cabins and rigs."""
+"""Structures on the decks of sample vessels: bridges and cargo, deck houses, cabins and rigs."""
 
 from __future__ import annotations
 

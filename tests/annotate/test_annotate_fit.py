@@ -59,7 +59,11 @@ def test_is_what_fit_finds() -> None:
 def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
     problem = problem_of(0, points=6, noise_px=1.0)
     few = Problem(
-        problem.points_3d[:points], problem.points_2d[:points], problem.camera, problem.alignment
+        problem.points_3d[:points],
+        problem.points_2d[:points],
+        problem.camera,
+        problem.alignment,
+        None,
     )
     live = live_of(few)
     assert live.result is None
@@ -307,7 +311,7 @@ def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> Non
     assert facts["Focal length"].value == "150 px"
     assert facts["Rotation"].value.startswith("known to ± ")
     assert facts["Pairs agree to"].value.endswith(" px")
-    assert facts_of(LiveAlignment()) == ()
+    assert facts_of(LiveAlignment.missing("")) == ()
 
 
 def test_estimated_focal_length_has_a_standard_deviation() -> None:
@@ -325,7 +329,7 @@ def test_notes_name_alternatives_and_weak_stretches() -> None:
     assert any("one more pair tells them apart" in note for note in notes)
     weak = problem_of(7, points=12, noise_px=15.0)
     assert any("is known only to ± " in note for note in notes_of(live_of(weak)))
-    assert notes_of(LiveAlignment(message="wait")) == ()
+    assert notes_of(LiveAlignment.missing("wait")) == ()
 
 
 def test_text_names_point_and_gain() -> None:

@@ -196,7 +196,7 @@ def test_camera_without_focal_length(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def first_of(count: int) -> Problem:
     points_3d, points_2d = PROBLEM.points_3d[:count], PROBLEM.points_2d[:count]
-    return Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
+    return Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
     points_3d = PROBLEM.points_3d.copy()
     points_3d[:, 2] = 0.1
     points_2d = PROBLEM.camera.project(PROBLEM.alignment.apply(points_3d))
-    flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment)
+    flat = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
     path = write_observation(tmp_path / "chair.json", flat)
     assert refusal_line(capsys, "fit", str(path), "--method", "aepnp") == (
         "points_3d: the points lie in the plane z = 0.1; "

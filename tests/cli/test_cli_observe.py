@@ -24,7 +24,7 @@ POINTS_3D = np.random.default_rng(1).uniform(-1, 1, (24, 3)) / ALIGNMENT.scale
 POINTS_2D = TRUE.project(ALIGNMENT.apply(POINTS_3D)) + np.random.default_rng(2).normal(
     scale=0.3, size=(24, 2)
 )
-PROBLEM = Problem(POINTS_3D, POINTS_2D, TRUE, ALIGNMENT)
+PROBLEM = Problem(POINTS_3D, POINTS_2D, TRUE, ALIGNMENT, None)
 NAMES = [f"corner {n}" for n in range(24)]
 
 

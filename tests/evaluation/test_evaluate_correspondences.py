@@ -310,6 +310,12 @@ class TestRows:
             inliers=np.array([True, False, True, True]),
             method="",
             camera=CAMERA,
+            sigma=None,
+            covariance=None,
+            known_axis="x",
+            stretched_axes="yz",
+            focal="known",
+            focal_prior=None,
         )
         inlier_columns = ("inliers", "inlier_precision", "inlier_recall")
         row = errors_of(est, truth, method="ransac-optimal")

@@ -171,7 +171,7 @@ def real_problems(real_data: Path, category: str, count: int) -> Iterator[Proble
         points_3d = xyz / scale
         points_2d = KEYPOINT_CAMERA.project(gt.apply(points_3d))
         points_2d += rng.standard_normal(points_2d.shape)
-        yield Problem(points_3d, points_2d, KEYPOINT_CAMERA, gt)
+        yield Problem(points_3d, points_2d, KEYPOINT_CAMERA, gt, None)
 
 
 @pytest.mark.slow

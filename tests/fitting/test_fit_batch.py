@@ -286,8 +286,10 @@ def test_wrong_sigma_of_one_problem_is_refused_by_name(sigma: float) -> None:
 def test_threads_agree_where_all_of_a_share_fail() -> None:
     good = problems_of([20, 20])
     rng = np.random.default_rng(0)
-    bad = [Problem(rng.normal(size=(20, 3)), rng.uniform(0, 400, (20, 2)), p.camera, p.alignment)
-           for p in good]  # fmt: skip
+    bad = [
+        Problem(rng.normal(size=(20, 3)), rng.uniform(0, 400, (20, 2)), p.camera, p.alignment, None)
+        for p in good
+    ]
     batch = run([*good, *bad], focal="estimate", ransac=RansacOptions(max_iterations=20), workers=2)
     assert batch.solved.tolist() == [True, True, False, False]
     assert batch.covariance is not None

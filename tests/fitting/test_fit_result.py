@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +26,10 @@ MADE = FitResult(
     camera=SIMULATION_CAMERA,
     sigma=1.0,
     covariance=np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0.0001, 0.0225]),
+    known_axis="x",
+    stretched_axes="yz",
+    focal="known",
+    focal_prior=None,
     alternatives=(
         Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125, SIMULATION_CAMERA),
     ),
@@ -44,13 +49,13 @@ def test_text_of_a_result() -> None:
 
 
 def test_text_of_a_result_without_statistics() -> None:
-    plain = FitResult(
-        alignment=MADE.alignment,
-        points_3d=MADE.points_3d,
-        residuals=MADE.residuals,
+    plain = replace(
+        MADE,
         inliers=np.ones(6, dtype=bool),
         method="aepnp",
-        camera=SIMULATION_CAMERA,
+        sigma=None,
+        covariance=None,
+        alternatives=(),
     )
     assert str(plain) == (
         "aepnp: 6 keypoints, rms 2.04 px\n"
@@ -124,14 +129,12 @@ def test_malformed_json_is_refused(text: str, expected: str) -> None:
 def test_warnings_look_at_the_inliers_alone() -> None:
     in_plane = MADE.points_3d * [1, 1, 0] + [0, 0, 0.25]
     points_3d = np.concatenate([in_plane, [[0.5, 0.5, 3.0]]])
-    result = FitResult(
-        alignment=MADE.alignment,
+    result = replace(
+        MADE,
         points_3d=points_3d,
         residuals=np.zeros((7, 2)),
         inliers=np.array([True] * 6 + [False]),
-        method="optimal",
-        camera=SIMULATION_CAMERA,
-        covariance=MADE.covariance,
+        alternatives=(),
     )
     assert result.warnings == (
         "s_z is known only to +-15 %: the keypoints lie nearly in the plane z = 0.25",

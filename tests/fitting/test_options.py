@@ -32,7 +32,7 @@ def test_keywords_of_the_functions_are_the_fields_of_the_options(
 
 @pytest.mark.parametrize("kind", [FitOptions, RansacOptions])
 def test_every_option_has_its_help_below_it(kind: type) -> None:
-    lines = inspect.getsource(kind).splitlines()
+    lines = "".join(map(inspect.getsource, kind.__mro__[:-1])).splitlines()
     for field in fields(kind):
         (place,) = (i for i, line in enumerate(lines) if re.match(rf"    {field.name}: ", line))
         assert lines[place + 1].startswith('    """'), field.name

@@ -28,7 +28,7 @@ def test_unknown_option_is_refused() -> None:
 
 
 def test_every_option_has_its_help_below_it() -> None:
-    lines = inspect.getsource(RetrievalOptions).splitlines()
+    lines = "".join(map(inspect.getsource, RetrievalOptions.__mro__[:-1])).splitlines()
     for field in fields(RetrievalOptions):
         (place,) = (i for i, line in enumerate(lines) if re.match(rf"    {field.name}: ", line))
         assert lines[place + 1].startswith('    """'), field.name

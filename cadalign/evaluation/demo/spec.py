@@ -90,6 +90,7 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
             for s in summaries
             if s.group != ALL
         ],
+        note="",
         grouped=False,
         wraps=True,
     )

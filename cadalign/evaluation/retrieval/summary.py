@@ -84,6 +84,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
             for s in summaries
             if s["category"] == ALL
         ],
+        note="",
         narrow=True,
         grouped=False,
     )

@@ -41,7 +41,7 @@ class Run:
     total: int
 
     @classmethod
-    def open(cls, path: Path, *, name: str | None = None) -> Run:
+    def open(cls, path: Path, name: str | None = None) -> Run:
         """Read a run."""
         folder = RunFolder(path)
         if not path.is_dir():

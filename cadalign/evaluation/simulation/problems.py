@@ -26,7 +26,7 @@ class Problem:
     points_2d: FloatArray
     camera: Camera
     alignment: Alignment
-    outliers: BoolArray | None = None
+    outliers: BoolArray | None
 
 
 def simulate_problem(
@@ -71,7 +71,7 @@ def simulate_problem(
     points_2d = points_2d + noise_px * rng.standard_normal(points_2d.shape)
     count = round(outlier_share * points)
     if not count:
-        return Problem(points_3d, points_2d, camera, alignment)
+        return Problem(points_3d, points_2d, camera, alignment, None)
     outliers = np.zeros(points, dtype=bool)
     outliers[rng.choice(points, size=count, replace=False)] = True
     points_2d[outliers] = rng.uniform(-0.5, [camera.width - 0.5, camera.height - 0.5], (count, 2))

@@ -89,7 +89,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         ]
         rows.append((f"{value:g}", *texts))
     heads = (kind_of(run).column, *methods)
-    return ConsoleTable(f"Median {metric}", (), heads, rows, grouped=False)
+    return ConsoleTable(f"Median {metric}", (), heads, rows, "", grouped=False)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:

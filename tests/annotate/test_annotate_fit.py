@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.problems import problem_of
 
@@ -205,6 +205,9 @@ def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> No
     problem = problem_of(seed, points=9, noise_px=0.5)
     result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
     assert result.covariance is not None
+    # The prediction is of first order: a focal length that is open by more than its own size, at
+    # the end of its range, is beyond it.
+    assume(result.std is not None and result.std.focal < 1)
     rng = np.random.default_rng(seed + 1)
     candidates = rng.uniform(-1, 1, (6, 3))
     candidates = candidates[result.alignment.apply(candidates)[:, 2] > 0.5]

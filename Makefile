@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper test test-fast lint format bench web clean
+.PHONY: help demo paper test test-fast lint format fuzz bench web clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -21,6 +21,9 @@ test: $(VENV)/.installed-dev  ## run the whole test suite
 
 test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones
 	$(BIN)/python -m pytest -m "not slow"
+
+fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)
+	for what in fits readers commands; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, renderers and retrieval
 	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)

@@ -1,0 +1,410 @@
+"""Fuzz the readers: small valid files of every format, mutated from a seed, in bounded memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import re
+import resource
+import shutil
+import signal
+import struct
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from cadalign import Alignment, CadalignError, Camera, FitResult, Library, fit
+from cadalign.datasets import (
+    BlindPnP,
+    Bundler,
+    Colmap,
+    KeypointNet,
+    ModelKeypoints,
+    load_mesh,
+    read_image_keypoints,
+)
+from cadalign.io.images import read_photo
+from cadalign.io.observation import Observation
+from cadalign.render.views.camera_files import (
+    CameraView,
+    read_camera_views,
+    write_nerf,
+    write_open3d,
+)
+from cadalign.retrieval import LibraryModel
+
+MEMORY = 500 << 20
+SECONDS = 10
+_EXTREMES = [
+    b"0", b"-1", b"1e999", b"nan", b"1e308", b"2147483648", b"9223372036854775808", b"99999999",
+    b"0.1.2", b"", b"null", b"\xff\xfe", b"[" * 2000, b"9" * 5000, b"-0", b"true", b'"', b"{",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Format:
+    """One file format.
+
+    Parameters
+    ----------
+    name : str
+    write : callable
+        Writes a valid file, and what goes with it, into a folder; returns the file to mutate.
+    read : callable
+        Reads that file.
+    seal : callable
+        Makes the checksum of mutated data right again, where the format has one.
+    """
+
+    name: str
+    write: Callable[[Path], Path]
+    read: Callable[[Path], object]
+    seal: Callable[[bytes], bytes] = bytes
+
+
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Change a file's bytes in one to four places."""
+    for _ in range(int(rng.integers(1, 5))):
+        start = int(rng.integers(len(data) + 1))
+        size = int(min(rng.geometric(0.05), len(data)))
+        match rng.integers(7):
+            case 0:
+                data = data[:start]
+            case 1:
+                data = data[:start] + rng.bytes(size) + data[start + size :]
+            case 2:
+                data = data[:start] + data[start + size :]
+            case 3:
+                data = (
+                    data[:start]
+                    + data[start : start + size] * int(rng.integers(2, 40))
+                    + data[start:]
+                )
+            case 4:
+                other = int(rng.integers(len(data) + 1))
+                data = data[:start] + data[other : other + size] + data[start:]
+            case 5 if data:
+                place = start % len(data)
+                data = (
+                    data[:place]
+                    + bytes([data[place] ^ (1 << int(rng.integers(8)))])
+                    + data[place + 1 :]
+                )
+            case _:
+                numbers = list(re.finditer(rb"-?\d+(\.\d+)?([eE]-?\d+)?", data))
+                if numbers:
+                    chosen = numbers[rng.integers(len(numbers))]
+                    extreme = _EXTREMES[rng.integers(len(_EXTREMES))]
+                    data = data[: chosen.start()] + extreme + data[chosen.end() :]
+    return data
+
+
+def run_mutation(kind: Format, seed: int, folder: Path) -> str:
+    """Read one mutation of a format's file; returns ``"read"`` or ``"refused"``.
+
+    Anything but a `CadalignError`, a warning too, passes through.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    path = kind.write(folder)
+    data = mutate(path.read_bytes(), np.random.default_rng([seed, len(kind.name)]))
+    path.write_bytes(kind.seal(data))
+    with bounded(), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            kind.read(path)
+        except CadalignError as error:
+            assert len(str(error)) < 2000, "the message quotes its input at length"
+            return "refused"
+    return "read"
+
+
+@contextmanager
+def bounded() -> Iterator[None]:
+    """Raise MemoryError and TimeoutError where a reader takes more than it should."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    previous = signal.signal(signal.SIGALRM, _too_long)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, before[1]))
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _too_long(number: int, frame: object) -> None:
+    raise TimeoutError(f"takes more than {SECONDS} s")
+
+
+# --- formats ------------------------------------------------------------------------------------
+
+_CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+_POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
+_POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
+
+
+def _text(name: str, text: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        (folder / name).write_text(text, encoding="utf-8")
+        return folder / name
+
+    return write
+
+
+def _json(name: str, value: Any) -> Callable[[Path], Path]:
+    return _text(name, json.dumps(value, indent=1))
+
+
+_OBJ = (
+    "mtllib box.mtl\n"
+    + "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    + "vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\nusemtl red\nf 1/1/1 2/2/1 4/3/1\nf 5 6 8 7\nl 1 2\n"
+    "usemtl blue\nf -1//1 -2//1 -3//1\nf 1 2 \\\n 5\n"
+)
+_MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd -s 1 1 1 wood.png\nnewmtl blue\nKd 0 0 1\nNs 10\n"
+
+
+def _write_obj(folder: Path) -> Path:
+    (folder / "box.mtl").write_text(_MTL)
+    Image.fromarray(np.full((4, 4, 3), 90, np.uint8)).save(folder / "wood.png")
+    return _text("box.obj", _OBJ)(folder)
+
+
+def _write_mtl(folder: Path) -> Path:
+    _write_obj(folder)
+    return folder / "box.mtl"
+
+
+def _export(name: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        box = trimesh.creation.box()
+        box.visual.vertex_colors = np.full((8, 4), 200, np.uint8)
+        box.export(folder / name)
+        return folder / name
+
+    return write
+
+
+def _write_image(folder: Path) -> Path:
+    rng = np.random.default_rng(1)
+    Image.fromarray(rng.integers(0, 255, (20, 30, 3), dtype=np.uint8)).save(folder / "photo.png")
+    return folder / "photo.png"
+
+
+_OBSERVATION = {
+    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "params": [60, 60, 32, 24]},
+    "keypoints": [
+        {
+            "xyz": xyz,
+            "uv": uv,
+            "sigma": 1.0,
+            "semantic_id": k,
+            "name": f"corner {k}",
+            "confidence": 0.5,
+        }
+        for k, (xyz, uv) in enumerate(
+            zip(_POINTS.tolist(), _CAMERA.project(_POSE.apply(_POINTS)).tolist(), strict=True)
+        )
+    ],
+}
+_COCO = {
+    "images": [{"id": 1, "file_name": "a.jpg", "width": 64, "height": 48}],
+    "categories": [{"id": 1, "name": "chair", "keypoints": ["a", "b", "c"]}],
+    "annotations": [
+        {
+            "id": 1,
+            "image_id": 1,
+            "category_id": 1,
+            "keypoints": [1, 2, 2, 3, 4, 1, 0, 0, 0],
+            "score": 0.5,
+        }
+    ],
+}
+_KEYPOINTNET = [
+    {
+        "class_id": "03001627",
+        "model_id": "abc",
+        "keypoints": [
+            {
+                "xyz": xyz,
+                "rgb": [1, 2, 3],
+                "semantic_id": k,
+                "pcd_info": {"point_index": k},
+                "mesh_info": {"face_index": k, "face_uv": [0.2, 0.3, 0.5]},
+            }
+            for k, xyz in enumerate(_POINTS.tolist())
+        ],
+        "symmetries": {
+            "reflection": [{"kp_indexes": [0, 1]}],
+            "rotation": [{"kp_indexes": [2, 3], "is_circle": False, "circle": {}}],
+        },
+    }
+]
+_MODEL_KEYPOINTS = {
+    "format": "cadalign model keypoints",
+    "version": 1,
+    "keypoints": [
+        {"name": f"k{k}", "xyz": xyz, "semantic_id": k} for k, xyz in enumerate(_POINTS.tolist())
+    ],
+}
+_CAMERAS = "# cameras\n1 PINHOLE 64 48 60 60 32 24\n2 OPENCV 64 48 60 60 32 24 .1 0 0 0\n"
+_IMAGES = "1 1 0 0 0 0 0 3 1 a.jpg\n10 10 1 20 20 2 5 5 -1\n2 .5 .5 .5 .5 0 0 3 2 b.jpg\n\n"
+_SCENE_POINTS = "1 0.1 0.2 0.3 255 0 0 0.5 1 0\n2 -.1 .2 .1 0 0 255 0.1 1 1 2 0\n"
+_BUNDLER = (
+    "# Bundle file v0.3\n1 2\n60 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 -3\n"
+    ".1 .2 .3\n255 0 0\n1 0 0 5 5\n-.1 .2 .3\n0 0 0\n1 0 1 -5 5\n"
+)
+
+
+def _colmap_text(changed: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        for name, text in (
+            ("cameras", _CAMERAS),
+            ("images", _IMAGES),
+            ("points3D", _SCENE_POINTS),
+        ):
+            (folder / f"{name}.txt").write_text(text)
+        return folder / f"{changed}.txt"
+
+    return write
+
+
+def _colmap_binary(changed: str) -> Callable[[Path], Path]:
+    camera = struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 60.0, 60.0, 32.0, 24.0)
+    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 3, 1) + b"a.jpg\0"
+    image += struct.pack("<Qddqddq", 2, 10, 10, 1, 5, 5, -1)
+    point = struct.pack("<QQ3d3BdQii", 1, 1, 0.1, 0.2, 0.3, 1, 2, 3, 0.5, 1, 1, 0)
+
+    def write(folder: Path) -> Path:
+        for name, data in (("cameras", camera), ("images", image), ("points3D", point)):
+            (folder / f"{name}.bin").write_bytes(data)
+        return folder / f"{changed}.bin"
+
+    return write
+
+
+def _write_blind_pnp(folder: Path) -> Path:
+    root = folder / "nyu_train"
+    root.mkdir()
+    rays = _CAMERA.normalize(_CAMERA.project(_POSE.apply(_POINTS)))
+    values = {
+        "matches": [np.hstack([rays, _POINTS])],
+        "R": [np.eye(3)],
+        "t": [np.array([0, 0, 3.0])],
+    }
+    for name, value in values.items():
+        (root / f"{name}.pkl").write_bytes(pickle.dumps(value, protocol=2))
+    return root / "matches.pkl"
+
+
+def _write_fit(folder: Path) -> Path:
+    result = fit(_POINTS, _CAMERA.project(_POSE.apply(_POINTS)), _CAMERA)
+    return _text("fit.json", result.to_json())(folder)
+
+
+def _write_library(folder: Path) -> Path:
+    bounds = np.array([_POINTS.min(axis=0), _POINTS.max(axis=0)])
+    models = [LibraryModel("box", f"{k}", _POINTS, np.arange(8), bounds) for k in range(3)]
+    Library.from_models(models).save(folder / "boxes.cadalign")
+    return folder / "boxes.cadalign"
+
+
+def _seal_library(data: bytes) -> bytes:
+    """A library whose header tells the length and the checksum of what it holds."""
+    payload = data[64:]
+    checksum = hashlib.blake2b(payload, digest_size=32).digest()
+    return struct.pack("<16sIIQ32s", b"cadalign library", 1, 0, len(payload), checksum) + payload
+
+
+def _read_library(path: Path) -> object:
+    library = Library.open(path)
+    return list(library), library.retrieve(
+        _CAMERA.project(_POSE.apply(_POINTS)), np.arange(8), _CAMERA
+    )
+
+
+def _write_views(write: Callable[..., None], name: str) -> Callable[[Path], Path]:
+    def write_views(folder: Path) -> Path:
+        write(
+            folder / name,
+            [CameraView(_CAMERA, Alignment(np.eye(3), [0, 0, 3], [1, 1, 1]), "a")] * 2,
+        )
+        return folder / name
+
+    return write_views
+
+
+def _read_annotations(path: Path) -> object:
+    dataset = KeypointNet(path.parent.parent)
+    return [model.keypoints for model in dataset], dataset.problems
+
+
+def _write_annotations(folder: Path) -> Path:
+    (folder / "annotations").mkdir()
+    return _json("chair.json", _KEYPOINTNET)(folder / "annotations")
+
+
+def _drain(images: Any) -> object:
+    return list(images)
+
+
+def _read_colmap(path: Path) -> object:
+    return _drain(Colmap(path.parent))
+
+
+def _read_fit(path: Path) -> object:
+    return FitResult.from_json(path.read_text("utf-8", "replace"))
+
+
+FORMATS = {
+    kind.name: kind
+    for kind in (
+        Format("obj", _write_obj, load_mesh),
+        Format("mtl", _write_mtl, lambda path: load_mesh(path.with_name("box.obj"))),
+        Format("ply", _export("box.ply"), load_mesh),
+        Format("stl", _export("box.stl"), load_mesh),
+        Format("glb", _export("box.glb"), load_mesh),
+        Format("image", _write_image, read_photo),
+        Format("observation", _json("o.json", _OBSERVATION), Observation.load),
+        Format("coco", _json("c.json", _COCO), read_image_keypoints),
+        Format("csv", _text("k.csv", "name,u,v,score\na,1,2,.5\nb,3,4,.1\n"), read_image_keypoints),
+        Format("keypointnet", _write_annotations, _read_annotations),
+        Format("model keypoints", _json("m.keypoints.json", _MODEL_KEYPOINTS), ModelKeypoints.load),
+        *(
+            Format(
+                f"colmap {name} text", _colmap_text(name), lambda path: _drain(Colmap(path.parent))
+            )
+            for name in ("cameras", "images", "points3D")
+        ),
+        *(
+            Format(
+                f"colmap {name} binary",
+                _colmap_binary(name),
+                lambda path: _drain(Colmap(path.parent)),
+            )
+            for name in ("cameras", "images", "points3D")
+        ),
+        Format(
+            "bundler",
+            _text("bundle.out", _BUNDLER),
+            lambda path: _drain(Bundler(path, sizes=(64, 48))),
+        ),
+        Format("blind pnp", _write_blind_pnp, lambda path: _drain(BlindPnP(path.parent))),
+        Format("fit", _write_fit, _read_fit),
+        Format("library", _write_library, _read_library),
+        Format("forged library", _write_library, _read_library, _seal_library),
+        Format("open3d", _write_views(write_open3d, "v.json"), read_camera_views),
+        Format("nerf", _write_views(write_nerf, "transforms.json"), read_camera_views),
+    )
+}

@@ -127,16 +127,33 @@ def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKey
         weights = closest_barycentric(triangles[near], place)
         points = np.einsum("mc,mcd->md", weights, triangles[near])
         best = int(np.argmin(np.linalg.norm(points - place, axis=1)))
-        xyz, face = points[best], int(near[best])
+        face = int(near[best])
+        xyz = weights[best] @ triangles[face]
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
         keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights[best], vertex))
     return tuple(keypoints)
 
 
 def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle."""
-    points = np.broadcast_to(point, (len(triangles), 3))
-    surface: Any = trimesh.triangles
-    nearest = surface.closest_point(triangles, points)
-    weights = np.maximum(surface.points_to_barycentric(triangles, nearest, method="cross"), 0)
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle.
+
+    That is the foot of the perpendicular where it lies inside, otherwise the nearest of the points
+    nearest on the three edges.
+    """
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    normal, offset = np.cross(first, second), point - triangles[:, 0]
+    squared = np.einsum("md,md->m", normal, normal)
+    v = np.einsum("md,md->m", np.cross(offset, second), normal) / squared
+    w = np.einsum("md,md->m", np.cross(first, offset), normal) / squared
+    candidates = [np.stack([1 - v - w, v, w], axis=1)]
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        along = triangles[:, end] - triangles[:, start]
+        reach = np.einsum("md,md->m", point - triangles[:, start], along)
+        share = np.clip(reach / np.einsum("md,md->m", along, along), 0.0, 1.0)
+        weights = np.zeros((len(triangles), 3))
+        weights[:, start], weights[:, end] = 1 - share, share
+        candidates.append(weights)
+    choices = np.stack(candidates)
+    distance = np.linalg.norm(np.einsum("kmc,mcd->kmd", choices, triangles) - point, axis=2)
+    distance[0][(choices[0] < 0).any(axis=1)] = np.inf
+    return np.asarray(choices[np.argmin(distance, axis=0), np.arange(len(triangles))])

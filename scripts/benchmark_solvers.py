@@ -107,7 +107,7 @@ def _keypointnet_problem(models: list[np.ndarray], rng: np.random.Generator) -> 
     alignment = cadalign.Alignment(random_rotation(rng), [0.0, 0.0, rng.uniform(1.5, 3)], scale)
     pixels = KEYPOINT_CAMERA.project(alignment.apply(chosen / scale))
     pixels += rng.standard_normal(pixels.shape)
-    return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment)
+    return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment, None)
 
 
 def _spans_volume(points: np.ndarray) -> bool:

@@ -188,7 +188,7 @@ def flattened(axis: int, thickness: float) -> Problem:
     points_3d = problem.points_3d * factor
     points_3d[:, axis] += 0.25 - points_3d[:, axis].mean()
     points_2d = problem.camera.project(problem.alignment.apply(points_3d))
-    return Problem(points_3d, points_2d, problem.camera, problem.alignment)
+    return Problem(points_3d, points_2d, problem.camera, problem.alignment, None)
 
 
 @pytest.mark.parametrize("axis", [1, 2])

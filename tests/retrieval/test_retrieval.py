@@ -16,6 +16,7 @@ from scipy.linalg import eigh
 from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.retrieval import LibraryModel
@@ -588,7 +589,7 @@ def rank_1_rate(library: Library, noise_px: float, keypoints: int, queries: int)
             continue
         made += 1
         best = library.retrieve(
-            seen.points_2d, seen.semantic_ids, seen.camera, sigma=noise_px, top=1
+            seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA, sigma=noise_px, top=1
         )[0]
         hits += is_same_shape(library[best.category, best.model_id], model)
     assert made > queries / 3
@@ -624,7 +625,7 @@ def test_the_list_is_exact_in_a_library_of_real_chairs(chairs: Library) -> None:
     for place, noise_px in enumerate((1.0, 3.0, 5.0)):
         model = list(chairs)[100 * place]
         seen = observe_model(model, RetrievalTask(*model.key, noise_px, 8), seed=1)
-        arguments = (seen.points_2d, seen.semantic_ids, seen.camera)
+        arguments = (seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA)
         found = chairs.retrieve(*arguments, sigma=noise_px)
         every = chairs.retrieve(*arguments, sigma=noise_px, exhaustive=True)
         assert names(found) == names(every)

@@ -54,7 +54,7 @@ class _Unfinished(JsonDocument):
     """File of the pairs with only one half placed."""
 
     pairs: list[_Half]
-    format: str
+    format: str = ""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,8 +22,8 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small: dict[str, SweepKind] = {
-        "noise": SweepKind("noise", "noise_px", (1.0, 5.0), points=30, runs=5),
-        "points": SweepKind("points", "points", (8, 20), runs=5),
+        "noise": replace(SWEEPS["noise"], values=(1.0, 5.0), points=30, runs=5),
+        "points": replace(SWEEPS["points"], values=(8, 20), runs=5),
     }
     for name, kind in small.items():
         monkeypatch.setitem(SWEEPS, name, kind)

@@ -64,7 +64,7 @@ def check_methods(names: Iterable[str]) -> tuple[str, ...]:
     return unique
 
 
-def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None = None) -> dict[str, Any]:
+def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dict[str, Any]:
     """The options of `cadalign.fit` and `cadalign.fit_batch` that make it a method.
 
     Robust methods take what lies within 3.5 ``sigma`` [px] for an inlier, or go by ``ransac``, but

@@ -174,7 +174,7 @@ class KeypointNetExperiment:
             [instance.points_3d for instance in instances],
             [instance.points_2d for instance in instances],
             [instance.camera for instance in instances],
-            **fit_options(method, sigma=self.options.noise_px or 1.0),
+            **fit_options(method, sigma=self.options.noise_px or 1.0, ransac=None),
         )
         return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
 
@@ -184,7 +184,8 @@ class KeypointNetExperiment:
         try:
             if method == LIMIT:
                 return limit_estimate(*given, instance.gt)
-            return fit(*given, **fit_options(method, sigma=self.options.noise_px or 1.0))
+            noise = self.options.noise_px or 1.0
+            return fit(*given, **fit_options(method, sigma=noise, ransac=None))
         except CadalignError as error:
             return error
 

@@ -130,7 +130,7 @@ def _estimates(
         [problem.points_3d for problem in problems],
         [problem.points_2d for problem in problems],
         problems[0].camera,
-        **fit_options(method, sigma=sigma),
+        **fit_options(method, sigma=sigma, ransac=None),
     )
     return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
 
@@ -141,7 +141,7 @@ def _timed(
     """An estimate, and the time of the quickest of some calls."""
     if method == LIMIT:
         return _bound(problem), None
-    best, how = np.inf, fit_options(method, sigma=sigma)
+    best, how = np.inf, fit_options(method, sigma=sigma, ransac=None)
     try:
         for _ in range(_REPEATS):
             start = time.perf_counter()

@@ -7,7 +7,9 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -125,17 +127,12 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    options = FitOptions(
-        method=method,
-        sigma=sigma,
-        loss=loss,
-        loss_scale=loss_scale,
-        stretch=stretch,
-        scale_prior_sigma=scale_prior_sigma,
-        known_axis=known_axis,
-        focal=focal,
-        focal_prior=focal_prior,
-    )
+    shape = (stretch, scale_prior_sigma, known_axis)
+    chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
+    try:
+        options = _checked_options(*chosen)
+    except TypeError:  # an array as sigma has no hash
+        options = FitOptions(*chosen)
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
     if ransac is None:
@@ -342,6 +339,10 @@ def _fit_inliers(
         problems.cameras,
     )
     return _fit_all(some, replace(options, sigma=sigma), start)
+
+
+# Checking options takes as long as solving a small problem linearly, and calls repeat them.
+_checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
 
 
 def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import DegenerateError, InputError
 from cadalign.fitting.noise import rays_of, whitening_of
-from cadalign.fitting.options import LOSSES
+from cadalign.fitting.options import LOSSES, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
@@ -62,7 +63,7 @@ def observe(
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
     """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
     count = len(pixels)
-    sigma = options.sigma if options.sigma is not None else np.nan  # None is refused
+    sigma = cast("Sigma", options.sigma)  # the options refuse None
     dimensions = np.ndim(sigma)
     if dimensions == 3:
         covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))[order]

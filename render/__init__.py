@@ -18,7 +18,7 @@ from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 from cadalign.render.select import make_renderer
 from cadalign.render.views.silhouette import silhouette_iou
-from cadalign.render.views.viewpoints import View, frame_object, look_at, sample_view
+from cadalign.render.views.viewpoints import Viewpoint, frame_object, look_at, sample_view
 from cadalign.render.views.visibility import visible_keypoints
 
 __all__ = [
@@ -30,7 +30,7 @@ __all__ = [
     "Renderer",
     "Scene",
     "Studio",
-    "View",
+    "Viewpoint",
     "cast_geometry",
     "contact_sheet",
     "depth_picture",

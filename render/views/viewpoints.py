@@ -22,7 +22,7 @@ _FILL_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Viewpoint:
     """A camera's view of an object.
 
     Parameters
@@ -103,7 +103,7 @@ def sample_view(
     roll: float = 0.0,
     scale: npt.ArrayLike = (1.0, 1.0, 1.0),
     max_attempts: int = 100,
-) -> View:
+) -> Viewpoint:
     """Draw a view, evenly over the sphere, in which enough keypoints are seen.
 
     The object's box lies inside the image about its centre.
@@ -133,7 +133,7 @@ def sample_view(
 
     Returns
     -------
-    View
+    Viewpoint
 
     Raises
     ------
@@ -159,7 +159,7 @@ def sample_view(
         )
         visible = visible_keypoints(scene, points, camera, pose)
         if visible.sum() >= min_visible:
-            return View(cam_from_model=pose, visible=visible)
+            return Viewpoint(cam_from_model=pose, visible=visible)
         best = max(best, int(visible.sum()))
     found = f"the best of {attempts} views shows {best}" if attempts else "there are no more"
     raise RenderError(

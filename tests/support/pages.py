@@ -75,8 +75,13 @@ def scroll_through(page: Page) -> None:
 
 
 def card_names(page: Page) -> list[str]:
-    """Model ids of the gallery, in its order, as far as its cards exist."""
-    return page.locator(".card .name").all_inner_texts()
+    """Model ids of the gallery, in its order, as far as its cards exist.
+
+    The gallery draws its cards when the browser has measured it, which a busy machine does late.
+    """
+    names = page.locator(".card .name")
+    names.first.wait_for(state="attached")
+    return names.all_inner_texts()
 
 
 def open_first(page: Page) -> Locator:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cadalign.fitting.options import RansacOptions
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
+    from cadalign.shapes.model import ShapeModel
 
 __version__ = "0.1.0"
 
@@ -35,6 +36,7 @@ __all__ = [
     "Material",
     "Mesh",
     "RansacOptions",
+    "ShapeModel",
     "datasets",
     "errors",
     "evaluate",
@@ -53,6 +55,7 @@ _NAMES = {
     "BatchResult": "cadalign.fitting.batch",
     "Library": "cadalign.retrieval.library",
     "Match": "cadalign.retrieval.match",
+    "ShapeModel": "cadalign.shapes.model",
     "evaluate": "cadalign.evaluation.api",
     "fit": "cadalign.fitting.fit",
     "fit_batch": "cadalign.fitting.fit",

@@ -1,0 +1,1 @@
+"""Warping of meshes, such that their keypoints come to given places."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -79,8 +80,8 @@ class AlignResult:
         mean's.
     component : int
         Number of the mixture's component that the object belongs to.
-    model : Model or ShapeModel
-        The model, as given.
+    model : Model or ShapeModel, optional
+        The model, as given; None for a result that was read from a file.
     alternatives : tuple of AlignAlternative
         Other estimates whose probability is at least 1/1000 of the best one's.
     warnings : tuple of str
@@ -99,7 +100,7 @@ class AlignResult:
     points_covariance: FloatArray
     stretch: FloatArray
     component: int
-    model: Model | ShapeModel
+    model: Model | ShapeModel | None
     alternatives: tuple[AlignAlternative, ...]
     warnings: tuple[str, ...]
     stats: FitStats
@@ -168,6 +169,25 @@ class AlignResult:
         if not isinstance(self.model, ShapeModel):
             raise InputError("only a learned shape has training models", where="model")
         return self.model.nearest(self.points_3d)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the result as plain lists and numbers, for JSON; its model is not part of it."""
+        from cadalign.fitting.joint.document import write_result
+
+        return write_result(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> AlignResult:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        from cadalign.fitting.joint.document import read_result
+
+        return read_result(data)
 
     def __str__(self) -> str:
         count = sum(int(inliers.sum()) for inliers in self.inliers)

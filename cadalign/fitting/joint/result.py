@@ -72,7 +72,8 @@ class AlignResult:
     covariance : (9, 9) float
         Of the rotation vector in the first camera's frame [rad], the translation [model units], and
         the logarithms of the object's lengths along x, y, z relative to the mean's; zero for what
-        is held. The inverse of the information of all evidence and priors.
+        is held. The second moment of the posterior about the estimate: the inverse information of
+        all evidence and priors and, where other estimates are likely too, their distance.
     points_covariance : (m, 3, 3) float
         Of each keypoint in the model's frame, stretch included [model units squared].
     stretch : (3,) float

@@ -130,7 +130,7 @@ def score_of(evidence: Evidence, state: State, system: System) -> float:
     for k in range(unknowns):
         score += 2.0 * np.log(factor[k, k])
     score += system.log_determinant[0]
-    return score
+    return float(score)
 
 
 @kernel

@@ -1,7 +1,7 @@
 """Mixtures of Gaussians, learned from vectors with missing entries.
 
 Expectation maximisation as in Ghahramani and Jordan, "Supervised learning from incomplete data via
-an EM approach", NIPS 1994, with a prior that draws each covariance towards a wider one, so that
+an EM approach", NIPS 1994, with a prior that draws each covariance towards a common one, so that
 components of few vectors keep sensible covariances.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from cadalign.arrays import FloatArray, IntArray
 
@@ -153,13 +153,15 @@ def learn_mixture(
 ) -> Gaussians:
     """Learn a mixture from a first clustering.
 
+    Covariances are drawn towards their mean over the components.
+
     Parameters
     ----------
     vectors : Vectors
     labels : (N,) int
         The component that each vector starts in.
     common : Gaussians
-        The Gaussian of all vectors, towards which covariances are drawn.
+        The Gaussian of all vectors, from which the components start.
     strength, floor : float
         See `Prior`.
     rounds : int
@@ -170,15 +172,15 @@ def learn_mixture(
         np.repeat(common.means, count, axis=0),
         np.repeat(common.covariances, count, axis=0),
     )
-    prior = Prior(common.covariances[0], strength, floor)
     responsibilities = np.eye(count)[labels]
     for turn in range(rounds):
         if turn:
             densities = _log_densities(vectors, model)
             densities -= np.logaddexp.reduce(densities, axis=1, keepdims=True)
             responsibilities = np.exp(densities)
+        within = np.einsum("g,gij->ij", model.weights, model.covariances)
         shares = vectors.weights[:, None] * responsibilities
-        model = _maximise(vectors, shares, model, prior)
+        model = _maximise(vectors, shares, model, Prior(within, strength, floor))
     return model
 
 
@@ -188,11 +190,11 @@ def _log_densities(vectors: Vectors, model: Gaussians) -> FloatArray:
     for pattern in vectors.patterns:
         seen = pattern.seen
         constant = len(seen) / 2 * math.log(2 * math.pi)
-        for number, (weight, mean) in enumerate(zip(model.weights, model.means, strict=True)):
-            root = np.linalg.cholesky(model.covariances[number][np.ix_(seen, seen)])
-            whitened = _solve(root, (pattern.values - mean[seen]).T)
-            volume = np.log(np.diag(root)).sum() + constant
-            squares = (whitened**2).sum(axis=0)
+        for number, weight in enumerate(model.weights):
+            root = _root(model.covariances[number][seen[:, None], seen])
+            whitened = _solve(root, (pattern.values - model.means[number][seen]).T)
+            volume = np.log(root.diagonal()).sum() + constant
+            squares = np.einsum("nr,nr->r", whitened, whitened)
             found[pattern.rows, number] = math.log(max(weight, 1e-300)) - volume - squares / 2
     return found
 
@@ -202,18 +204,17 @@ def _expect(
 ) -> tuple[FloatArray, FloatArray]:
     """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
     mean, covariance = model.means[number], model.covariances[number]
-    completed, spread = np.empty_like(vectors.values), np.zeros_like(covariance)
+    completed, spread = vectors.values.copy(), np.zeros_like(covariance)
     for pattern in vectors.patterns:
         seen, missing = pattern.seen, pattern.missing
-        completed[np.ix_(pattern.rows, seen)] = pattern.values
         if not len(missing):
             continue
-        root = np.linalg.cholesky(covariance[np.ix_(seen, seen)])
+        root = _root(covariance[seen[:, None], seen])
         whitened = _solve(root, (pattern.values - mean[seen]).T)
-        across = _solve(root, covariance[np.ix_(seen, missing)])
-        completed[np.ix_(pattern.rows, missing)] = mean[missing] + whitened.T @ across
-        rest = covariance[np.ix_(missing, missing)] - across.T @ across
-        spread[np.ix_(missing, missing)] += shares[pattern.rows].sum() * rest
+        across = _solve(root, covariance[seen[:, None], missing])
+        completed[pattern.rows[:, None], missing] = mean[missing] + whitened.T @ across
+        rest = covariance[missing[:, None], missing] - across.T @ across
+        spread[missing[:, None], missing] += shares[pattern.rows].sum() * rest
     return completed, spread
 
 
@@ -235,5 +236,16 @@ def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Pri
     return Gaussians(totals / totals.sum(), np.array(means), np.array(covariances))
 
 
+# SciPy's own checks would take longer than the factorisation of such small matrices.
+def _root(covariance: FloatArray) -> FloatArray:
+    """Lower Cholesky factor."""
+    root, info = dpotrf(covariance, lower=1, clean=1)
+    if info:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return np.asarray(root)
+
+
 def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(solve_triangular(root, right, lower=True, check_finite=False))
+    """Solve with a lower Cholesky factor."""
+    solution, _ = dtrtrs(root, right, lower=1)
+    return np.asarray(solution)

@@ -72,11 +72,11 @@ class _FitFields(Document):
     """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
 
     method: Text | UnsetType = UNSET
-    sigma: Positive | None | UnsetType = UNSET
+    sigma: Positive | UnsetType | None = UNSET
     loss: Text | UnsetType = UNSET
     loss_scale: Positive | UnsetType = UNSET
-    stretch: Text | None | UnsetType = UNSET
-    scale_prior_sigma: Positive | None | UnsetType = UNSET
+    stretch: Text | UnsetType | None = UNSET
+    scale_prior_sigma: Positive | UnsetType | None = UNSET
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
 

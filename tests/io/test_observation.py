@@ -125,7 +125,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("keypoints", {}), "{path}: keypoints: {{}} is not a list"),
         (
             DATA | {"cameras": 3},
-            "{path}: top level: unknown field 'cameras'; known are camera, image, keypoints, model",
+            "{path}: top level: unknown field 'cameras'; known are camera, fit, image, keypoints, model",
         ),
         (
             DATA | {"x` - at `$.y": 3},

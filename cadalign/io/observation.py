@@ -156,6 +156,10 @@ class Observation:
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
         read: _ObservationFile = convert(data, _ObservationFile)
+        sigma = read.fit.sigma
+        if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
+            what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
+            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
         names = _column(read.keypoints, "name")
         ids = _column(read.keypoints, "semantic_id")
         return cls(

@@ -112,7 +112,11 @@ class _Lock:
     def hold(self, timeout: float) -> Iterator[None]:
         """Hold the lock; raises DataError if another has it, or the folder cannot be written to."""
         if not self._path.parent.is_dir():  # which FileLock would make
-            raise self._unwritable("No such folder")
+            raise DataError(
+                "the folder is gone",
+                where=str(self._path.parent),
+                fix="put it back: everything is saved with the next change, or at the end",
+            )
         lock = FileLock(self._path, timeout=timeout, thread_local=False)
         try:
             lock.acquire()

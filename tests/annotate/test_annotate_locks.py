@@ -132,13 +132,13 @@ def test_deleted_folder_loses_nothing(case: Case) -> None:
         shutil.rmtree(out)
         state = first.act({"do": "place_uv", "uv": [30, 40]})
         assert state["saved"]["trouble"] == (
-            f"{out}: the folder cannot be written to (No such folder); "
-            "make it writable, or choose another one by --out"
+            f"{out}: the folder is gone; "
+            "put it back: everything is saved with the next change, or at the end"
         )
         code, err = first.end()
     *_, trouble, place = err.strip().splitlines()
     assert code == 1
-    assert trouble.startswith(f"Not saved: {out}: the folder cannot be written to")
+    assert trouble.startswith(f"Not saved: {out}: the folder is gone")
     match = re.fullmatch(r"Saved in (\S+) instead", place)
     assert match
     rescued = json.loads(Path(match[1], "photo.unfinished.json").read_text())

@@ -74,9 +74,14 @@ def observation_file(photo: Path, folder: Path) -> Path:
 
 
 def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:
-    """Refuse files to be written that are one, or a file that is read; raises InputError."""
+    """Refuse files to be written that are one, or one that is read, or no files of their own.
+
+    Raises InputError.
+    """
     seen = {_key(path) for path in read}
     for path in written:
+        if path.exists() and not path.is_file():
+            raise InputError("not a regular file", where=str(path), fix=_OTHER_FOLDER)
         if _key(path) in seen:
             raise InputError(
                 "would be written twice, or over a file that is read",
@@ -93,8 +98,9 @@ def _key(path: Path) -> Path:
 def _load(path: Path) -> dict[str, Any]:
     """The object of a JSON file; empty if there is none."""
     data: Any = None
-    with suppress(DataError):
-        data = read_json(path)
+    if path.is_file():  # a pipe would be waited for
+        with suppress(DataError):
+            data = read_json(path)
     return data if isinstance(data, dict) else {}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import tempfile
 import threading
 from contextlib import ExitStack, suppress
@@ -68,6 +69,8 @@ class Annotate(SessionOptions):
             )
             if not self.no_open:
                 webbrowser.open(access.url)
+            # Ends as Ctrl+C does, with everything saved and unlocked.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
             with suppress(KeyboardInterrupt):
                 serve(make_app(session, access), listener)
             return _save_and_say_where(session, console)

@@ -48,8 +48,8 @@ class Annotator:
         connection.close()
         return answer
 
-    def end(self) -> tuple[int, str]:
-        self.process.send_signal(signal.SIGINT)
+    def end(self, how: signal.Signals = signal.SIGINT) -> tuple[int, str]:
+        self.process.send_signal(how)
         _, err = self.process.communicate(timeout=60)
         return self.process.returncode, err
 
@@ -100,7 +100,7 @@ def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
     with annotator(case, "--image", case.photo) as third:
         pairs = third.act({"do": "place_uv", "uv": [50, 60]})["pairs"]
         assert [pair["uv"] for pair in pairs] == [[10, 20], [30, 40], [50, 60]]
-        code, err = third.end()
+        code, err = third.end(signal.SIGTERM)
     assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
     assert not list(case.folder.glob(LOCK))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -160,6 +161,15 @@ def test_other_files_in_the_place_of_derived_ones_are_kept(case: Case) -> None:
     fit.mkdir()
     (fit / "fit.json").write_text(json.dumps({"clothes": "L"}))
     assert refusal_text(case.open).startswith(f"{fit / 'fit.json'}: not an alignment of cadalign")
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
+@pytest.mark.parametrize("name", ["photo.json", "photo.unfinished.json"])
+def test_folders_and_pipes_in_a_files_place_are_refused(
+    case: Case, name: str, make: Callable[[Path], None]
+) -> None:
+    make(case.folder / name)
+    assert refusal_text(case.open).startswith(f"{case.folder / name}: not a regular file; ")
 
 
 def test_files_are_compared_by_place(tmp_path: Path) -> None:

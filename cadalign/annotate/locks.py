@@ -25,7 +25,7 @@ logger = logging.getLogger("cadalign")
 
 _ENDING = "annotate-lock"
 _PATIENCE = 0.2  # for a lock that is just being removed [s]
-_QUEUE = 5.0  # for others that are passing through the folder's lock [s]
+_QUEUE = 2.0  # for others that are passing through the folder's lock [s]
 _LONGEST_NOTE = 150
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 

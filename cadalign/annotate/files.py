@@ -49,7 +49,7 @@ class _Half(Labelled, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.uv is None and self.semantic_id is None:
-            raise InputError("uv and semantic_id are both missing")
+            raise InputError("uv and semantic_id are both missing", fix="give one of them")
 
 
 class _Unfinished(JsonDocument):

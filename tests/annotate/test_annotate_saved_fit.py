@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,8 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     command = json.loads(capsys.readouterr().out)
     saved = FitResult.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    assert page.std is not None
+    np.testing.assert_allclose(flat(command["std"]), flat(asdict(page.std)), rtol=1e-9)
     for fitted in (FitResult.from_json(json.dumps(command)), saved):
         np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(
@@ -78,7 +81,7 @@ def flat(value: Any) -> list[float]:
     """All numbers of nested lists and objects."""
     if isinstance(value, dict):
         return flat(list(value.values()))
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [number for item in value for number in flat(item)]
     return [] if isinstance(value, str) else [value]
 

@@ -8,6 +8,7 @@ Beside the observation `photo.json` there may be
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,8 @@ from cadalign.io.documents import (
 )
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
+
+logger = logging.getLogger("cadalign")
 
 _UNFINISHED = "cadalign unfinished pairs"
 _RENAME = "rename it: the annotator writes a file of this name"
@@ -87,6 +90,7 @@ class AnnotationFiles:
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
+            self._warn_of_options(observation)
             document = _document_of(observation, registry, diagonal)
         if self.unfinished.exists():
             document = _with_halves(document, self.unfinished, registry)
@@ -135,6 +139,17 @@ class AnnotationFiles:
                 return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
+
+    def _warn_of_options(self, observation: Observation) -> None:
+        """Warn of stored options of the fit that the page does not use."""
+        options = observation.fit_options.items()
+        others = [name for name, value in options if name != "sigma" or isinstance(value, float)]
+        if others:
+            logger.warning(
+                "%s: the annotator fits without the stored %s, and replaces the stored options "
+                "at the first change; keep a copy of the file if they matter",
+                *(self.observation, ", ".join(others)),
+            )
 
     def _refuse_other_fit(self) -> None:
         """Refuse a file in the alignment's place that is something else, before it is replaced."""

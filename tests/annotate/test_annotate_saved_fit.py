@@ -86,6 +86,19 @@ def flat(value: Any) -> list[float]:
     return [] if isinstance(value, str) else [value]
 
 
+def test_stored_options_that_the_page_does_not_use_are_named(
+    case: Case, caplog: pytest.LogCaptureFixture
+) -> None:
+    instance = case.instance
+    for options in ({"sigma": None}, {"sigma": 3.0, "loss": "cauchy"}):
+        Observation(
+            instance.points_3d, instance.points_2d, instance.camera, fit_options=options
+        ).save(case.observation)
+        assert caplog.text == ""
+        case.open()
+    assert f"{case.observation}: the annotator fits without the stored sigma, loss" in caplog.text
+
+
 def test_options_follow_the_pairs(case: Case) -> None:
     """What was estimated for other pairs is not left in the file."""
     instance = case.instance

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.outliers import Rows, find_outliers
 from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit
+from cadalign.fitting.outliers import Rows, find_outliers
 from cadalign.fitting.result import FitResult
 
 LEAST_PAIRS = 4
@@ -121,7 +121,7 @@ class _Fitter:
         return self._fit(np.arange(len(self.points_3d)), sigma, "linear")
 
     def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
-        """Fit some pairs; see `cadalign.annotate.outliers.FitRows`."""
+        """Fit some pairs; see `cadalign.fitting.outliers.FitRows`."""
         result = self._fit(rows, _LEAST_SIGMA, "linear")
         if robust:
             # sigma=None iterates until nothing changes, which takes ten times as long.

@@ -150,13 +150,13 @@ class AlignResult:
                 raise InputError("the model has no mesh", where="mesh", fix="give one")
             if self.model.shape_sigma is None:
                 return given
-            return warp_mesh(given, np.asarray(self.model.points_3d), self.points_3d)
+            return warp_mesh(given, self.model.points_3d, self.points_3d, bounds=self.bounds)
         if mesh is None:
             fix = "give that of the training model `nearest`, read from its mesh_path"
             raise InputError("a learned shape has no mesh of its own", where="mesh", fix=fix)
         source = self.nearest.points_3d
         known = np.isfinite(source).all(axis=1)
-        return warp_mesh(mesh, source[known], self.points_3d[known])
+        return warp_mesh(mesh, source[known], self.points_3d[known], bounds=self.bounds)
 
     @property
     def nearest(self) -> NearestShape:

@@ -18,7 +18,13 @@ from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.status import Status
+
+    from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.result import FitResult
     from cadalign.io.observation import Observation
+    from cadalign.render.drawing.color import ByteImage
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,13 @@ class Fit(ObservationCommand):
     """Estimate sigma from the residuals: for a model that is only similar to the object."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
+    shape: Path | None = None
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
+    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz; of options stored in
+    the file, sigma and loss count."""
+    shape_sigma: float | None = None
+    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
+    positions on the object about those on the stretched model [model units]."""
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if the file has one."""
     exif: bool = True
@@ -68,31 +81,18 @@ class Fit(ObservationCommand):
 
     def run(self) -> int:
         """Run the fit; returns the exit code."""
-        from cadalign.fitting.fit import fit
         from cadalign.io.files import write_text
         from cadalign.io.images import write_image
-        from cadalign.io.observation import Observation
-        from cadalign.render.drawing.fit_overlay import draw_observation
 
-        observation = Observation.load(self.observation)
         console = new_console()
-        options = self._options(observation)
-        prior = options.focal_prior
-        if prior is not None:
-            share = 100 * prior.relative_sigma
-            text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
-            console.print(text, markup=False)
         status = console.status("fitting (the first time after an installation takes a minute)")
-        with status, named_as_flags(self, options):
-            result = fit(
-                observation.points_3d,
-                observation.points_2d,
-                observation.camera,
-                **vars(options),
-                ransac=self.ransac if self.robust else None,
-                confidences=observation.confidences if self.robust else None,
-            )
-        picture = draw_observation(observation, result)
+        result: FitResult | AlignResult
+        if self.shape is None and self.shape_sigma is None:
+            result, picture = self._fit(console, status)
+        else:
+            from cadalign.cli.fit_shape import fit_shape
+
+            result, picture = fit_shape(self, status)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
         make_folder(out)
         text = json.dumps(result.to_dict(), indent=2) + "\n"
@@ -105,7 +105,31 @@ class Fit(ObservationCommand):
             console.print(f"Picture: {out / 'overlay.png'}", markup=False)
         return 0
 
-    def _options(self, observation: Observation) -> FitOptions:
+    def _fit(self, console: Console, status: Status) -> tuple[FitResult, ByteImage]:
+        """Fit the stretched model; returns the result and its picture."""
+        from cadalign.fitting.fit import fit
+        from cadalign.io.observation import Observation
+        from cadalign.render.drawing.fit_overlay import draw_observation
+
+        observation = Observation.load(self.observation)
+        options = self.options_for(observation)
+        prior = options.focal_prior
+        if prior is not None:
+            share = 100 * prior.relative_sigma
+            text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
+            console.print(text, markup=False)
+        with status, named_as_flags(self, options):
+            result = fit(
+                observation.points_3d,
+                observation.points_2d,
+                observation.camera,
+                **vars(options),
+                ransac=self.ransac if self.robust else None,
+                confidences=observation.confidences if self.robust else None,
+            )
+        return result, draw_observation(observation, result)
+
+    def options_for(self, observation: Observation) -> FitOptions:
         """Options of the fit: those of the flags, otherwise those of the file."""
         from cadalign.io.documents import in_file, within
 

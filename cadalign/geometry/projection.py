@@ -2,13 +2,49 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
+
+if TYPE_CHECKING:
+    from cadalign.geometry.camera import Camera  # which imports this module
 
 
 def perspective(points_cam: FloatArray) -> FloatArray:
     """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
     return points_cam[:, :2] / points_cam[:, 2:]
+
+
+def projected_covariances(
+    points_cam: FloatArray, covariances: FloatArray, camera: Camera
+) -> FloatArray:
+    """Covariances (n, 2, 2) [px squared] of the projections of uncertain points, to first order.
+
+    Parameters
+    ----------
+    points_cam : (n, 3) float
+        In front of the camera, in its frame.
+    covariances : (n, 3, 3) float
+        Of these points.
+    camera : Camera
+
+    Examples
+    --------
+    >>> from cadalign.geometry.camera import Camera
+    >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+    >>> projected_covariances(np.array([[0.0, 0.0, 5.0]]), np.eye(3)[None], camera).tolist()
+    [[[10000.0, 0.0], [0.0, 10000.0]]]
+    """
+    rays = perspective(points_cam)
+    by_point = np.concatenate(
+        [np.broadcast_to(np.eye(2), (len(rays), 2, 2)), -rays[:, :, None]], axis=2
+    )
+    by_point /= points_cam[:, 2, None, None]
+    jacobian = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays) @ by_point
+    return np.asarray(jacobian @ covariances @ jacobian.swapaxes(1, 2))
 
 
 def model_rays(cam_from_model: Alignment) -> tuple[FloatArray, FloatArray]:

@@ -138,8 +138,14 @@ class Observation:
                 object.__setattr__(self, name, checked)
 
     @classmethod
-    def load(cls, path: str | Path) -> Observation:
+    def load(cls, path: str | Path, *, needs_xyz: bool = True) -> Observation:
         """Read an observation file.
+
+        Parameters
+        ----------
+        path : str or Path
+        needs_xyz : bool
+            Whether keypoints must have ``xyz``, which is zero otherwise where it is missing.
 
         Raises
         ------
@@ -149,6 +155,8 @@ class Observation:
         """
         path = Path(path)
         data = read_json(path)
+        if not needs_xyz:
+            data = _with_xyz(data)
         with in_file(path):
             return cls.from_dict(data, folder=path.parent)
 
@@ -202,6 +210,18 @@ class Observation:
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
+
+
+def _with_xyz(data: Any) -> Any:
+    """The parsed form of a file, with zeros for the ``xyz`` of keypoints that have none."""
+    keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
+    if not isinstance(keypoints, list):
+        return data
+    filled = [
+        {"xyz": [0.0, 0.0, 0.0], **each} if isinstance(each, Mapping) else each
+        for each in keypoints
+    ]
+    return {**data, "keypoints": filled}
 
 
 def _column(keypoints: list[_Keypoint], name: str) -> Any:

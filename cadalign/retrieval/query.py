@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,10 @@ import numpy as np
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import in_file, read_json
+from cadalign.io.documents import in_file
 from cadalign.io.images import open_photo, read_image
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.color import ByteImage
-
-_ORIGIN = [0.0, 0.0, 0.0]
 
 
 def read_query(path: Path) -> Observation:
@@ -24,16 +21,8 @@ def read_query(path: Path) -> Observation:
     The format is that of `cadalign.io.observation`, but keypoints must have a ``semantic_id`` and
     may lack ``xyz``, which is zero in the returned observation and not used.
     """
-    data = read_json(path)
-    keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
-    if isinstance(keypoints, list):
-        filled = [
-            {"xyz": _ORIGIN, **keypoint} if isinstance(keypoint, Mapping) else keypoint
-            for keypoint in keypoints
-        ]
-        data = {**data, "keypoints": filled}
+    query = Observation.load(path, needs_xyz=False)
     with in_file(path):
-        query = Observation.from_dict(data, folder=path.parent)
         if query.semantic_ids is None:
             raise DataError(
                 "the keypoints have no semantic_id",

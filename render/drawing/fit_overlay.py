@@ -8,6 +8,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import load_mesh
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
@@ -21,17 +22,20 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
     The box is the model's; without a model it is the box of the keypoints.
     """
     camera = result.camera
-    if observation.image is None:
-        image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    else:
-        image = read_image(observation.image, camera)
     return draw_overlay(
-        image,
+        photo_of(observation, camera),
         camera,
         est_box=Box.from_model(_bounds(observation), result.alignment),
         observed=observation.points_2d,
         reprojected=camera.project(result.alignment.apply(observation.points_3d)),
     )
+
+
+def photo_of(observation: Observation, camera: Camera) -> ByteImage:
+    """The photo (h, w, 3), grey where there is none."""
+    if observation.image is None:
+        return np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
+    return read_image(observation.image, camera)
 
 
 def _bounds(observation: Observation) -> FloatArray:

@@ -8,21 +8,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_points
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
 from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
 from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.keypoint_layer import KeypointMarks
 from cadalign.render.drawing.model_layer import TRANSLUCENT, check_model_style, draw_lines, veil
 from cadalign.render.frame import LIGHT_GREY, Geometry, check_image_size
 from cadalign.render.views.lens_field import within_lens_field
 
 GT_COLOR: Color = (40, 205, 80)
 EST_COLOR: Color = (240, 50, 50)
-OBSERVED_COLOR: Color = (255, 255, 255)
-REPROJECTED_COLOR: Color = (255, 222, 40)
 # Red-ish, green-ish and blue-ish, but none of them a box's colour.
 AXIS_COLORS: tuple[Color, Color, Color] = ((255, 150, 60), (110, 235, 205), (95, 150, 255))
 
@@ -57,6 +56,8 @@ def draw_overlay(
     model_style: str = "translucent",
     observed: npt.ArrayLike | None = None,
     reprojected: npt.ArrayLike | None = None,
+    unseen: npt.ArrayLike | None = None,
+    regions: npt.ArrayLike | None = None,
     axes: bool = True,
     legend: bool = True,
 ) -> ByteImage:
@@ -66,7 +67,8 @@ def draw_overlay(
     the predicted box's centre (or the true one's, without a prediction) to its faces, so that
     their lengths show the stretch. The predicted model itself lies over the photo as a red veil
     with its edges. Observed keypoints are white rings, reprojected ones yellow
-    crosses, and a thin line between the two is the residual. What lies behind the camera is cut
+    crosses, and a thin line between the two is the residual. Keypoints that were not observed are
+    small rings, and thin curves hold those that are uncertain. What lies behind the camera is cut
     off.
 
     Parameters
@@ -82,6 +84,11 @@ def draw_overlay(
         How to show it: ``translucent``, with its edges, or ``lines`` for the edges alone.
     observed, reprojected : (k, 2) float, optional
         Keypoints [px]; if both are given they belong together, row by row.
+    unseen : (n, 2) float, optional
+        Predicted keypoints that were not observed [px].
+    regions : (r, j, 2) float, optional
+        Outlines of regions that hold keypoints [px]; see
+        `cadalign.render.drawing.keypoint_layer.confidence_regions`.
     axes, legend : bool
         Whether to draw these.
 
@@ -113,12 +120,7 @@ def draw_overlay(
     canvas = Canvas(pixels)
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
-    seen = None if observed is None else as_points(observed, name="observed", dimension=2)
-    back = None if reprojected is None else as_points(reprojected, name="reprojected", dimension=2)
-    if seen is not None and back is not None and len(seen) != len(back):
-        raise InputError(
-            f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
-        )
+    marks = KeypointMarks.checked(observed, reprojected, unseen, regions)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
@@ -127,13 +129,14 @@ def draw_overlay(
     if axes and main_box is not None:
         strokes += _axis_strokes(main_box, camera)
     strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
-    seen, back = (None if points is None else canvas.place(points) for points in (seen, back))
+    marks = marks.placed(canvas)
     _draw_strokes(canvas, strokes)
-    _draw_keypoints(canvas, seen, back)
+    marks.draw(canvas)
     predicted = est_box is not None or est_frame is not None
-    entries = _legend_entries(gt_box, predicted, seen, back, axes=axes and main_box is not None)
+    entries = _legend_entries(gt_box, predicted, axes=axes and main_box is not None)
+    entries += marks.legend
     if legend and entries:
-        canvas.legend(entries, keep_clear=_drawn_pixels(strokes, seen, back))
+        canvas.legend(entries, keep_clear=np.concatenate([_drawn_pixels(strokes), marks.pixels]))
     return canvas.finished()
 
 
@@ -261,26 +264,8 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
             canvas.label(stroke.arrow, stroke.points[-1] + ahead, stroke.color)
 
 
-def _draw_keypoints(canvas: Canvas, seen: FloatArray | None, back: FloatArray | None) -> None:
-    """Rings, crosses and the residuals between them."""
-    if seen is not None and back is not None:
-        for pair in np.stack([seen, back], axis=1):
-            canvas.line(pair, REPROJECTED_COLOR, width=1.0)
-    for point in [] if seen is None else seen:
-        canvas.ring(point, OBSERVED_COLOR, radius=5)
-    for point in [] if back is None else back:
-        canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
-
-
-def _legend_entries(
-    gt_box: Box | None,
-    predicted: bool,
-    seen: FloatArray | None,
-    back: FloatArray | None,
-    *,
-    axes: bool,
-) -> list[LegendEntry]:
-    """Names and colours of everything drawn."""
+def _legend_entries(gt_box: Box | None, predicted: bool, *, axes: bool) -> list[LegendEntry]:
+    """Names and colours of boxes, model and axes."""
     entries = []
     if gt_box is not None:
         entries.append(LegendEntry("ground truth", GT_COLOR))
@@ -289,18 +274,11 @@ def _legend_entries(
     if axes:
         names = zip("xyz", AXIS_COLORS, strict=True)
         entries += [LegendEntry(f"{name} axis", color) for name, color in names]
-    if seen is not None:
-        entries.append(LegendEntry("observed", OBSERVED_COLOR, "ring"))
-    if back is not None:
-        entries.append(LegendEntry("reprojected", REPROJECTED_COLOR, "cross"))
     return entries
 
 
-def _drawn_pixels(
-    strokes: list[_Stroke], seen: FloatArray | None, back: FloatArray | None
-) -> FloatArray:
-    """Pixels that the legend should not cover, (n, 2)."""
+def _drawn_pixels(strokes: list[_Stroke]) -> FloatArray:
+    """Pixels of the lines, (n, 2)."""
     share = np.linspace(0, 1, 41)[:, None]
     lines = [s.points[0] + share * (s.points[-1] - s.points[0]) for s in strokes]
-    markers = [points for points in (seen, back) if points is not None]
-    return np.concatenate([np.empty((0, 2)), *lines, *markers])
+    return np.concatenate([np.empty((0, 2)), *lines])

@@ -156,10 +156,33 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     assert np.allclose(state.poses, other.poses, atol=1e-5)
     found = points_of(evidence.shape, state), points_of(as_modes.shape, other)
     assert np.allclose(*found, atol=1e-5)
-    unknowns, points = joint_covariance(evidence, state)
-    all_of_them, of_modes = joint_covariance(as_modes, other)
+    unknowns, points, seen = joint_covariance(evidence, state)
+    all_of_them, of_modes, seen_of_modes = joint_covariance(as_modes, other)
     assert np.allclose(unknowns[:6, :6], all_of_them[:6, :6], rtol=1e-3, atol=1e-9)
     assert np.allclose(points, of_modes, rtol=1e-3, atol=1e-8)
+    assert np.allclose(seen, seen_of_modes, rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("poses", [(0, 0), (0, 1)])
+def test_covariances_of_points_are_propagated_from_the_unknowns(poses: tuple[int, int]) -> None:
+    evidence = evidence_of(4, spread=0.0, poses=poses, loss=LINEAR)
+    state = state_of(4, max(poses) + 1)
+    found = joint_covariance(evidence, state)
+    system, moved = empty_system(evidence), copy_state(state)
+
+    def in_model_and_camera(step: np.ndarray) -> np.ndarray:
+        move_state(evidence, state, system, step, moved)
+        places = [points_of(evidence.shape, moved)]
+        for motion in (moved.poses[poses[0]], evidence.rig.cam_from_rig[0]):
+            places.append(places[-1] @ motion[:9].reshape(3, 3).T + motion[9:])
+        return np.stack([places[0], places[2]])
+
+    steps = 1e-6 * np.eye(len(found.unknowns))
+    ends = [in_model_and_camera(step) - in_model_and_camera(-step) for step in steps]
+    slopes = np.moveaxis(np.array(ends) / 2e-6, 0, -1)
+    expected = slopes @ found.unknowns @ slopes.swapaxes(-1, -2)
+    size = np.abs(expected).max()
+    assert np.allclose(expected, [found.points, found.seen], rtol=1e-5, atol=1e-7 * size)
 
 
 def _without(lengths: Lengths) -> Lengths:

@@ -44,6 +44,7 @@ class _Estimate(NamedTuple):
     lengths: FloatArray
     covariance: FloatArray
     of_points: FloatArray
+    of_seen: FloatArray
     likelihood: float
 
 
@@ -66,7 +67,7 @@ def assemble(
         if likelihood >= _LEAST_LIKELIHOOD
     ]
     best, minimum = likely[0], minima[0]
-    covariance, of_points = _moments(likely)
+    covariance, of_points, of_seen = _moments(likely)
     residuals = []
     for view, pose in zip(views, best.poses, strict=True):
         rows = prior.rows_of(view.keypoint_ids, "ids")
@@ -89,6 +90,7 @@ def assemble(
         inliers=_inliers(prior, views, minimum),
         covariance=covariance,
         points_covariance=of_points[:-2],
+        points_cam_covariance=of_seen[:-2],
         stretch=stretch,
         component=minimum.component,
         model=model,
@@ -101,7 +103,7 @@ def assemble(
 def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
     scale = np.exp(minimum.state.log_scales)
     stretched = points_of(minimum.evidence.shape, minimum.state)
-    unknowns, of_points = joint_covariance(minimum.evidence, minimum.state)
+    unknowns, of_points, of_seen = joint_covariance(minimum.evidence, minimum.state)
     return _Estimate(
         stretched / scale,
         scale,
@@ -109,22 +111,26 @@ def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
         stretched[-1] - stretched[-2],
         _pose_and_lengths(minimum, unknowns),
         of_points,
+        of_seen,
         likelihood,
     )
 
 
-def _moments(likely: Sequence[_Estimate]) -> tuple[FloatArray, FloatArray]:
-    """Second moments (9, 9) and (m + 2, 3, 3) of a mixture of estimates about the first."""
+def _moments(likely: Sequence[_Estimate]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Second moments (9, 9) and twice (m + 2, 3, 3) of a mixture of estimates about the first."""
     total = sum(each.likelihood for each in likely)
     best = likely[0]
     covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
+    of_seen = np.zeros_like(best.of_seen)
     for each in likely:
         weight = each.likelihood / total
         step = _step(best, each)
         covariance += weight * (each.covariance + np.outer(step, step))
         moved = each.points * each.scale - best.points * best.scale
         of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
-    return covariance, of_points
+        moved = each.poses[0].apply(each.points) - best.poses[0].apply(best.points)
+        of_seen += weight * (each.of_seen + moved[:, :, None] * moved[:, None, :])
+    return covariance, of_points, of_seen
 
 
 def _step(best: _Estimate, other: _Estimate) -> FloatArray:

@@ -47,6 +47,7 @@ class _Result(ForeignDocument):
     views: list[_View]
     covariance: Matrix
     points_covariance: list[Matrix]
+    points_cam_covariance: list[Matrix]
     stretch: Point3
     component: int
     alternatives: list[_Alternative]
@@ -56,7 +57,7 @@ class _Result(ForeignDocument):
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("there are none", where="views")
-        for name in ("ids", "points_covariance"):
+        for name in ("ids", "points_covariance", "points_cam_covariance"):
             count = len(getattr(self, name))
             if count != len(self.points_3d):
                 what = f"{count} entries, but points_3d has {len(self.points_3d)}"
@@ -84,6 +85,7 @@ def write_result(result: AlignResult) -> dict[str, Any]:
         ],
         "covariance": result.covariance.tolist(),
         "points_covariance": result.points_covariance.tolist(),
+        "points_cam_covariance": result.points_cam_covariance.tolist(),
         "stretch": result.stretch.tolist(),
         "std": asdict(result.std),
         "component": result.component,
@@ -127,6 +129,9 @@ def read_result(data: Mapping[str, Any]) -> AlignResult:
             inliers=tuple(np.array(view.inliers, dtype=bool) for view in read.views),
             covariance=_array(read.covariance, "covariance", (9, 9)),
             points_covariance=_array(read.points_covariance, "points_covariance", (None, 3, 3)),
+            points_cam_covariance=_array(
+                read.points_cam_covariance, "points_cam_covariance", (None, 3, 3)
+            ),
             stretch=np.array(read.stretch),
             component=read.component,
             model=None,

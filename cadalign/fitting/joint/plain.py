@@ -15,6 +15,7 @@ from cadalign.fitting.joint.result import AlignAlternative, AlignResult
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.options import RansacOptions
 from cadalign.fitting.uncertainty import unknown_axes
+from cadalign.geometry.alignment import Alignment
 
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
@@ -50,12 +51,7 @@ def align_plain(
     if found.covariance is not None:
         covariance[np.ix_(columns, columns)] = found.covariance
     scale = found.alignment.scale
-    stretched = points * scale
-    of_points = np.zeros((len(points), 3, 3))
-    for first in range(3):
-        for second in range(3):
-            products = stretched[:, first] * stretched[:, second]
-            of_points[:, first, second] = products * covariance[6 + first, 6 + second]
+    of_points, of_seen = _points_covariances(points, found.alignment, covariance)
     bounds = cast(FloatArray, model.bounds)
     return AlignResult(
         alignment=found.alignment,
@@ -67,6 +63,7 @@ def align_plain(
         inliers=(found.inliers,),
         covariance=covariance,
         points_covariance=of_points,
+        points_cam_covariance=of_seen,
         stretch=scale,
         component=0,
         model=model,
@@ -77,3 +74,17 @@ def align_plain(
         warnings=found.warnings,
         stats=found.stats,
     )
+
+
+def _points_covariances(
+    points: FloatArray, alignment: Alignment, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
+    stretched = points * alignment.scale
+    by_logs = stretched[:, :, None] * np.eye(3)
+    of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
+    turned = stretched @ alignment.rotation.T
+    by_turn = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)  # columns: axis x turned
+    shifts = np.broadcast_to(np.eye(3), by_turn.shape)
+    rows = np.concatenate([by_turn, shifts, alignment.rotation @ by_logs], axis=2)
+    return of_points, rows @ covariance @ rows.swapaxes(1, 2)

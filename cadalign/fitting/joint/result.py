@@ -76,6 +76,9 @@ class AlignResult:
         all evidence and priors and, where other estimates are likely too, their distance.
     points_covariance : (m, 3, 3) float
         Of each keypoint in the model's frame, stretch included [model units squared].
+    points_cam_covariance : (m, 3, 3) float
+        Of each keypoint in the first camera's frame, where pose and shape vary together
+        [model units squared].
     stretch : (3,) float
         Lengths of the object along x, y, z relative to the model's or, for a learned shape, to the
         mean's.
@@ -99,6 +102,7 @@ class AlignResult:
     inliers: tuple[BoolArray, ...]
     covariance: FloatArray
     points_covariance: FloatArray
+    points_cam_covariance: FloatArray
     stretch: FloatArray
     component: int
     model: Model | ShapeModel | None

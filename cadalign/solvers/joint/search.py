@@ -133,13 +133,21 @@ def score_of(evidence: Evidence, state: State, system: System) -> float:
     return float(score)
 
 
-@kernel
-def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, FloatArray]:
-    """Covariance of the unknowns (U, U), and of every point (m, 3, 3) in the model's frame.
+class JointCovariance(NamedTuple):
+    """Covariances: of the ``unknowns`` (U, U), and of every point in two frames.
 
-    Both are the inverse information at a state; zero for log scales that are held. The points'
-    covariance is that of the pose-independent shape, scales and displacements included.
+    ``points`` (m, 3, 3) in the model's frame are those of the shape, scales and displacements
+    included; ``seen`` (m, 3, 3) in the first view's camera include the pose.
     """
+
+    unknowns: FloatArray
+    points: FloatArray
+    seen: FloatArray
+
+
+@kernel
+def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
+    """The inverse information at a state; zero for log scales that are held."""
     system = empty_system(evidence)
     evaluate_joint(evidence, state, system)
     unknowns = system.gradient.shape[0]
@@ -147,12 +155,14 @@ def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, Floa
     covariance = np.zeros((unknowns, unknowns))
     points = evidence.shape.mean.shape[0]
     of_points = np.zeros((points, 3, 3))
+    of_seen = np.zeros((points, 3, 3))
     modes = evidence.shape.modes.shape[0]
     first = unknowns - modes - 3
     if not cholesky(factor, unknowns, 0.0):
         covariance[:] = np.inf
         of_points[:] = np.inf
-        return covariance, of_points
+        of_seen[:] = np.inf
+        return JointCovariance(covariance, of_points, of_seen)
     column = np.empty(unknowns)
     for k in range(unknowns):
         if first <= k < first + 3 and evidence.scales.free[k - first] == 0.0:
@@ -162,6 +172,7 @@ def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, Floa
         solve_cholesky(factor, unknowns, column)
         covariance[:, k] = column
     scale = np.exp(state.log_scales)
+    turn, pose = _first_camera(evidence, state)
     starts = np.zeros(points, dtype=np.int64)
     ends = np.zeros(points, dtype=np.int64)
     for n in range(evidence.sightings.point.shape[0]):
@@ -172,12 +183,14 @@ def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, Floa
     for i in range(points):
         rows = np.zeros((3, unknowns))
         own = np.zeros((3, 3))
+        point = np.empty(3)
         for a in range(3):
             value = evidence.shape.mean[i, a]
             for k in range(modes):
                 value += state.coefficients[k] * evidence.shape.modes[k, i, a]
                 rows[a, first + 3 + k] = scale[a] * evidence.shape.modes[k, i, a]
             rows[a, first + a] = scale[a] * value
+            point[a] = scale[a] * value + state.displacements[i, a]
         square = evidence.shape.spread[i] ** 2
         for a in range(3):
             own[a, a] = square
@@ -190,4 +203,23 @@ def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, Floa
                 for k in range(unknowns):
                     rows[a, k] -= square * by_own[a] * by_others[k]
         of_points[i] = rows @ covariance @ rows.T + own
-    return covariance, of_points
+        # With the pose: exp(rotation vector) turned + translation, in the rig's frame.
+        turned = turn[0] @ point
+        rows = turn[1] @ rows
+        x, y, z = turned
+        across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+        rows[:, pose : pose + 3] += turn[2] @ across
+        rows[:, pose + 3 : pose + 6] += turn[2]
+        of_seen[i] = rows @ covariance @ rows.T + turn[1] @ own @ turn[1].T
+    return JointCovariance(covariance, of_points, of_seen)
+
+
+@kernel
+def _first_camera(evidence: Evidence, state: State) -> tuple[FloatArray, int]:
+    """Rotations (3, 3, 3) rig from model, camera from model, camera from rig; the pose's column."""
+    number = evidence.rig.pose[0]
+    turns = np.empty((3, 3, 3))
+    turns[0] = state.poses[number, :9].copy().reshape((3, 3))
+    turns[2] = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
+    turns[1] = turns[2] @ turns[0]
+    return turns, 6 * number

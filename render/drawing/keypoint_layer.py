@@ -1,0 +1,136 @@
+"""Keypoints on an overlay: observed, reprojected and unobserved ones, and their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.errors import InputError
+from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
+
+OBSERVED_COLOR: Color = (255, 255, 255)
+REPROJECTED_COLOR: Color = (255, 222, 40)
+UNSEEN_COLOR: Color = (255, 150, 225)
+
+REGION_SHARE = 0.95
+"""Probability that a region of uncertainty holds its keypoint."""
+_REGION_OPACITY = 0.6
+_REGION_POINTS = 48
+_LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointMarks:
+    """Keypoints to be drawn [px]; None for what is not.
+
+    ``seen`` and ``back`` (k, 2) belong together, row by row, ``unseen`` is (n, 2), and ``regions``
+    holds closed curves (r, j, 2).
+    """
+
+    seen: FloatArray | None = None
+    back: FloatArray | None = None
+    unseen: FloatArray | None = None
+    regions: FloatArray | None = None
+
+    @classmethod
+    def checked(
+        cls,
+        observed: npt.ArrayLike | None,
+        reprojected: npt.ArrayLike | None,
+        unseen: npt.ArrayLike | None,
+        regions: npt.ArrayLike | None,
+    ) -> KeypointMarks:
+        """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
+        seen = None if observed is None else as_points(observed, name="observed", dimension=2)
+        back = (
+            None if reprojected is None else as_points(reprojected, name="reprojected", dimension=2)
+        )
+        if seen is not None and back is not None and len(seen) != len(back):
+            raise InputError(
+                f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
+            )
+        return cls(
+            seen,
+            back,
+            None if unseen is None else as_points(unseen, name="unseen", dimension=2),
+            None if regions is None else as_floats(regions, name="regions", shape=(None, None, 2)),
+        )
+
+    def placed(self, canvas: Canvas) -> KeypointMarks:
+        """The same marks in pixels of a canvas."""
+        return KeypointMarks(*(None if each is None else canvas.place(each) for each in self._all))
+
+    def draw(self, canvas: Canvas) -> None:
+        """Draw regions, then unobserved keypoints, residuals, rings and crosses."""
+        before = canvas.image.copy()
+        for region in () if self.regions is None else self.regions:
+            canvas.line(np.concatenate([region, region[:1]]), UNSEEN_COLOR, width=0.7)
+        canvas.blend_from(before, opacity=_REGION_OPACITY)
+        for point in () if self.unseen is None else self.unseen:
+            canvas.ring(point, UNSEEN_COLOR, radius=2.5)
+        if self.seen is not None and self.back is not None:
+            for pair in np.stack([self.seen, self.back], axis=1):
+                canvas.line(pair, REPROJECTED_COLOR, width=1.0)
+        for point in () if self.seen is None else self.seen:
+            canvas.ring(point, OBSERVED_COLOR, radius=5)
+        for point in () if self.back is None else self.back:
+            canvas.cross(point, REPROJECTED_COLOR, radius=3.5)
+
+    @property
+    def legend(self) -> list[LegendEntry]:
+        """Names and colours of what is drawn."""
+        entries = []
+        if self.seen is not None:
+            entries.append(LegendEntry("observed", OBSERVED_COLOR, "ring"))
+        if self.back is not None:
+            entries.append(LegendEntry("reprojected", REPROJECTED_COLOR, "cross"))
+        if self.unseen is not None and len(self.unseen):
+            entries.append(LegendEntry("not observed", UNSEEN_COLOR, "ring"))
+        if self.regions is not None and len(self.regions):
+            entries.append(LegendEntry(f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR))
+        return entries
+
+    @property
+    def pixels(self) -> FloatArray:
+        """Pixels of the keypoints, (n, 2)."""
+        points = [each for each in (self.seen, self.back, self.unseen) if each is not None]
+        return np.concatenate([np.empty((0, 2)), *points])
+
+    @property
+    def _all(self) -> tuple[Any, ...]:
+        return self.seen, self.back, self.unseen, self.regions
+
+
+def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Outlines of the ellipses that hold each point with `REGION_SHARE` probability.
+
+    Parameters
+    ----------
+    points_2d : (n, 2) float
+        Their centres [px].
+    covariances : (n, 2, 2) float
+        [px squared].
+
+    Returns
+    -------
+    (k, 48, 2) float
+        Those of at least 3 px across.
+
+    Examples
+    --------
+    >>> (ellipse,) = confidence_regions(np.zeros((1, 2)), np.diag([4.0, 9.0])[None])
+    >>> np.abs(ellipse).max(axis=0).round(2).tolist()  # 2.45 standard deviations
+    [4.9, 7.34]
+    """
+    values, vectors = np.linalg.eigh(covariances)
+    # The quantile of chi-square with two degrees of freedom.
+    reach = np.sqrt(-2 * np.log(1 - REGION_SHARE) * np.maximum(values, 0.0))
+    kept = 2 * reach[:, -1] >= _LEAST_REGION
+    angles = np.linspace(0, 2 * np.pi, _REGION_POINTS, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    axes = vectors[kept] * reach[kept, None, :]
+    return np.asarray(points_2d[kept, None] + (axes @ circle).swapaxes(1, 2))

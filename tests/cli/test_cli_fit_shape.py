@@ -1,0 +1,285 @@
+"""`cadalign fit` with a learned shape or a similar model: results, pictures and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from support.files import TETRAHEDRON
+from support.refusals import refusal_line
+
+from cadalign import Alignment, AlignResult, Camera, Model, RansacOptions, ShapeModel, View, align
+from cadalign.cli import main
+from cadalign.io.observation import Observation
+from cadalign.render.drawing.keypoint_layer import UNSEEN_COLOR
+from cadalign.render.drawing.overlay import EST_COLOR
+from cadalign.shapes.examples import Example
+
+CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+NAMES = tuple("abcdefgh")
+RIGHT = np.array([1.1, 0.9, 1.2])  # lengths of the object's box
+TRUTH = Alignment(np.diag([1.0, -1, -1]) @ np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]),
+                  [0.1, -0.1, 6.0], np.ones(3))  # fmt: skip
+
+
+def boxes(ids: Any, meshes: dict[int, Path] | None = None) -> ShapeModel:
+    """The shape of boxes, whose lengths differ by a tenth."""
+    rng = np.random.default_rng(0)
+    models = []
+    for row in range(40):
+        points = CORNERS * rng.normal(1, 0.1, 3) + rng.normal(0, 0.01, CORNERS.shape)
+        bounds = np.stack([points.min(0), points.max(0)])
+        models.append(Example(f"box {row}", ids, points, bounds, (meshes or {}).get(row)))
+    return ShapeModel.learn(models, category="box", up_axis="y")
+
+
+@pytest.fixture(scope="module")
+def numbered() -> ShapeModel:
+    return boxes(range(8))
+
+
+def write(folder: Path, count: int = 6, **fields: Any) -> Path:
+    """An observation of a box's first corners, some noise, and corners of the unit box as xyz."""
+    noise = np.random.default_rng(1).normal(0, 0.5, (8, 2))
+    pixels = CAMERA.project(TRUTH.apply(CORNERS * RIGHT)) + noise
+    fields = {"semantic_ids": np.arange(count), **fields}
+    Observation(CORNERS[:count], pixels[:count], CAMERA, **fields).save(folder / "box.json")
+    return folder / "box.json"
+
+
+def edit(path: Path, **fields: Any) -> Path:
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({**data, **fields}))
+    return path
+
+
+def has_color(path: Path, color: tuple[int, int, int]) -> bool:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    near = np.abs(picture[..., ::-1].reshape(-1, 3).astype(int) - color).max(axis=1) < 40
+    return int(near.sum()) > 20
+
+
+# --- what it does ----------------------------------------------------------------------------
+
+
+def test_learned_shape_gives_the_numbers_of_align(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    path = write(tmp_path)
+    numbered.save(tmp_path / "box.shape")
+    assert main(["fit", str(path), "--shape", str(tmp_path / "box.shape")]) == 0
+    seen = Observation.load(path)
+    expected = align(numbered, View(CAMERA, seen.points_2d, ids=range(6)))
+    assert capsys.readouterr().out == f"{expected}\n"
+    out = tmp_path / "box_fit"
+    assert sorted(entry.name for entry in out.iterdir()) == ["fit.json", "overlay.png"]
+    written = AlignResult.from_dict(json.loads((out / "fit.json").read_text()))
+    assert written.alignment == expected.alignment
+    assert written.ids == tuple(range(8))
+    lengths = written.stretch / RIGHT  # one image does not tell the size
+    np.testing.assert_allclose(lengths / lengths[0], 1, rtol=0.1)
+    for color in (EST_COLOR, UNSEEN_COLOR):
+        assert has_color(out / "overlay.png", color)
+
+
+def test_json_is_that_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    command = ["fit", write(tmp_path), "--shape", tmp_path / "box.shape", "--json"]
+    assert main([str(each) for each in command]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data == json.loads((tmp_path / "box_fit" / "fit.json").read_text())
+    assert data["method"] == "align"
+
+
+def test_keypoints_are_found_by_name_and_need_no_xyz(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = boxes(NAMES)
+    shape.save(tmp_path / "box.shape")
+    path = write(tmp_path, names=NAMES[:6], semantic_ids=np.full(6, 3))
+    keypoints = json.loads(path.read_text())["keypoints"]
+    edit(path, keypoints=[{"name": each["name"], "uv": each["uv"]} for each in keypoints])
+    assert main(["fit", str(path), "--shape", str(tmp_path / "box.shape"), "--sigma", "2"]) == 0
+    uv = [each["uv"] for each in keypoints]
+    expected = align(shape, View(CAMERA, uv, ids=NAMES[:6], sigma=2.0))
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_similar_model_is_that_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = {"scale_prior_sigma": 0.1, "known_axis": "y", "sigma": 2.0}
+    path = write(tmp_path, 8, fit_options=stored)
+    assert main(["fit", str(path), "--shape-sigma", "0.05", "--stretch", "z"]) == 0
+    seen = Observation.load(path)
+    model = Model(
+        points_3d=CORNERS, shape_sigma=0.05, stretch="z", known_axis="y", scale_prior_sigma=0.1
+    )
+    expected = align(model, View(CAMERA, seen.points_2d, sigma=2.0))
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_robust_search_works_with_shapes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    path = write(tmp_path, 8)
+    data = json.loads(path.read_text())
+    data["keypoints"][2]["uv"] = [20.0, 400.0]
+    path.write_text(json.dumps(data))
+    numbered.save(tmp_path / "box.shape")
+    command = ["fit", path, "--shape", tmp_path / "box.shape", "--robust", "--max-reproj-error=3"]
+    assert main([str(each) for each in command]) == 0
+    seen = Observation.load(path)
+    ransac = RansacOptions(max_reproj_error=3.0)
+    expected = align(numbered, View(CAMERA, seen.points_2d), ransac=ransac)
+    assert capsys.readouterr().out == f"{expected}\n"
+    assert expected.inliers[0].tolist() == [k != 2 for k in range(8)]
+
+
+@pytest.mark.parametrize("source", ["observation", "training"])
+def test_warped_mesh_is_drawn(tmp_path: Path, source: str) -> None:
+    (tmp_path / "model.obj").write_text(TETRAHEDRON)
+    plain = write(tmp_path)
+    meshes = dict.fromkeys(range(40), tmp_path / "model.obj") if source == "training" else {}
+    boxes(range(8), meshes).save(tmp_path / "box.shape")
+    boxes(range(8)).save(tmp_path / "bare.shape")
+    flags = ["--shape", str(tmp_path / "bare.shape"), "--out", str(tmp_path / "bare")]
+    assert main(["fit", str(plain), *flags]) == 0
+    if source == "observation":
+        edit(plain, model="model.obj")
+    flags = ["--shape", str(tmp_path / "box.shape"), "--out", str(tmp_path / "out")]
+    assert main(["fit", str(plain), *flags]) == 0
+    bare, drawn = (cv2.imread(str(tmp_path / name / "overlay.png")) for name in ("bare", "out"))
+    assert bare is not None
+    assert drawn is not None
+    assert (bare != drawn).any(axis=2).mean() > 0.01  # the box takes 0.07 of the image
+
+
+def test_training_mesh_that_is_gone_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    boxes(range(8), dict.fromkeys(range(40), tmp_path / "gone.obj")).save(tmp_path / "box.shape")
+    assert main(["fit", str(write(tmp_path)), "--shape", str(tmp_path / "box.shape")]) == 0
+    said = caplog.text + capsys.readouterr().err
+    assert f"the nearest training model is not drawn: {tmp_path / 'gone.obj'}: no such" in said
+
+
+# --- what it refuses -------------------------------------------------------------------------
+
+
+def test_unknown_keypoints_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, semantic_ids=np.array([0, 1, 9, 3, 12, 5]))
+    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
+        f"{path}: keypoints.semantic_id: box has no keypoint 9, 12; "
+        "known are [0, 1, 2, 3, 4, 5, 6, 7]"
+    )
+
+
+def test_keypoints_without_ids(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, semantic_ids=None, names=NAMES[:6])
+    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
+        f"{path}: keypoints: the keypoints have no semantic_id; "
+        "the shape of box knows its keypoints by their semantic ids"
+    )
+
+
+def test_keypoint_that_occurs_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, semantic_ids=np.array([0, 1, 2, 3, 1, 5]))
+    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
+        f"{path}: keypoints.semantic_id: 1 occurs twice; give each once"
+    )
+
+
+def test_similar_model_needs_xyz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path)
+    edit(path, keypoints=[{"uv": [1.0, 2.0]}])
+    assert refusal_line(capsys, "fit", path, "--shape-sigma", "0.1").startswith(
+        f"{path}: keypoints[0].xyz: "
+    )
+
+
+@pytest.mark.parametrize("sigma", ["0", "-1", "nan", "inf"])
+def test_shape_sigma_that_is_no_length(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma: str
+) -> None:
+    assert refusal_line(capsys, "fit", write(tmp_path), f"--shape-sigma={sigma}") == (
+        f"--shape-sigma: {float(sigma)} is not positive; "
+        "give a length in model units, or None for the exact model"
+    )
+
+
+def test_unknown_focal_length(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = edit(write(tmp_path), camera={"width": 640, "height": 480})
+    for flags in (["--shape", tmp_path / "box.shape"], ["--shape-sigma", "0.1"]):
+        assert refusal_line(capsys, "fit", path, *flags) == (
+            f"{path}: camera: the focal length is unknown, and is not estimated together with a "
+            "shape; write into the file what `cadalign fit` without a shape estimates"
+        )
+
+
+def test_shape_file_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = tmp_path / "none.shape"
+    line = refusal_line(capsys, "fit", write(tmp_path), "--shape", missing)
+    assert line == f"{missing}: no such file"
+
+
+def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--shape", "box.shape", "--shape-sigma", "0.1"]
+    assert refusal_line(capsys, "fit", write(tmp_path), *flags) == (
+        "--shape-sigma: --shape has learned how far objects of the category differ; "
+        "give one of the two options"
+    )
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--similar"],
+        ["--focal", "known"],
+        ["--no-exif"],
+        ["--method", "aepnp"],
+        ["--no-refine"],
+        ["--minimal", "aepnp"],
+        ["--success-prob", "0.9"],
+        ["--min-iterations", "7"],
+        ["--max-iterations", "7"],
+    ],
+)
+@pytest.mark.parametrize("shape", [["--shape", "box.shape"], ["--shape-sigma", "0.1"]])
+def test_options_without_effect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], shape: list[str]
+) -> None:
+    assert refusal_line(capsys, "fit", write(tmp_path), *shape, *flags) == (
+        f"{flags[0]}: has no effect together with {shape[0]}; leave out one of the two"
+    )
+
+
+@pytest.mark.parametrize(
+    "flags", [["--stretch", "y"], ["--known-axis", "z"], ["--scale-prior-sigma", "0.1"]]
+)
+def test_options_of_a_stretch_without_effect_on_a_learned_shape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
+) -> None:
+    assert refusal_line(capsys, "fit", write(tmp_path), "--shape", "box.shape", *flags) == (
+        f"{flags[0]}: has no effect together with --shape; leave out one of the two"
+    )

@@ -63,12 +63,17 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
 
 def is_number(value: Any) -> bool:
     """True for a finite real number, of NumPy or not."""
-    if not isinstance(value, _NUMBERS) or isinstance(value, bool):
+    if not isinstance(value, _NUMBERS) or isinstance(value, bool | np.timedelta64):
         return False
     try:
         return math.isfinite(value)
     except OverflowError:  # a whole number beyond all floats
         return False
+
+
+def is_whole(value: Any) -> bool:
+    """True for an integer, of NumPy or not."""
+    return is_number(value) and isinstance(value, int | np.integer)
 
 
 def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:

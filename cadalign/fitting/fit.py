@@ -131,7 +131,9 @@ def fit(
     chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
     try:
         options = _checked_options(*chosen)
-    except TypeError:  # an array as sigma has no hash
+    except InputError:
+        raise
+    except (TypeError, ValueError):  # an array or a memoryview as sigma has no hash
         options = FitOptions(*chosen)
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
@@ -387,7 +389,8 @@ def _alternatives(
     """The other minima that are likely enough."""
     costs = solutions.costs[0, :minima]
     if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        ratios = (max(costs[0], 1e-300) / np.maximum(costs, 1e-300)) ** len(problems.points_3d)
+        ratios = np.maximum(costs[0], 1e-300) / np.maximum(costs, 1e-300)
+        ratios = np.minimum(1.0, ratios) ** len(problems.points_3d)
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
     return tuple(

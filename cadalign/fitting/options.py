@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, is_number
+from cadalign.arrays import FloatArray, is_number, is_whole
 from cadalign.errors import InputError, quote
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -73,9 +73,10 @@ class FitOptions(AlignmentOptions):
         _check_known("loss", self.loss, LOSSES)
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
-        _check_positive("loss_scale", self.loss_scale)
+        object.__setattr__(self, "loss_scale", _positive("loss_scale", self.loss_scale))
         if self.scale_prior_sigma is not None:
-            _check_positive("scale_prior_sigma", self.scale_prior_sigma)
+            scale_prior_sigma = _positive("scale_prior_sigma", self.scale_prior_sigma)
+            object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
         if self.sigma is not None and not is_number(self.sigma):
             try:
                 np.ndim(self.sigma)
@@ -96,12 +97,12 @@ class FitOptions(AlignmentOptions):
                 fix="use the method 'optimal', or leave these options at their defaults",
             )
 
-    def _check_stretch(self, stretch: str) -> None:
+    def _check_stretch(self, stretch: object) -> None:
         axes = [axis for axis in "xyz" if axis != self.known_axis]
         allowed = ("".join(axes), axes[0], axes[1], "none")
-        if stretch not in allowed:
+        if not isinstance(stretch, str) or stretch not in allowed:
             raise InputError(
-                f"{stretch!r} are not axes that can stretch where {self.known_axis} is known",
+                f"{quote(stretch)} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",
                 fix=f"give one of {', '.join(allowed)}",
             )
@@ -210,11 +211,15 @@ class RansacOptions:
     the best hypothesis as the minimal solver left it."""
 
     def __post_init__(self) -> None:
-        _check_positive("max_reproj_error", self.max_reproj_error)
+        error = _positive("max_reproj_error", self.max_reproj_error)
+        object.__setattr__(self, "max_reproj_error", error)
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or not least <= value < 2**63:
+            if not is_whole(value) or not least <= value < 2**63:
                 raise InputError(f"{quote(value)} is not a number of at least {least}", where=name)
+            object.__setattr__(self, name, int(value))
+        if not isinstance(self.refine, bool | np.bool_):
+            raise InputError(f"{quote(self.refine)} is neither True nor False", where="refine")
         if not is_number(self.success_prob) or not 0 < self.success_prob < 1:
             what = f"{quote(self.success_prob)} is not between 0 and 1"
             raise InputError(what, where="success_prob")
@@ -227,8 +232,11 @@ def _check_known(name: str, value: object, known: Collection[str]) -> None:
         raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
 
 
-def _check_positive(name: str, value: Any) -> None:
+def _positive(name: str, value: Any) -> float:
+    """The value as a plain float: the kernels know no others."""
     if not is_number(value) or not value > 0:
         raise InputError(f"{quote(value)} is not positive", where=name)
-    if not _LEAST <= value <= _MOST:
-        raise InputError(f"{value} is not between {_LEAST:g} and {_MOST:g}", where=name)
+    number = float(value)
+    if not _LEAST <= number <= _MOST:
+        raise InputError(f"{number} is not between {_LEAST:g} and {_MOST:g}", where=name)
+    return number

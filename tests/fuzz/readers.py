@@ -5,14 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-import re
-import resource
-import shutil
-import signal
 import struct
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +15,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from cadalign import Alignment, CadalignError, Camera, FitResult, Library, fit
+from cadalign import Alignment, Camera, FitResult, Library, fit
 from cadalign.datasets import (
     BlindPnP,
     Bundler,
@@ -40,13 +34,6 @@ from cadalign.render.views.camera_files import (
     write_open3d,
 )
 from cadalign.retrieval import LibraryModel
-
-MEMORY = 500 << 20
-SECONDS = 10
-_EXTREMES = [
-    b"0", b"-1", b"1e999", b"nan", b"1e308", b"2147483648", b"9223372036854775808", b"99999999",
-    b"0.1.2", b"", b"null", b"\xff\xfe", b"[" * 2000, b"9" * 5000, b"-0", b"true", b'"', b"{",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,83 +55,6 @@ class Format:
     write: Callable[[Path], Path]
     read: Callable[[Path], object]
     seal: Callable[[bytes], bytes] = bytes
-
-
-def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a file's bytes in one to four places."""
-    for _ in range(int(rng.integers(1, 5))):
-        start = int(rng.integers(len(data) + 1))
-        size = int(min(rng.geometric(0.05), len(data)))
-        match rng.integers(7):
-            case 0:
-                data = data[:start]
-            case 1:
-                data = data[:start] + rng.bytes(size) + data[start + size :]
-            case 2:
-                data = data[:start] + data[start + size :]
-            case 3:
-                data = (
-                    data[:start]
-                    + data[start : start + size] * int(rng.integers(2, 40))
-                    + data[start:]
-                )
-            case 4:
-                other = int(rng.integers(len(data) + 1))
-                data = data[:start] + data[other : other + size] + data[start:]
-            case 5 if data:
-                place = start % len(data)
-                data = (
-                    data[:place]
-                    + bytes([data[place] ^ (1 << int(rng.integers(8)))])
-                    + data[place + 1 :]
-                )
-            case _:
-                numbers = list(re.finditer(rb"-?\d+(\.\d+)?([eE]-?\d+)?", data))
-                if numbers:
-                    chosen = numbers[rng.integers(len(numbers))]
-                    extreme = _EXTREMES[rng.integers(len(_EXTREMES))]
-                    data = data[: chosen.start()] + extreme + data[chosen.end() :]
-    return data
-
-
-def run_mutation(kind: Format, seed: int, folder: Path) -> str:
-    """Read one mutation of a format's file; returns ``"read"`` or ``"refused"``.
-
-    Anything but a `CadalignError`, a warning too, passes through.
-    """
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    path = kind.write(folder)
-    data = mutate(path.read_bytes(), np.random.default_rng([seed, len(kind.name)]))
-    path.write_bytes(kind.seal(data))
-    with bounded(), warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            kind.read(path)
-        except CadalignError as error:
-            assert len(str(error)) < 2000, "the message quotes its input at length"
-            return "refused"
-    return "read"
-
-
-@contextmanager
-def bounded() -> Iterator[None]:
-    """Raise MemoryError and TimeoutError where a reader takes more than it should."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    previous = signal.signal(signal.SIGALRM, _too_long)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, before[1]))
-    signal.alarm(SECONDS)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
-        resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-def _too_long(number: int, frame: object) -> None:
-    raise TimeoutError(f"takes more than {SECONDS} s")
 
 
 # --- formats ------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, is_number
+from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import open_photo
 
@@ -65,8 +65,8 @@ class FocalPrior:
     def __post_init__(self) -> None:
         for name in ("focal", "relative_sigma"):
             value = getattr(self, name)
-            if not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
-                raise InputError(f"{value!r} is not positive", where=f"focal_prior.{name}")
+            if not is_number(value) or not value > 0:
+                raise InputError(f"{quote(value)} is not positive", where=f"focal_prior.{name}")
             object.__setattr__(self, name, float(value))
 
     @classmethod

@@ -104,7 +104,7 @@ class EvaluateShow(JsonOption):
         """Show the run; returns the exit code, that of the run."""
         from cadalign.evaluation.registry import spec_of_config
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.opened import Run
+        from cadalign.evaluation.runs.opened import Run, interpreting
 
         folder = RunFolder(self.run_folder)
         config = folder.read_config()
@@ -117,7 +117,8 @@ class EvaluateShow(JsonOption):
                 where=str(self.run_folder),
                 fix="start the command that made it again: it goes on",
             )
-        return conclude(spec, Run.open(self.run_folder), json=self.json)
+        with interpreting(self.run_folder):
+            return conclude(spec, Run.open(self.run_folder), json=self.json)
 
 
 def _commands() -> Any:

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.options import ExperimentOptions
 
 if TYPE_CHECKING:
@@ -66,5 +66,5 @@ def spec_of_config(config: dict[str, Any], path: Path) -> Spec:
         return spec_named(str(name))
     except InputError as error:
         raise DataError(
-            f"there is no report on a run of {name!r}", where=str(path), fix=error.fix
+            f"there is no report on a run of {quote(name)}", where=str(path), fix=error.fix
         ) from None

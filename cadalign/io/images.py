@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,8 +38,10 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
         # Waiting for the other end of a pipe could take for ever, and images need random access.
         if not path.is_file():
             raise OSError("not a regular file")
-        with Image.open(path) as image:
-            yield image
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's about EXIF data of which it skips a part
+            with Image.open(path) as image:
+                yield image
     # ValueError: a NUL in the path; SyntaxError: Pillow's word for a broken PNG.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"not an image that can be read ({error})", where=str(path)) from None

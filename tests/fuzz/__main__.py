@@ -1,7 +1,8 @@
 """Fuzz for as long as you like: ``python -m fuzz fits 1000000``, ``python -m fuzz readers 20000``.
 
-Every case follows from its seed, which a failure names: ``--first-seed`` goes on where an earlier run
-ended, or repeats one case. Cases run in worker processes, since what a reader reads may kill it.
+Every case follows from its seed, which a failure names: ``--first-seed`` goes on where an earlier
+run ended, or repeats one case. Cases run in worker processes, since what a reader reads may kill
+it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fuzz `cadalign.fit` and `fit_batch`: call them with the case of a seed, and check what they return."""
+"""Fuzz `cadalign.fit` and `fit_batch`: call them with drawn cases, and check what they return."""
 
 from __future__ import annotations
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 _NUMBERS: list[Any] = [
-    0, -0.0, -1, 1, 2, 0.3, 1e-200, 1e-12, 1e12, 1e200, 1e308, 5e-324, math.nan, math.inf, -math.inf,
-    10**400, 10**5000, -(10**400), 2**31, 2**63, 2**64, np.float32(2), np.float16(1e-7), np.int8(-1),
-    np.uint64(2**64 - 1), np.float64("nan"), np.longdouble(1), np.bool_(True), np.complex128(1 + 2j),
-    1j, True, False,
+    0, -0.0, -1, 1, 2, 0.3, 1e-200, 1e-12, 1e12, 1e200, 1e308, 5e-324, math.nan, math.inf,
+    -math.inf,
+    10**400, 10**5000, -(10**400), 2**31, 2**63, 2**64, np.float32(2), np.float16(1e-7),
+    np.int8(-1), np.uint64(2**64 - 1), np.float64("nan"), np.longdouble(1), np.bool_(True),
+    np.complex128(1 + 2j), 1j, True, False,
 ]  # fmt: skip
 _OTHERS: list[Any] = [
     None, "", "x", "0.3", "huber", "optimal", "yz", "zy", "estimate", "\x1b[31m\n\0", "a" * 10**5,

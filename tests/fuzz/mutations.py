@@ -48,10 +48,10 @@ _NUMBERS = [
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a file in one to four places: its bytes, or the values of a JSON document."""
+    """Change a file in one place or a few: its bytes, or the values of a JSON document."""
     if rng.random() < 0.5 and (changed := _with_other_values(data, rng)) is not None:
         return changed
-    for _ in range(int(rng.integers(1, 5))):
+    for _ in range(int(rng.geometric(0.6))):
         data = _MUTATIONS[rng.integers(len(_MUTATIONS))](data, rng)
     return data
 

@@ -1,4 +1,4 @@
-"""Worker processes that may be killed by what they run: the seed that did it is found, the rest goes on."""
+"""Worker processes that may be killed by what they run: that seed is found, the rest goes on."""
 
 from __future__ import annotations
 

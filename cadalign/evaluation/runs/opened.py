@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -15,13 +17,32 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.errors import DataError
+from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
 
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
 _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
+
+
+@contextmanager
+def interpreting(*paths: str | os.PathLike[str]) -> Iterator[None]:
+    """Convert errors on runs whose files cadalign did not write like that to `DataError`.
+
+    Any value of ``run.json`` may be missing or something else then, any column of the tables too.
+    """
+    try:
+        yield
+    except CadalignError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise DataError(
+            f"run.json or a table is not as cadalign writes it ({reason})",
+            where=", ".join(str(path) for path in paths),
+            fix="get the whole folder again, or repeat the run",
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metri
 def kind_of(run: Run) -> SweepKind:
     """The sweep that a run makes."""
     given = run.config["sweep"]
-    lists = {name: tuple(given[name]) for name in ("values", "methods")}
+    lists = {name: tuple(dict.fromkeys(given[name])) for name in ("values", "methods")}
     # What an older run does not say is as in this sweep.
     return replace(SWEEPS["noise"], **{**given, **lists})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -280,6 +281,20 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
             "stretch: 'yz' are not axes that can stretch where z is known; "
             "give one of xy, x, y, none",
         ),
+        (
+            {"stretch": np.array(["y", "z"])},
+            "stretch: array(['y', 'z'], dtype='<U1') are not axes that can stretch where x is "
+            "known; give one of yz, y, z, none",
+        ),
+        (
+            {"stretch": "a" * 300},
+            f"stretch: {quote('a' * 300)} are not axes that can stretch where x is known; "
+            "give one of yz, y, z, none",
+        ),
+        (
+            {"scale_prior_sigma": np.timedelta64(2, "s")},
+            "scale_prior_sigma: np.timedelta64(2,'s') is not positive",
+        ),
         ({"known_axis": "w"}, "known_axis: unknown known_axis 'w'; known are x, y, z"),
         (
             {"method": "best"},
@@ -318,6 +333,22 @@ def test_matrices_and_numbers_of_any_width_are_taken() -> None:
     result = fit(np.asmatrix(GOOD.points_3d), *given, loss="huber", loss_scale=np.float32(2.0))
     assert type(result.points_3d) is np.ndarray
     assert result.alignment == expected.alignment
+    wide = fit(GOOD.points_3d, *given, loss="huber", loss_scale=np.longdouble(2.0))
+    assert wide.alignment == expected.alignment
+    sigma = memoryview(np.ones(len(GOOD.points_2d)))
+    assert fit(GOOD.points_3d, *given, loss="huber", sigma=sigma).alignment == expected.alignment
+
+
+def test_alternatives_to_an_exact_fit_are_not_likelier_than_it() -> None:
+    # Three points, each given twice: every alternative is exact, too, up to rounding.
+    likelihoods = []
+    for chosen in combinations(range(8), 3):
+        points_3d = np.tile(GOOD.points_3d[list(chosen)], (2, 1))
+        points_2d = GOOD.camera.project(points_3d + [0.0, 0.0, 5.0])
+        result = fit(points_3d, points_2d, GOOD.camera, stretch="none", sigma=None)
+        likelihoods += [other.relative_likelihood for other in result.alternatives]
+    assert likelihoods
+    assert max(likelihoods) <= 1
 
 
 @pytest.mark.filterwarnings("error")

@@ -8,40 +8,17 @@ import resource
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from fuzz import commands, fit_cases, fits, mutations, readers
+from fuzz.outcome import Failure, Outcome
 
 LONGEST_FIT = 1.0  # seconds of processor time that one call of fit may take
 BATCH = 4
 _STUCK = 120  # seconds after which a process that hangs in compiled code ends itself
 _SLOWEST = 3
-
-
-class Failure(NamedTuple):
-    """A description of what went wrong, and the seed."""
-
-    what: str
-    seed: int
-
-
-class Outcome(NamedTuple):
-    """What the cases of some seeds showed.
-
-    Parameters
-    ----------
-    failures : list of Failure
-    slowest : list of (float, str, int)
-        The longest cases: seconds of processor time, kind, seed.
-    memory : float
-        The largest memory of the process so far [MB].
-    """
-
-    failures: list[Failure]
-    slowest: list[tuple[float, str, int]]
-    memory: float
 
 
 def fit_outcome(kind: str, start: int, stop: int) -> Outcome:
@@ -89,18 +66,31 @@ def command_outcome(kind: str, start: int, stop: int) -> Outcome:
 
 
 def _outcome(one: Callable[[int], tuple[str, float]], kind: str, start: int, stop: int) -> Outcome:
-    logging.disable(logging.WARNING)
     failures, times = [], []
-    for seed in range(start, stop):
-        faulthandler.dump_traceback_later(_STUCK, exit=True)
-        try:
-            what, seconds = one(seed)
-            times.append((seconds, what, seed))
-        except Exception as error:
-            failures.append(Failure(f"{kind}: {describe(error)}", seed))
-    faulthandler.cancel_dump_traceback_later()
+    with _unlogged():
+        for seed in range(start, stop):
+            faulthandler.dump_traceback_later(_STUCK, exit=True)
+            try:
+                what, seconds = one(seed)
+                times.append((seconds, what, seed))
+            except Exception as error:
+                failures.append(Failure(f"{kind}: {describe(error)}", seed))
+        faulthandler.cancel_dump_traceback_later()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return Outcome(failures, sorted(times)[-_SLOWEST:], memory)
+
+
+@contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keep the warnings that are logged of damaged files from the terminal."""
+    logger, nowhere = logging.getLogger("cadalign"), logging.NullHandler()
+    logger.addHandler(nowhere)
+    propagated, logger.propagate = logger.propagate, False
+    try:
+        yield
+    finally:
+        logger.removeHandler(nowhere)
+        logger.propagate = propagated
 
 
 def describe(error: Exception) -> str:

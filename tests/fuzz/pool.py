@@ -8,7 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 
-from fuzz.failures import Failure, Outcome
+from fuzz.outcome import Failure, Outcome
 
 
 @dataclass(frozen=True)

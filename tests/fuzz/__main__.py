@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import collections
 import multiprocessing
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -47,6 +48,7 @@ def main() -> int:
     found: dict[str, list[int]] = collections.defaultdict(list)
     slowest: list[tuple[float, str, int]] = []
     cases, memory, begin, told = 0, 0.0, time.monotonic(), time.monotonic()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a killed run says what it found
     jobs = _jobs(chosen.what, chosen.format, chosen.first_seed, chosen.count)
     try:
         for job, outcome in run_jobs(jobs, chosen.workers):
@@ -54,6 +56,8 @@ def main() -> int:
             memory = max(memory, outcome.memory)
             slowest = sorted(slowest + outcome.slowest)[-_NAMED:]
             for what, seed in outcome.failures:
+                if what not in found:
+                    print(f"{what}, seed {seed}", flush=True)
                 found[what].append(seed)
             if time.monotonic() > told + _EVERY:
                 told = time.monotonic()

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, is_number, is_whole
+from cadalign.arrays import FloatArray, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -22,8 +21,6 @@ FOCALS = ("known", "estimate")
 AXES = ("x", "y", "z")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
-
-_LEAST, _MOST = 1e-100, 1e100  # whose squares do not overflow
 
 Sigma = float | npt.ArrayLike
 
@@ -73,9 +70,9 @@ class FitOptions(AlignmentOptions):
         _check_known("loss", self.loss, LOSSES)
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
-        object.__setattr__(self, "loss_scale", _positive("loss_scale", self.loss_scale))
+        object.__setattr__(self, "loss_scale", as_positive(self.loss_scale, name="loss_scale"))
         if self.scale_prior_sigma is not None:
-            scale_prior_sigma = _positive("scale_prior_sigma", self.scale_prior_sigma)
+            scale_prior_sigma = as_positive(self.scale_prior_sigma, name="scale_prior_sigma")
             object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
         if self.sigma is not None and not is_number(self.sigma):
             try:
@@ -211,7 +208,7 @@ class RansacOptions:
     the best hypothesis as the minimal solver left it."""
 
     def __post_init__(self) -> None:
-        error = _positive("max_reproj_error", self.max_reproj_error)
+        error = as_positive(self.max_reproj_error, name="max_reproj_error")
         object.__setattr__(self, "max_reproj_error", error)
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
@@ -230,13 +227,3 @@ def _check_known(name: str, value: object, known: Collection[str]) -> None:
     if not isinstance(value, str) or value not in known:
         fix = f"known are {', '.join(known)}"
         raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
-
-
-def _positive(name: str, value: Any) -> float:
-    """The value as a plain float: the kernels know no others."""
-    if not is_number(value) or not value > 0:
-        raise InputError(f"{quote(value)} is not positive", where=name)
-    number = float(value)
-    if not _LEAST <= number <= _MOST:
-        raise InputError(f"{number} is not between {_LEAST:g} and {_MOST:g}", where=name)
-    return number

@@ -153,12 +153,17 @@ def _with_estimated_sigmas(
             sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0
         ):
             break
-    covariances = found.covariances
+    covariances, statuses = found.covariances, found.statuses
+    if covariances is not None:
+        covariances = covariances * (sigmas**2)[:, None, None]
+        overflows = ~np.isfinite(covariances).all(axis=(1, 2))
+        statuses = np.where((statuses == OK) & overflows, OUT_OF_RANGE, statuses)
     exact = np.flatnonzero(2 * problems.counts <= options.unknowns).tolist()
     too_few = {b: no_redundancy_error(int(problems.counts[b])) for b in exact}
     return found._replace(
         costs=found.costs / sigmas[:, None] ** 2,
-        covariances=None if covariances is None else covariances * (sigmas**2)[:, None, None],
+        covariances=covariances,
+        statuses=statuses,
         sigmas=sigmas,
         errors={**found.errors, **too_few},
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, brief
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -44,7 +44,8 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
                 yield image
     # ValueError: a NUL in the path; SyntaxError: Pillow's word for a broken PNG.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
+        what = f"not an image that can be read ({brief(error)})"
+        raise DataError(what, where=str(path)) from None
 
 
 def read_photo(path: str | os.PathLike[str]) -> ByteImage:

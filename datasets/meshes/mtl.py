@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from trimesh.exchange.obj import parse_mtl
 
+from cadalign.errors import brief, quote
 from cadalign.geometry.mesh import GREY, Material
 
 logger = logging.getLogger("cadalign")
@@ -50,7 +51,7 @@ def load_materials(
         if key in entries:
             found[name] = _material(name, *entries[key], load_texture)
         else:
-            logger.warning("%s: material %r is not defined; it becomes grey", obj_path, name)
+            logger.warning("%s: material %s is not defined; it becomes grey", obj_path, quote(name))
             found[name] = Material(name=name)
     return found
 
@@ -73,7 +74,7 @@ def _library_paths(obj_path: Path, library: str) -> list[Path]:
     for word in library.split():
         path = _find(obj_path.parent, word)
         if path is None:
-            logger.warning("%s: no material library %s beside it", obj_path, word)
+            logger.warning("%s: no material library %s beside it", obj_path, brief(word))
         else:
             paths.append(path)
     return paths
@@ -104,7 +105,7 @@ def _parse_library(path: Path) -> dict[str, dict[str, Any]]:
         lines = (_rename_map(line) for line in text.splitlines())
         return dict(parse_mtl("\n".join(lines), resolver=_DeferredTextures()))  # type: ignore[no-untyped-call]
     except Exception as error:  # the parser promises nothing about damaged files
-        logger.warning("%s: the material library cannot be read (%s)", path, error)
+        logger.warning("%s: the material library cannot be read (%s)", path, brief(error))
         return {}
 
 
@@ -159,13 +160,14 @@ def _load_texture(path: Path, words: tuple[str, ...]) -> Texture | None:
     name = " ".join(_without_options(words))
     found = _find(path.parent, name) or _find(path.parent, PurePosixPath(name).name)
     if found is None:
-        logger.warning("%s: the texture %s is missing; drawn grey", path, name)
+        logger.warning("%s: the texture %s is missing; drawn grey", path, brief(name))
         return None
     try:
         with PIL.Image.open(found) as image:
             return texture_array(image, found.stat().st_size)
     except Exception as error:  # PIL's plugins raise what they like on damaged files
-        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", path, name, error)
+        given = path, brief(name), brief(error)
+        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
         return None
 
 

@@ -281,6 +281,19 @@ def test_half_characters_are_refused(tmp_path: Path, name: str) -> None:
     assert read_json(path) == {"image": "\N{CHAIR}"}
 
 
+@pytest.mark.parametrize("library", ["newmtl a\nmap_Kd {}", "newmtl {}\nmap_Kd a.png"])
+def test_long_names_of_textures_and_materials_are_cut(
+    tmp_path: Path, library: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}usemtl {'y' * 999}\x1b[2J\nf 1 2 3\n")
+    (tmp_path / "a.mtl").write_text(library.format("x" * 5000 + "\x1b[2J"))
+    load_mesh(tmp_path / "a.obj")
+    assert caplog.records
+    for record in caplog.records:
+        assert record.getMessage().isprintable()
+        assert len(record.getMessage()) < 600
+
+
 def test_digits_without_end_in_annotations_are_refused(tmp_path: Path) -> None:
     (tmp_path / "annotations").mkdir()
     (tmp_path / "annotations" / "chair.json").write_text(f'[{{"keypoints": {MANY_DIGITS}}}]')

@@ -339,6 +339,14 @@ def test_matrices_and_numbers_of_any_width_are_taken() -> None:
     assert fit(GOOD.points_3d, *given, loss="huber", sigma=sigma).alignment == expected.alignment
 
 
+def test_noise_beyond_all_numbers_is_refused() -> None:
+    size = 1e200
+    error = fit_refusal(
+        GOOD.points_3d, size * GOOD.points_2d, GOOD.camera, sigma=None, scale_prior_sigma=0.1
+    )
+    assert isinstance(error, InputError | DegenerateError)
+
+
 def test_alternatives_to_an_exact_fit_are_not_likelier_than_it() -> None:
     # Three points, each given twice: every alternative is exact, too, up to rounding.
     likelihoods = []

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign import __version__
-from cadalign.errors import DataError
+from cadalign.errors import DataError, brief
 from cadalign.io.files import write_json, writing
 
 _FORMAT = 2
@@ -113,9 +113,9 @@ class RunFolder:
             found = json.loads(self.config_file.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(
-                f"cannot be read ({error})", where=str(self.config_file), fix=_FIX
+                f"cannot be read ({brief(error)})", where=str(self.config_file), fix=_FIX
             ) from None
         if not isinstance(found, dict):
             raise DataError("not the file of a run", where=str(self.config_file), fix=_FIX)

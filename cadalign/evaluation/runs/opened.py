@@ -17,13 +17,19 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError, DataError, brief
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_table
 
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
 _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
+
+
+_NOT_AS_WRITTEN = (
+    *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError),
+    pa.ArrowException,
+)
 
 
 @contextmanager
@@ -36,8 +42,8 @@ def interpreting(*paths: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except CadalignError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        reason = f"{type(error).__name__}: {str(error)[:200]}"
+    except _NOT_AS_WRITTEN as error:
+        reason = f"{type(error).__name__}: {brief(error)}"
         raise DataError(
             f"run.json or a table is not as cadalign writes it ({reason})",
             where=", ".join(str(path) for path in paths),
@@ -123,7 +129,7 @@ class Run:
         """Day of its start, such as 2026-03-01 (UTC)."""
         try:
             return str(json.loads(self.folder.progress.read_text(encoding="utf-8"))["started"])[:10]
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             seconds = self.folder.config_file.stat().st_mtime
             return time.strftime("%Y-%m-%d", time.gmtime(seconds))
 

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, brief
 from cadalign.io.files import write_whole
 
 Row = dict[str, Any]
@@ -51,7 +51,7 @@ def read_table(path: Path) -> pa.Table:
         return pq.read_table(path, use_threads=False)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
-            f"not a table that can be read ({error})",
+            f"not a table that can be read ({brief(error)})",
             where=str(path),
             fix="remove it and start the same run again",
         ) from None

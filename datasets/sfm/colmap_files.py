@@ -243,7 +243,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
         # The observations' line follows in any case; it is empty where there are none.
         _, observations = next(lines, (0, None))
         name = words[-1].strip()
-        where = f"{path}, image {name}"
+        where = f"{path}, image {brief(name)}"
         images.append((name, partial(_text_view, words[1:-1], observations, where)))
     return images
 

@@ -34,7 +34,9 @@ def fit_outcome(kind: str, start: int, stop: int) -> Outcome:
         seconds = fits.run_case(case)
         if seconds > LONGEST_FIT:  # the first call with arguments of some type compiles
             seconds = fits.run_case(fit_cases.draw_case(seed))
-        longest = LONGEST_SEARCH if case.options.get("focal") == "estimate" else LONGEST_FIT
+        focal = case.options.get("focal")
+        searches = isinstance(focal, str) and focal == "estimate"
+        longest = LONGEST_SEARCH if searches else LONGEST_FIT
         assert seconds < longest, f"took more than {longest} s"
         return case.kind, seconds
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -14,14 +15,12 @@ from trimesh.exchange.obj import parse_mtl
 
 from cadalign.errors import brief, quote
 from cadalign.geometry.mesh import GREY, Material
+from cadalign.io.images import check_pixels
 
 logger = logging.getLogger("cadalign")
 
 Texture = npt.NDArray[np.uint8]
 
-# Deflate compresses bytes to 1/1032 at most; images of one bit per pixel grow further when decoded.
-_COMPRESSION = 1032
-_FREE_BYTES = 2**26
 WHITE = (1.0, 1.0, 1.0, 1.0)
 # How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
 _MAP_OPTIONS = {
@@ -58,9 +57,7 @@ def load_materials(
 
 def texture_array(image: Any, file_size: int) -> Texture:
     """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
-    width, height = image.size
-    if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
-        raise ValueError(f"{width} x {height} pixels in {file_size} bytes")
+    check_pixels(image, file_size)
     transparent = "A" in image.getbands() or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
@@ -163,7 +160,7 @@ def _load_texture(path: Path, words: tuple[str, ...]) -> Texture | None:
         logger.warning("%s: the texture %s is missing; drawn grey", path, brief(name))
         return None
     try:
-        with PIL.Image.open(found) as image:
+        with warnings.catch_warnings(action="ignore"), PIL.Image.open(found) as image:
             return texture_array(image, found.stat().st_size)
     except Exception as error:  # PIL's plugins raise what they like on damaged files
         given = path, brief(name), brief(error)

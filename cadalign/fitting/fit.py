@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -133,8 +134,8 @@ def fit(
         options = _checked_options(*chosen)
     except InputError:
         raise
-    except (TypeError, ValueError):  # an array or a memoryview as sigma has no hash
-        options = FitOptions(*chosen)
+    except (TypeError, ValueError):  # an array as sigma has no hash
+        options = FitOptions(method, _copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
     if ransac is None:
@@ -246,6 +247,14 @@ def fit_batch(
         return BatchResult.joined(list(pool.map(run, parts)))
 
 
+def _copied(sigma: Any) -> Any:
+    """A copy that the caller does not go on to change."""
+    try:
+        return deepcopy(sigma)
+    except TypeError:  # a memoryview
+        return np.array(sigma)
+
+
 def _check_ransac(ransac: object, confidences: object) -> None:
     if ransac is not None and not isinstance(ransac, RansacOptions):
         what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
@@ -317,6 +326,7 @@ def _fit_robustly(
         points_3d=problems.points_3d.copy(),
         residuals=residuals_of(problems, result.alignment, result.camera),
         inliers=inliers,
+        options=options,
         method="ransac-optimal",
         stats=replace(
             consensus.stats,
@@ -374,6 +384,7 @@ def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult
         focal_prior=options.focal_prior,
         alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
+        options=options,
     )
 
 
@@ -389,8 +400,8 @@ def _alternatives(
     """The other minima that are likely enough."""
     costs = solutions.costs[0, :minima]
     if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        ratios = np.maximum(costs[0], 1e-300) / np.maximum(costs, 1e-300)
-        ratios = np.minimum(1.0, ratios) ** len(problems.points_3d)
+        # Costs are in units of sigma^2; below 1 they are those of exact fits.
+        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
     return tuple(

@@ -94,7 +94,7 @@ class Camera:
             what = f"{quote(known)} is neither True nor False"
             raise InputError(what, where="camera.focal_known")
         try:
-            if np.iscomplexobj(self.distortion):
+            if np.iscomplexobj(self.distortion) or np.ma.is_masked(self.distortion):
                 raise TypeError
             coefficients = tuple(float(value) for value in self.distortion)
         except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview

@@ -230,6 +230,14 @@ class Camera:
             )
         return self.pixels_from_normalized(perspective(points))
 
+    def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
+        """Project points (n, 3) of the camera frame; pixels (n, 2), infinite behind the camera."""
+        pixels = np.full((len(points_cam), 2), np.inf)
+        ahead = points_cam[:, 2] > 0
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
+            pixels[ahead] = self.pixels_from_normalized(perspective(points_cam[ahead]))
+        return pixels
+
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Turn pixels into normalised image coordinates, the lens distortion removed.
 

@@ -30,7 +30,7 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
         camera,
         est_box=Box.from_model(_bounds(observation), result.alignment),
         observed=observation.points_2d,
-        reprojected=camera.project(result.alignment.apply(observation.points_3d)),
+        reprojected=camera.project_where_ahead(result.alignment.apply(observation.points_3d)),
     )
 
 

@@ -21,6 +21,7 @@ from cadalign import FitResult, RansacOptions, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
+from cadalign.render.drawing.overlay import REPROJECTED_COLOR
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
 
@@ -121,6 +122,26 @@ def test_options_of_ransac_need_no_prefix(
     ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
     expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
     assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    behind = np.array([[0.0, 0.0, -100.0]])
+    points_3d = np.vstack([behind @ PROBLEM.alignment.linear, PROBLEM.points_3d])
+    points_2d = np.vstack([[[100.0, 100.0]], PROBLEM.points_2d])
+    problem = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
+    path = write_observation(tmp_path / "chair.json", problem)
+    assert main(["fit", str(path), "--robust"]) == 0
+    text = (tmp_path / "chair_fit" / "fit.json").read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    read = FitResult.from_json(text)
+    assert read.inliers.tolist() == [False] + [True] * 10
+    assert np.isposinf(read.residuals[0]).all()
+    assert np.isfinite(read.residuals[1:]).all()
+    assert capsys.readouterr().out == f"{read}\n"
+    overlay = tmp_path / "chair_fit" / "overlay.png"
+    assert has_color(overlay, REPROJECTED_COLOR)
 
 
 def test_full_disk_is_reported_and_leaves_earlier_results(

@@ -45,9 +45,9 @@ def all_methods(runs: Sequence[Run]) -> list[str]:
 
 def _read(path: Path, name: str) -> Run:
     config = RunFolder(path).read_config() if path.is_dir() else None
-    if config is not None:
-        spec_of_config(config, path)  # refuse what is unknown, however far it is
-    return Run.open(path, name)
+    if config is None:
+        return Run.open(path, name)  # says what is wrong with the folder
+    return spec_of_config(config, path).open(path, name)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -10,6 +10,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.registry import spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
+from cadalign.io.files import refuse_nul
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
@@ -23,6 +24,7 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
         )
     seen: set[Path] = set()
     for path in paths:
+        refuse_nul(path)
         if path.resolve() in seen:
             raise InputError("the run is given twice", where=str(path))
         seen.add(path.resolve())

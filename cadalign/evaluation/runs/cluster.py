@@ -10,9 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from cadalign.errors import CadalignError, DataError, quote
+from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.runs.parallel import Chunk, evaluate_on
 from cadalign.evaluation.runs.work import Experiment, Rows
+from cadalign.io.files import printable
 
 T = TypeVar("T")
 
@@ -73,7 +74,7 @@ class DaskWorkers:
         except (OSError, ValueError) as error:
             raise DataError(
                 f"no Dask scheduler answers ({str(error)[:200]})",
-                where=self.address if self.address.isprintable() else quote(self.address),
+                where=printable(self.address),
                 fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
             ) from None
         with _quiet(), client:

@@ -31,7 +31,7 @@ from msgspec import Meta, field
 from cadalign import __version__
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import refuse_nul, write_json, writing
 
 _FORMAT = 2
 _LONGEST_VALUE = 80
@@ -117,6 +117,7 @@ class RunFolder:
     def read_config(self) -> dict[str, Any] | None:
         """Read ``run.json``; None where there is none."""
         path = self.config_file
+        refuse_nul(path)
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:

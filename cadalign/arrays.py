@@ -44,11 +44,16 @@ def as_floats(
         If it is not numeric, has another shape, or holds NaN or infinite values.
     """
     try:
-        if np.asarray(value).dtype.kind in "cmM":  # complex numbers and times
-            raise TypeError(f"they are {np.asarray(value).dtype}")
+        found = np.asarray(value)
+        if found.dtype.kind in "cmM":  # complex numbers and times
+            raise TypeError(f"they are {found.dtype}")
         if np.ma.is_masked(value):
             raise TypeError("some are masked")
         array = np.ascontiguousarray(value, dtype=np.float64)
+        if found.dtype.kind in "SU" or (
+            found.dtype.kind == "O" and any(isinstance(each, str | bytes) for each in found.flat)
+        ):
+            raise TypeError("they are texts")
     except (TypeError, ValueError, OverflowError) as error:
         what = f"not an array of numbers ({str(error)[:200]})"
         raise InputError(what, where=name) from None

@@ -261,8 +261,11 @@ def test_parts_that_disagree_in_a_file_are_refused(content: bytes, tmp_path: Pat
     )
 
 
-def test_more_components_than_models_are_possible() -> None:
-    model = ShapeModel.learn(tables(5), components=8)
+def test_more_components_than_models_are_refused() -> None:
+    assert refusal_text(lambda: ShapeModel.learn(tables(5), components=8)) == (
+        "components: 8 are more than the 5 models"
+    )
+    model = ShapeModel.learn(tables(5), components=3)
     assert sum(each.weight for each in model.components) == pytest.approx(1)
 
 

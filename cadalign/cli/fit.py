@@ -137,5 +137,5 @@ class Fit(ObservationCommand):
                 )
             return None
         if self.sigma is None and "sigma" in stored:
-            return cast("float | None", stored["sigma"])
+            return cast("Sigma | None", stored["sigma"])
         return self.sigma_of(observation)

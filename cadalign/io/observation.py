@@ -22,8 +22,8 @@ with integers at pixel centres, of the photo as it is seen: turned upright where
 ``sigma`` [px], ``semantic_id``, ``name`` and ``confidence`` (a detector's score, not negative) are
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
-``method``, ``sigma`` (one for all keypoints, in place of theirs; ``null`` estimates it), ``loss``,
-``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
+``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class _FitFields(Document):
     """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
 
     method: Text | UnsetType = UNSET
-    sigma: Positive | UnsetType | None = UNSET
+    sigma: Positive | list[Positive] | UnsetType | None = UNSET
     loss: Text | UnsetType = UNSET
     loss_scale: Positive | UnsetType = UNSET
     stretch: Text | UnsetType | None = UNSET
@@ -156,6 +156,10 @@ class Observation:
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
         read: _ObservationFile = convert(data, _ObservationFile)
+        sigma = read.fit.sigma
+        if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
+            what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
+            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
         names = _column(read.keypoints, "name")
         ids = _column(read.keypoints, "semantic_id")
         return cls(

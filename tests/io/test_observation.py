@@ -82,6 +82,8 @@ def test_options_of_the_fit_are_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"sigma": [1.0]}, r"fit\.sigma: 1 numbers for 6 keypoints; give one for each"),
+        ({"sigma": [1.0, -1.0]}, r"fit\.sigma\[1\]: -1\.0 is not a positive number"),
         ({"sigma": 0}, r"fit\.sigma: 0 is not a positive number"),
         ({"noise": 1}, r"fit: .*noise"),
         ({"focal": "guess"}, r"fit\.focal"),

@@ -47,7 +47,7 @@ def main(arguments: Arguments) -> None:
 
 
 def _coverage(arguments: Arguments, console: Console) -> list[dict[str, Any]]:
-    columns = ("sigma", "loss", "keypoints", "inverse Fisher", "stated", "best mode")
+    columns = ("sigma", "loss", "keypoints", "inverse Fisher", "stated", "no alternative")
     table = new_table("Errors within the 95 % ellipsoid [%]", *columns)
     rows = []
     for sigma, loss in ((arguments.noise_px, "linear"), (None, "linear"), (None, "cauchy")):

@@ -16,13 +16,19 @@ if TYPE_CHECKING:
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.fitting.batch import BatchResult
     from cadalign.fitting.fit import fit, fit_batch
+    from cadalign.fitting.joint.align import align, align_batch
+    from cadalign.fitting.joint.model import Model
+    from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.joint.view import View
     from cadalign.fitting.options import RansacOptions
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
+    from cadalign.shapes.model import ShapeModel
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AlignResult",
     "Alignment",
     "BatchResult",
     "Box",
@@ -34,7 +40,12 @@ __all__ = [
     "Match",
     "Material",
     "Mesh",
+    "Model",
     "RansacOptions",
+    "ShapeModel",
+    "View",
+    "align",
+    "align_batch",
     "datasets",
     "errors",
     "evaluate",
@@ -49,10 +60,16 @@ __all__ = [
 
 # Imported when first asked for, so that `import cadalign` stays quick.
 _NAMES = {
+    "AlignResult": "cadalign.fitting.joint.result",
+    "Model": "cadalign.fitting.joint.model",
+    "View": "cadalign.fitting.joint.view",
+    "align": "cadalign.fitting.joint.align",
+    "align_batch": "cadalign.fitting.joint.align",
     "RansacOptions": "cadalign.fitting.options",
     "BatchResult": "cadalign.fitting.batch",
     "Library": "cadalign.retrieval.library",
     "Match": "cadalign.retrieval.match",
+    "ShapeModel": "cadalign.shapes.model",
     "evaluate": "cadalign.evaluation.api",
     "fit": "cadalign.fitting.fit",
     "fit_batch": "cadalign.fitting.fit",

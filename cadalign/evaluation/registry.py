@@ -50,7 +50,7 @@ def spec_named(name: str) -> Spec:
             spec: Spec = import_module(f"{__package__}.{folder}.spec").SPEC
             return spec
     names = [options.experiment for options in known_options()]
-    what, fix = f"unknown experiment {name!r}", f"known are {', '.join(names)}"
+    what, fix = f"unknown experiment {quote(name)}", f"known are {', '.join(names)}"
     raise InputError(what, where="experiment", fix=fix)
 
 

@@ -21,6 +21,19 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
+def vector_from_rotation(rotation: FloatArray) -> FloatArray:
+    """The rotation vector (3,), axis times angle [rad], of a rotation matrix (3, 3).
+
+    Examples
+    --------
+    >>> vector_from_rotation(rotation_from_vector(np.array([0.0, 0.5, 0.0]))).round(12).tolist()
+    [0.0, 0.5, 0.0]
+    """
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
 

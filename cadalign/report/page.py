@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.registry import spec_of
-from cadalign.evaluation.runs.opened import Run, interpreting
 from cadalign.io.files import dense_json, write_text, writing
 from cadalign.report.headline import headline_of
 from cadalign.report.instances import instance_table
@@ -59,22 +58,7 @@ def write_report(
     >>> write_report(["runs/before", "runs/after"], "compare.html")  # doctest: +SKIP
     """
     page = Path(path)
-    with interpreting(*runs):
-        return _write(page, read_runs(runs), assets=assets, title=title)
-
-
-def render_page(payload: dict[str, Any]) -> str:
-    """The HTML of a payload; texts in it cannot become part of the page."""
-    return fill(
-        "report.html",
-        title=escape(str(payload["title"])),
-        style=asset("report.css"),
-        payload=dense_json(payload).translate(_ESCAPES),
-        script=asset("report.js"),
-    )
-
-
-def _write(page: Path, found: Sequence[Run], *, assets: bool, title: str | None) -> Report:
+    found = read_runs(runs)
     with writing(page.parent):
         page.parent.mkdir(parents=True, exist_ok=True)
     table, media = None, {}
@@ -90,3 +74,14 @@ def _write(page: Path, found: Sequence[Run], *, assets: bool, title: str | None)
     payload = payload_of(found, headline_of(found), table, media, title=title or title_of(found))
     write_text(page, render_page(payload))
     return Report(page, folder)
+
+
+def render_page(payload: dict[str, Any]) -> str:
+    """The HTML of a payload; texts in it cannot become part of the page."""
+    return fill(
+        "report.html",
+        title=escape(str(payload["title"])),
+        style=asset("report.css"),
+        payload=dense_json(payload).translate(_ESCAPES),
+        script=asset("report.js"),
+    )

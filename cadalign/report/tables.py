@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from cadalign.errors import InputError
 from cadalign.evaluation.accuracy.style import look_of
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.runs.opened import interpreting
 from cadalign.evaluation.summary import csv_text
 from cadalign.report.headline import Headline, HeadlineRow, headline_of
 from cadalign.report.runs import read_runs
@@ -59,9 +58,8 @@ def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str
         raise InputError(
             f"unknown format {format!r}", where="format", fix=f"known are {', '.join(FORMATS)}"
         )
-    with interpreting(*runs):
-        found = read_runs(runs)
-        return table_text(headline_of(found), [run.name for run in found], format=format)
+    found = read_runs(runs)
+    return table_text(headline_of(found), [run.name for run in found], format=format)
 
 
 def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:

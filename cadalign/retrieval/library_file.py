@@ -1,23 +1,14 @@
-"""File format of libraries: a header of 64 bytes, then a memory-mapped Arrow table.
+"""File format of libraries: a sealed Arrow table, mapped into memory.
 
-The header holds, in little-endian order::
-
-    16 bytes   the text "cadalign library"
-     4 bytes   version of the format
-     4 bytes   zero
-     8 bytes   length of the payload
-    32 bytes   BLAKE2b checksum of the payload
-
-The payload is an Arrow IPC file of the columns of `cadalign.retrieval.models.SCHEMA`. Opening maps
-it into memory and compares the checksum, which reads the file once: 50,000 models of 10 keypoints
-are 30 MB and take some 0.1 s. Processes that open the same file share its memory.
+See `cadalign.io.sealed` for the header. The payload is an Arrow IPC file of the columns of
+`cadalign.retrieval.models.SCHEMA`. Opening maps it into memory and compares the checksum, which
+reads the file once: 50,000 models of 10 keypoints are 30 MB and take some 0.1 s. Processes that
+open the same file share its memory.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -25,63 +16,38 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadalign.errors import DataError
-from cadalign.io.files import write_whole
+from cadalign.io.sealed import Seal, checksum
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
-VERSION = 1
-_MAGIC = b"cadalign library"
-_HEADER = struct.Struct("<16sIIQ32s")
 _AGAIN = "build it with: cadalign library build"
+SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
     """Write a library's file atomically."""
-    payload = _payload(models)
-    header = _HEADER.pack(_MAGIC, VERSION, 0, payload.size, _checksum(payload))
-    write_whole(Path(path), lambda unfinished: unfinished.write_bytes(header + payload))
+    SEAL.write(Path(path), _payload(models))
 
 
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory and check it."""
     where = str(path)
     try:
+        # Opening a pipe would wait for its other end.
+        if Path(path).exists() and not Path(path).is_file():
+            raise OSError("not a regular file")
         with pa.memory_map(where) as source:
             content = source.read_buffer()
     except FileNotFoundError:
         raise DataError("no such library file", where=where, fix=_AGAIN) from None
     except (OSError, pa.ArrowException) as error:
         raise DataError(f"cannot be read ({error})", where=where) from None
-    if content.size < _HEADER.size or content.slice(0, 16).to_pybytes() != _MAGIC:
-        raise DataError("not a library file", where=where, fix=_AGAIN)
-    _, version, _, size, checksum = _HEADER.unpack(content.slice(0, _HEADER.size).to_pybytes())
-    if version != VERSION:
-        raise DataError(
-            f"a library file of version {version}, but this cadalign reads version {VERSION}",
-            where=where,
-            fix=_AGAIN,
-        )
-    payload = content.slice(_HEADER.size)
-    if payload.size != size:
-        what = "truncated" if payload.size < size else "too long"
-        raise DataError(
-            f"the library file is {what}: {payload.size} bytes, {size} expected",
-            where=where,
-            fix=f"copy it again, or {_AGAIN}",
-        )
-    if _checksum(payload) != checksum:
-        raise DataError(
-            "the library file is damaged: its checksum is wrong",
-            where=where,
-            fix=f"copy it again, or {_AGAIN}",
-        )
+    payload = SEAL.unwrap(content, where)
     try:
-        with pa.ipc.open_file(pa.BufferReader(payload)) as reader:
+        with pa.ipc.open_file(pa.BufferReader(pa.py_buffer(payload))) as reader:
             table = reader.read_all()
         _check_table(table)
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise DataError(
-            f"the library file is invalid: {str(error)[:200]}", where=where, fix=_AGAIN
-        ) from None
+        raise SEAL.error(f"is invalid: {str(error)[:200]}", where) from None
     return ModelTable(table)
 
 
@@ -117,7 +83,7 @@ def _check_table(table: pa.Table) -> None:
 
 def fingerprint(models: ModelTable) -> str:
     """Hash of all content of a library, as text."""
-    return _checksum(_payload(models)).hex()
+    return checksum(_payload(models)).hex()
 
 
 def _payload(models: ModelTable) -> pa.Buffer:
@@ -125,7 +91,3 @@ def _payload(models: ModelTable) -> pa.Buffer:
     with pa.ipc.new_file(sink, SCHEMA) as writer:
         writer.write_table(models.table)
     return sink.getvalue()
-
-
-def _checksum(payload: pa.Buffer) -> bytes:
-    return hashlib.blake2b(payload, digest_size=32).digest()

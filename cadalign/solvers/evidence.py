@@ -108,7 +108,7 @@ def keypoint_rows(
             weights = (whitening[i, 0], whitening[i, 1], whitening[i, 2])
         ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
         nearest = min(nearest, depth)
-        part, root = _loss_and_root(loss, loss_scale, ru * ru + rv * rv)
+        part, root = loss_and_root(loss, loss_scale, ru * ru + rv * rv)
         cost += part
         weighted = (root * weights[0], root * weights[1], root * weights[2])
         write_derivatives(scalars, point, weighted, rows, b, size + b)
@@ -129,7 +129,7 @@ def _residual(
 
 
 @inlined
-def _loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]:
+def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]:
     """The loss of a squared residual, and the root of the weight that it gives to the residual."""
     if loss == LINEAR:
         return square, 1.0
@@ -174,7 +174,7 @@ def keypoint_cost(keypoints: Keypoints, pose: FloatArray) -> float:
         ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
         if not depth > 0:
             return np.inf
-        cost += _loss_and_root(loss, loss_scale, ru * ru + rv * rv)[0]
+        cost += loss_and_root(loss, loss_scale, ru * ru + rv * rv)[0]
     return cost
 
 

@@ -33,7 +33,7 @@ from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.options import SweepOptions
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
-from cadalign.report import headline_text, media, write_report
+from cadalign.report import media, write_report
 from cadalign.report.instances import compact
 from cadalign.retrieval import LibraryModel
 
@@ -640,28 +640,6 @@ def test_what_is_no_run_is_refused(
         write_report([tmp_path / "run"], tmp_path / "report.html")
     assert str(tmp_path / "run") in str(error.value)
     assert not (tmp_path / "report.html").exists()
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"sweep": None},
-        {"sweep": {}},
-        {"sweep": {"name": "noise", "values": [[]], "methods": [{}], "column": []}},
-        {"sweep": {"column": "brewing", "values": [1], "methods": ["aepnp"]}},
-        {"tasks": "x"},
-        {"tasks": None},
-    ],
-)
-def test_runs_of_another_configuration_are_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
-    options = SweepOptions("noise", values=(8,), runs=1, methods=("aepnp",))
-    do_run(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
-    config = json.loads((tmp_path / "run" / "run.json").read_text())
-    (tmp_path / "run" / "run.json").write_text(json.dumps(config | changes))
-    with pytest.raises(DataError, match="is not as cadalign writes it"):
-        write_report([tmp_path / "run"], tmp_path / "report.html")
-    with pytest.raises(DataError, match="is not as cadalign writes it"):
-        headline_text([tmp_path / "run"], format="csv")
 
 
 def test_runs_that_do_not_go_together_are_refused(drawn: Path, tmp_path: Path) -> None:

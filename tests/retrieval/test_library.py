@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import struct
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.labelings import mirrored_labelings
-from cadalign.retrieval.library_file import _HEADER, VERSION, _checksum, write_library
+from cadalign.retrieval.library_file import SEAL, write_library
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
 HEADER = 64
@@ -201,6 +202,12 @@ def test_a_folder_is_refused(tmp_path: Path) -> None:
         Library.open(tmp_path)
 
 
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DataError, match=r"cannot be read \(not a regular file\)"):
+        Library.open(tmp_path / "pipe")
+
+
 def test_another_version_is_refused_and_both_are_named(file: Path) -> None:
     content = bytearray(file.read_bytes())
     struct.pack_into("<I", content, 16, 7)
@@ -291,10 +298,7 @@ def test_forged_offsets_are_refused_when_opened(file: Path) -> None:
     assert offsets.tobytes() in payload
     far = np.minimum(offsets * 2**24, 2**31 - 1).astype("<i4")
     payload = payload.replace(offsets.tobytes(), far.tobytes())
-    checksum = _checksum(pa.py_buffer(payload))
-    file.write_bytes(
-        _HEADER.pack(b"cadalign library", VERSION, 0, len(payload), checksum) + payload
-    )
+    SEAL.write(file, payload)
     with pytest.raises(DataError, match="the library file is invalid: "):
         Library.open(file)
 

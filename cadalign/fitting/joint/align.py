@@ -1,0 +1,192 @@
+"""`align`: the object's pose, stretch and shape from all that is known about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.fitting.joint.assemble import Minimum, assemble
+from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.pack import evidence_of
+from cadalign.fitting.joint.plain import align_plain, is_plain
+from cadalign.fitting.joint.prior import prior_of
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.robust import Consensus, find_consensus, state_of
+from cadalign.fitting.joint.starts import starts_of
+from cadalign.fitting.joint.view import View
+from cadalign.fitting.options import LOSSES, FitOptions, RansacOptions
+from cadalign.fitting.result import FitStats
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.search import search_joint
+
+
+@np.errstate(all="ignore")  # what is not finite is refused
+def align(
+    model: Model | ShapeModel,
+    views: View | Sequence[View],
+    *,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    ransac: RansacOptions | None = None,
+) -> AlignResult:
+    """Estimate an object's pose, stretch and shape from one or more views.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+        One CAD model, exact, stretched, or only similar (``shape_sigma``); or the learned shape of
+        a category.
+    views : View or sequence of View
+        What the images tell. Views with ``cam_from_rig`` share one pose and determine the object's
+        size; views without it have a pose each and share the stretch and the shape.
+    loss, loss_scale
+        As for `cadalign.fit`.
+    ransac : RansacOptions, optional
+        Search for the keypoints that agree, for views with outliers; of its options,
+        ``max_reproj_error`` and ``seed`` count where the shape is not exact.
+
+    Returns
+    -------
+    AlignResult
+
+    Raises
+    ------
+    InputError
+        If an argument is invalid, or a view names a keypoint that the model lacks.
+    DegenerateError
+        If the keypoints are too few, or no estimate has them all in front of the cameras.
+
+    Examples
+    --------
+    A box of which the model's proportions are known to some 5 % of its size:
+
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> truth = Alignment(np.diag([1.0, -1.0, -1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> photo = camera.project(truth.apply(corners * [1.0, 1.1, 0.95]))
+    >>> result = align(Model(points_3d=corners, shape_sigma=0.05), View(camera, photo))
+    >>> result.points_3d.shape, len(result.warnings)
+    ((8, 3), 0)
+    """
+    start = time.perf_counter()
+    given = [views] if isinstance(views, View) else list(views)
+    _check_views(given)
+    options = FitOptions(loss=loss, loss_scale=loss_scale)
+    if is_plain(model, given):
+        exact = cast(Model, model)
+        return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
+    prior = prior_of(model)
+    minima: list[Minimum] = []
+    iterations = hypotheses = 0
+    everything = evidence_of(prior, given, loss=LOSSES[options.loss], loss_scale=options.loss_scale)
+    for number, shape in enumerate(prior.components):
+        evidence = everything._replace(shape=shape)
+        if ransac is None:
+            found, used, tried = _search(evidence)
+        else:
+            threshold = _thresholds(evidence, given, ransac.max_reproj_error)
+            found, used, tried = find_consensus(evidence, threshold, int(ransac.seed))
+        iterations, hypotheses = iterations + used, hypotheses + tried
+        prior_score = -2 * float(np.log(prior.weights[number]))
+        minima.extend(
+            Minimum(number, *each._replace(score=each.score + prior_score)) for each in found
+        )
+    if not minima:
+        raise DegenerateError(
+            "no pose has the keypoints in front of the camera",
+            where="views",
+            fix="give at least 3 keypoints in one view, and check which is which",
+        )
+    minima.sort(key=lambda minimum: minimum.score)
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    return assemble(model, prior, given, minima, stats)
+
+
+def align_batch(
+    model: Model | ShapeModel,
+    objects: Sequence[View | Sequence[View]],
+    *,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    ransac: RansacOptions | None = None,
+    workers: int = 1,
+) -> list[AlignResult | CadalignError]:
+    """Align many objects of one kind; each as `align` does, bit for bit.
+
+    Parameters
+    ----------
+    model, loss, loss_scale, ransac
+        As for `align`.
+    objects : sequence of View or of sequences of View
+        The views of every object.
+    workers : int
+        Number of threads that share the objects; -1 for all cores.
+
+    Returns
+    -------
+    list of AlignResult or CadalignError
+        The error takes the place of the result where an object has none.
+
+    Raises
+    ------
+    InputError
+        If workers is invalid.
+    """
+    if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
+        what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
+        raise InputError(what, where="workers")
+
+    def one(views: View | Sequence[View]) -> AlignResult | CadalignError:
+        try:
+            return align(model, views, loss=loss, loss_scale=loss_scale, ransac=ransac)
+        except CadalignError as error:
+            return error
+
+    if workers == 1:
+        return [one(views) for views in objects]
+    with ThreadPoolExecutor(None if workers == -1 else int(workers)) as pool:
+        return list(pool.map(one, objects))
+
+
+def _search(evidence: Evidence) -> tuple[list[Consensus], int, int]:
+    """Minima of all sightings together, and the effort they took."""
+    poses, log_scales = starts_of(evidence)
+    if not len(poses):
+        return [], 0, 0
+    minima, count, iterations = search_joint(evidence, poses, log_scales)
+    all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
+    found = [
+        Consensus(
+            all_of_them,
+            evidence,
+            state_of(minima, k),
+            float(minima.costs[k]),
+            float(minima.scores[k]),
+        )
+        for k in range(count)
+    ]
+    return found, iterations, len(poses)
+
+
+def _thresholds(evidence: Evidence, views: Sequence[View], max_reproj_error: float) -> FloatArray:
+    """Largest whitened residuals (N,) of inliers."""
+    sightings = evidence.sightings
+    focal = np.array([np.sqrt(view.camera.fx * view.camera.fy) for view in views])
+    root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
+    return max_reproj_error / focal[sightings.image] * root
+
+
+def _check_views(views: Sequence[object]) -> None:
+    if not views:
+        raise InputError("none is given", where="views")
+    for number, view in enumerate(views):
+        if not isinstance(view, View):
+            what = f"expected a cadalign.View, got {type(view).__name__}"
+            raise InputError(what, where=f"views[{number}]")

@@ -1,0 +1,122 @@
+"""A CAD model whose keypoints are known: what `align` fits where no category was learned."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points, is_number, read_only
+from cadalign.errors import InputError, quote
+from cadalign.fitting.options import FitOptions
+from cadalign.geometry.mesh import Mesh
+
+SIMILAR_SCALE_SIGMA = 0.2
+"""Default deviation of the log scales of an object that is only similar to its model."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """One CAD model: its keypoints, and how far the object may differ from it.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Keypoints, in the model's own coordinates.
+    ids : sequence of n int or str, optional
+        Their semantic ids or names; by default their numbers 0 to n - 1.
+    bounds : (2, 3) float, optional
+        Least and greatest coordinates of the model; by default the mesh's, else the keypoints'.
+    mesh : Mesh, optional
+        The model's surface, for `AlignResult.mesh`.
+    shape_sigma : float, optional
+        Standard deviation of the keypoints' positions on the object about those on the stretched
+        model, along each axis [model units]: for an object that is only similar. None for the
+        exact, stretched model.
+    stretch, known_axis
+        As for `cadalign.fit`.
+    scale_prior_sigma : float, optional
+        As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
+        similar has similar proportions, and its keypoints alone would say otherwise.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, ids repeat, a value is NaN or infinite, or an option is invalid.
+
+    Examples
+    --------
+    >>> corners = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    >>> Model(points_3d=corners, shape_sigma=0.02).bounds.tolist()
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    """
+
+    points_3d: npt.ArrayLike
+    ids: Sequence[Hashable] | None = None
+    bounds: npt.ArrayLike | None = None
+    mesh: Mesh | None = None
+    shape_sigma: float | None = None
+    stretch: str | None = None
+    scale_prior_sigma: float | None = None
+    known_axis: str = "x"
+
+    def __post_init__(self) -> None:
+        points = as_points(self.points_3d, name="points_3d", dimension=3)
+        if not len(points):
+            raise InputError("a model needs keypoints", where="points_3d")
+        object.__setattr__(self, "points_3d", read_only(points))
+        object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        given = self.bounds
+        if given is None:
+            given = self.mesh.bounds if self.mesh is not None else _extent(points)
+        bounds = as_floats(given, name="bounds", shape=(2, 3))
+        if (bounds[1] < bounds[0]).any():
+            raise InputError("the first row must hold the least coordinates", where="bounds")
+        object.__setattr__(self, "bounds", read_only(bounds))
+        sigma = self.shape_sigma
+        if sigma is not None and not (is_number(sigma) and sigma > 0):
+            fix = "give a length in model units, or None for the exact model"
+            raise InputError(f"{quote(sigma)} is not positive", where="shape_sigma", fix=fix)
+        self.fit_options(1.0)
+
+    def fit_options(self, sigma: float) -> FitOptions:
+        """The options of the plain fit to this model."""
+        prior = self.scale_prior_sigma
+        if prior is None and self.shape_sigma is not None:
+            prior = SIMILAR_SCALE_SIGMA
+        return FitOptions(
+            sigma=sigma,
+            stretch=self.stretch,
+            scale_prior_sigma=prior,
+            known_axis=self.known_axis,
+        )
+
+
+def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
+    """Ids of ``count`` keypoints, each once; their numbers where none are given.
+
+    Raises
+    ------
+    InputError
+        If there are more or fewer, or one occurs twice.
+    """
+    if ids is None:
+        return tuple(range(count))
+    listed = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+    if len(listed) != count:
+        raise InputError(f"{len(listed)} ids for {count} keypoints", where="ids")
+    seen: set[Hashable] = set()
+    for name in listed:
+        if not isinstance(name, str | int | np.integer) or isinstance(name, bool):
+            raise InputError(f"{quote(name)} is neither a number nor a name", where="ids")
+        if name in seen:
+            raise InputError(f"{quote(name)} occurs twice", where="ids", fix="give each once")
+        seen.add(name)
+    return listed
+
+
+def _extent(points: FloatArray) -> FloatArray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])

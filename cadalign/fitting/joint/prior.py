@@ -1,0 +1,98 @@
+"""Prior knowledge of an object's shape, in the form that the kernels take."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError, quote
+from cadalign.fitting.joint.model import Model
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import ScalePriors, Shape
+
+
+@dataclass(frozen=True, eq=False)
+class ShapePrior:
+    """Gaussian components of a shape, and what is known of its scales.
+
+    The rows of a component are the keypoints with ``ids`` (m,), then the least and the greatest
+    corner of the box. ``unpriored`` counts scales that are free without a prior.
+    """
+
+    ids: tuple[Hashable, ...]
+    components: tuple[Shape, ...]
+    weights: tuple[float, ...]
+    scales: ScalePriors
+    up: FloatArray | None
+
+    @property
+    def lengths(self) -> FloatArray:
+        """Lengths (3,) of the mean's box."""
+        pairs = zip(self.weights, self.components, strict=True)
+        return np.asarray(sum(weight * (each.mean[-1] - each.mean[-2]) for weight, each in pairs))
+
+    def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
+        """Row numbers of keypoints.
+
+        Raises
+        ------
+        InputError
+            If the model has no such keypoint.
+        """
+        place = {name: row for row, name in enumerate(self.ids)}
+        missing = [name for name in ids if name not in place]
+        if missing:
+            listed = ", ".join(quote(name) for name in missing[:5])
+            known = ", ".join(quote(name) for name in self.ids[:12])
+            more = ", ..." if len(self.ids) > 12 else ""
+            fix = f"the model has {known}{more}"
+            raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
+        return [place[name] for name in ids]
+
+
+def prior_of(model: object) -> ShapePrior:
+    """The prior of an exact, a stretched or a learned model.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if isinstance(model, Model):
+        return _of_model(model)
+    if isinstance(model, ShapeModel):
+        return _of_category(model)
+    what = f"expected a cadalign.Model or a cadalign.ShapeModel, got {type(model).__name__}"
+    raise InputError(what, where="model")
+
+
+def _of_model(model: Model) -> ShapePrior:
+    points = cast(FloatArray, model.points_3d)
+    mean = np.concatenate([points, cast(FloatArray, model.bounds)])
+    spread = np.full(len(mean), model.shape_sigma or 0.0)
+    options = model.fit_options(1.0)
+    free = np.array([float(axis in options.stretched_axes) for axis in "xyz"])
+    scales = ScalePriors(free, np.diag(free * options.prior_weight))
+    shape = Shape(mean, np.empty((0, len(mean), 3)), spread)
+    return ShapePrior(cast("tuple[Hashable, ...]", model.ids), (shape,), (1.0,), scales, _Y)
+
+
+def _of_category(model: ShapeModel) -> ShapePrior:
+    shapes = tuple(
+        Shape(
+            np.array(component.mean),
+            np.array(component.modes),
+            np.array(np.broadcast_to(component.residual_sigma, len(component.mean)), dtype=float),
+        )
+        for component in model.components
+    )
+    weights = tuple(component.weight for component in model.components)
+    up = None if model.up_axis is None else np.eye(3)["xyz".index(model.up_axis)]
+    return ShapePrior(model.ids, shapes, weights, ScalePriors(np.zeros(3), np.zeros((3, 3))), up)
+
+
+_Y = np.array([0.0, 1.0, 0.0])

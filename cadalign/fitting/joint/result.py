@@ -1,0 +1,216 @@
+"""The result of an alignment to everything that is known about an object."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import InputError
+from cadalign.fitting.joint.model import Model
+from cadalign.fitting.result import FitStats
+from cadalign.fitting.uncertainty import Uncertainty, uncertainty_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.mesh import Mesh
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import NearestShape
+from cadalign.shapes.warp import warp_mesh
+
+
+@dataclass(frozen=True, eq=False)
+class AlignAlternative:
+    """Another estimate that the evidence cannot tell from the best one.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    points_3d : (m, 3) float
+        Its keypoints in the model's frame.
+    bounds : (2, 3) float
+        Its box in the model's frame.
+    relative_likelihood : float
+        Its probability over that of the best one.
+    """
+
+    alignment: Alignment
+    points_3d: FloatArray
+    bounds: FloatArray
+    relative_likelihood: float
+
+    @property
+    def box(self) -> Box:
+        """Its box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignResult:
+    """An object's pose, stretch and shape, with their uncertainty.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        Pose in the first view's camera, and stretch. ``alignment.apply(points_3d)`` are the
+        object's keypoints in that camera's frame.
+    ids : tuple of int or str
+        Ids or names of the m keypoints.
+    points_3d : (m, 3) float
+        All keypoints of the model as they are on the object, also those that no view shows, in the
+        model's frame and before its stretch.
+    bounds : (2, 3) float
+        Least and greatest coordinates of the object in the same frame.
+    poses : tuple of Alignment
+        The alignment in every view's camera.
+    residuals : tuple of (n_v, 2) float
+        Projected minus observed keypoints of every view [px].
+    inliers : tuple of (n_v,) bool
+        Keypoints of every view that the estimate rests on.
+    covariance : (9, 9) float
+        Of the rotation vector in the first camera's frame [rad], the translation [model units], and
+        the logarithms of the object's lengths along x, y, z relative to the mean's; zero for what
+        is held. The second moment of the posterior about the estimate: the inverse information of
+        all evidence and priors and, where other estimates are likely too, their distance.
+    points_covariance : (m, 3, 3) float
+        Of each keypoint in the model's frame, stretch included [model units squared].
+    stretch : (3,) float
+        Lengths of the object along x, y, z relative to the model's or, for a learned shape, to the
+        mean's.
+    component : int
+        Number of the mixture's component that the object belongs to.
+    model : Model or ShapeModel, optional
+        The model, as given; None for a result that was read from a file.
+    alternatives : tuple of AlignAlternative
+        Other estimates whose probability is at least 1/1000 of the best one's.
+    warnings : tuple of str
+        What the evidence leaves undetermined, and what contradicts the rest.
+    stats : FitStats
+    """
+
+    alignment: Alignment
+    ids: tuple[Hashable, ...]
+    points_3d: FloatArray
+    bounds: FloatArray
+    poses: tuple[Alignment, ...]
+    residuals: tuple[FloatArray, ...]
+    inliers: tuple[BoolArray, ...]
+    covariance: FloatArray
+    points_covariance: FloatArray
+    stretch: FloatArray
+    component: int
+    model: Model | ShapeModel | None
+    alternatives: tuple[AlignAlternative, ...]
+    warnings: tuple[str, ...]
+    stats: FitStats
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the inliers' residuals [px]."""
+        pairs = zip(self.residuals, self.inliers, strict=True)
+        kept = np.concatenate([residuals[inliers] for residuals, inliers in pairs])
+        return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
+
+    @property
+    def std(self) -> Uncertainty:
+        """Standard deviations of rotation, translation and stretch."""
+        full = np.maximum(self.covariance.diagonal(), 0.0)
+        first = uncertainty_of(np.diag(full[:8]), "x")
+        x, y, z = np.sqrt(full[6:]).tolist()
+        return Uncertainty(first.rotation_deg, first.translation, (x, y, z), 0.0)
+
+    @property
+    def box(self) -> Box:
+        """The object's box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+    def mesh(self, mesh: Mesh | None = None) -> Mesh:
+        """A model's mesh, warped so that its keypoints are the object's.
+
+        Parameters
+        ----------
+        mesh : Mesh, optional
+            By default that of the `Model`. For a learned shape, that of `nearest`.
+
+        Returns
+        -------
+        Mesh
+            In the model's frame, before the stretch; ``alignment`` places it.
+
+        Raises
+        ------
+        InputError
+            If there is no mesh to warp.
+        """
+        if isinstance(self.model, Model):
+            given = mesh if mesh is not None else self.model.mesh
+            if given is None:
+                raise InputError("the model has no mesh", where="mesh", fix="give one")
+            if self.model.shape_sigma is None:
+                return given
+            return warp_mesh(given, self.model.points_3d, self.points_3d, bounds=self.bounds)
+        if mesh is None:
+            fix = "give that of the training model `nearest`, read from its mesh_path"
+            raise InputError("a learned shape has no mesh of its own", where="mesh", fix=fix)
+        source = self.nearest.points_3d
+        known = np.isfinite(source).all(axis=1)
+        return warp_mesh(mesh, source[known], self.points_3d[known], bounds=self.bounds)
+
+    @property
+    def nearest(self) -> NearestShape:
+        """The training model of a learned shape whose keypoints are nearest to the object's.
+
+        Raises
+        ------
+        InputError
+            If the model is not learned, or its training models are not known.
+        """
+        if not isinstance(self.model, ShapeModel):
+            raise InputError("only a learned shape has training models", where="model")
+        return self.model.nearest(self.points_3d)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the result as plain lists and numbers, for JSON; its model is not part of it."""
+        from cadalign.fitting.joint.document import write_result
+
+        return write_result(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> AlignResult:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        from cadalign.fitting.joint.document import read_result
+
+        return read_result(data)
+
+    def __str__(self) -> str:
+        count = sum(int(inliers.sum()) for inliers in self.inliers)
+        of = sum(len(inliers) for inliers in self.inliers)
+        text = f"{count}" if count == of else f"{count} of {of}"
+        views = "" if len(self.poses) == 1 else f" in {len(self.poses)} views"
+        std = self.std
+        angle = np.degrees(np.arccos(np.clip((np.trace(self.alignment.rotation) - 1) / 2, -1, 1)))
+        shift = ", ".join(f"{value:.4g}" for value in self.alignment.translation)
+        shift_std = ", ".join(f"{value:.2g}" for value in std.translation)
+        stretch = ", ".join(
+            f"{value:.4g}" if deviation == 0 else f"{value:.4g} +- {100 * deviation:.2g} %"
+            for value, deviation in zip(self.stretch, std.scale, strict=True)
+        )
+        lines = [
+            f"{text} keypoints{views}, rms {self.rms:.3g} px",
+            f"  rotation     {angle:.4g} deg from the camera's axes, +- {std.rotation_deg:.2g} deg",
+            f"  translation  ({shift}) +- ({shift_std})",
+            f"  stretch      ({stretch})",
+        ]
+        lines.extend(
+            f"  also likely  ({other.relative_likelihood:.2g} x)" for other in self.alternatives
+        )
+        lines.extend(f"  warning      {text}" for text in self.warnings)
+        return "\n".join(lines)

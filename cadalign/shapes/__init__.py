@@ -1,0 +1,1 @@
+"""Knowledge of a category: learned shape models, and the deformation of meshes."""

@@ -1,0 +1,133 @@
+"""Shape components from given means, modes and covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats
+from cadalign.errors import InputError
+from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
+
+# Rounding leaves eigenvalues this far below zero, relative to the largest.
+_NEGATIVE = 1e-8
+
+
+def component_of_basis(
+    mean: npt.ArrayLike,
+    modes: npt.ArrayLike,
+    deviations: npt.ArrayLike,
+    *,
+    box: npt.ArrayLike | None,
+    residual_sigma: float,
+    size_sigma: npt.ArrayLike | None,
+) -> ShapeComponent:
+    """Make a component from a linear shape model; see `ShapeModel.from_basis`."""
+    points = as_floats(mean, name="mean", shape=(None, 3))
+    directions = _directions(modes, len(points))
+    sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
+    if (sigmas < 0).any():
+        row = int(np.flatnonzero(sigmas < 0)[0])
+        raise InputError(f"deviations[{row}] is negative ({sigmas[row]:g})", where="deviations")
+    rows = np.vstack([points, _box(box, points)])
+    scaled = sigmas[:, None, None] * directions
+    extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
+    extended += _size_modes(rows, size_sigma)
+    flat = np.array(extended).reshape(len(extended), rows.size)
+    return ShapeComponent(1.0, rows, _orthogonal(flat, len(rows)), residual_sigma)
+
+
+def component_of_covariance(
+    mean: FloatArray,
+    covariance: npt.ArrayLike,
+    *,
+    weight: float = 1.0,
+    modes: int | None = None,
+    where: str = "covariance",
+) -> ShapeComponent:
+    """Make a component from a covariance: its largest eigenvectors are the modes.
+
+    The variance that they leave is spread evenly over the coordinates.
+
+    Parameters
+    ----------
+    mean : (m + 2, 3) float
+    covariance : (3 (m + 2), 3 (m + 2)) float
+    weight : float
+    modes : int, optional
+        Number of modes; by default all of positive variance.
+
+    Raises
+    ------
+    InputError
+        If the covariance is not finite, symmetric and positive semi-definite.
+    """
+    matrix = as_floats(covariance, name=where, shape=(mean.size, mean.size))
+    largest = np.abs(matrix).max()
+    if np.abs(matrix - matrix.T).max() > 1e-6 * largest:
+        raise InputError("not symmetric", where=where)
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    if values[0] < -_NEGATIVE * max(values[-1], 0.0) or values[-1] < 0:
+        raise InputError(
+            f"not positive semi-definite: its least eigenvalue is {values[0]:.3g}", where=where
+        )
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    count = int((values > 1e-15 * values[0]).sum())
+    count = count if modes is None else min(count, modes)
+    directions = (vectors[:, :count] * np.sqrt(values[:count])).T.reshape(count, *mean.shape)
+    rest = values[count:]
+    sigma = float(np.sqrt(rest.mean())) if len(rest) else 0.0
+    if sigma:  # the residual is part of every direction, also of the modes'
+        directions = directions * np.sqrt(np.maximum(1 - sigma**2 / values[:count], 0.0)).reshape(
+            -1, 1, 1
+        )
+    return ShapeComponent(weight, mean, directions, sigma)
+
+
+def _directions(modes: npt.ArrayLike, count: int) -> FloatArray:
+    """Modes as (K, m, 3), also from (K, 3 m): x, y, z of the first keypoint, and so on."""
+    if np.ndim(modes) == 2:
+        flat = as_floats(modes, name="modes", shape=(None, 3 * count))
+        return flat.reshape(len(flat), count, 3)
+    return as_floats(modes, name="modes", shape=(None, count, 3))
+
+
+def _box(box: npt.ArrayLike | None, points: FloatArray) -> FloatArray:
+    if box is None:
+        return np.array([points.min(axis=0), points.max(axis=0)])
+    corners = as_floats(box, name="box", shape=(2, 3))
+    if (corners[0] > corners[1]).any():
+        what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
+        raise InputError(what, where="box")
+    return corners
+
+
+def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> FloatArray:
+    """Motion of the box's corners: the shift and stretch along each axis that fit the mode best."""
+    centre = points.mean(axis=0)
+    offsets = points - centre
+    squares = (offsets**2).sum(axis=0)
+    stretch = (offsets * mode).sum(axis=0) / np.where(squares > 0, squares, 1.0)
+    return np.asarray(mode.mean(axis=0) + stretch * (corners - centre))
+
+
+def _size_modes(rows: FloatArray, size_sigma: npt.ArrayLike | None) -> list[FloatArray]:
+    if size_sigma is None:
+        return []
+    wide = as_floats(size_sigma, name="size_sigma", shape=(None,) * np.ndim(size_sigma))
+    if wide.shape not in ((), (3,)):
+        raise InputError(f"shape {wide.shape}, expected () or (3,)", where="size_sigma")
+    if (wide < 0).any():
+        raise InputError(f"{wide.tolist()} is negative", where="size_sigma")
+    if wide.ndim == 0:
+        return [rows * wide]
+    return [rows * (wide * np.eye(3)[axis]) for axis in range(3)]
+
+
+def _orthogonal(modes: FloatArray, count: int) -> FloatArray:
+    """Modes of the same covariance that are orthogonal, the longest first."""
+    if not len(modes):
+        return modes.reshape(0, count, 3)
+    _, lengths, directions = np.linalg.svd(modes, full_matrices=False)
+    keep = lengths > 1e-12 * max(float(lengths[0]), 1e-300)
+    return np.asarray((lengths[keep, None] * directions[keep]).reshape(-1, count, 3))

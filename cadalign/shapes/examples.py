@@ -1,0 +1,186 @@
+"""Training data of a shape model: models of a category with identified keypoints."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.errors import DataError, InputError, quote
+from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids
+
+if TYPE_CHECKING:
+    from cadalign.geometry.mesh import Mesh
+
+logger = logging.getLogger("cadalign")
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One model to learn from.
+
+    Parameters
+    ----------
+    model_id : str
+        Its name, for messages and to find it again.
+    ids : (n,) int or str
+        Semantic ids or names of its keypoints.
+    points_3d : (n, 3) float
+        The keypoints [model units].
+    bounds : (2, 3) float, optional
+        The least and the greatest corner of its bounding box [model units].
+    mesh_path : Path, optional
+        Its mesh.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, an id occurs twice, ids are of two kinds,
+        or the bounds are upside down.
+    """
+
+    model_id: str
+    ids: Sequence[KeypointId]
+    points_3d: FloatArray
+    bounds: FloatArray | None = None
+    mesh_path: Path | None = None
+
+    def __post_init__(self) -> None:
+        where = f"model {self.model_id}"
+        points = as_points(self.points_3d, name=f"{where}, points_3d", dimension=3)
+        ids = check_ids(self.ids, f"{where}, ids")
+        if len(ids) != len(points):
+            what = f"{len(ids)} ids for {len(points)} keypoints"
+            raise InputError(what, where=f"{where}, ids")
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "points_3d", read_only(points))
+        if self.bounds is not None:
+            bounds = as_floats(self.bounds, name=f"{where}, bounds", shape=(2, 3))
+            if (bounds[0] > bounds[1]).any():
+                what = f"the least corner {bounds[0].tolist()} exceeds {bounds[1].tolist()}"
+                raise InputError(what, where=f"{where}, bounds")
+            object.__setattr__(self, "bounds", read_only(bounds))
+
+
+class AnnotatedKeypoints(Protocol):
+    """Keypoints of an `AnnotatedModel`."""
+
+    @property
+    def xyz(self) -> FloatArray: ...
+    @property
+    def semantic_ids(self) -> IntArray: ...
+
+
+class AnnotatedModel(Protocol):
+    """A data set's model, such as `cadalign.datasets.AnnotatedModel`."""
+
+    @property
+    def model_id(self) -> str: ...
+    @property
+    def keypoints(self) -> Any: ...
+    @property
+    def mesh_path(self) -> Path | None: ...
+    def load_mesh(self, *, check: bool = True) -> Mesh: ...
+
+
+class Dataset(Protocol):
+    """A data set of annotated models, such as `cadalign.datasets.KeypointNet`."""
+
+    def subset(self, *, categories: Iterable[str] | None, split: str | None) -> Dataset: ...
+    def __getitem__(self, key: str, /) -> Any: ...
+
+
+def examples_of(
+    models: Sequence[AnnotatedModel], *, meshes: bool, on_progress: Callable[[int, int], object]
+) -> list[Example]:
+    """Convert a data set's models; boxes are those of the meshes if at least half have one."""
+    with_mesh = sum(model.mesh_path is not None for model in models)
+    measured = meshes and with_mesh > 0 and 2 * with_mesh >= len(models)
+    examples = []
+    for model in models:
+        bounds = None
+        if measured and model.mesh_path is not None:
+            try:
+                bounds = model.load_mesh(check=False).bounds
+            except DataError as error:
+                logger.warning("its bounding box is taken as unknown: %s", error)
+        path = None if model.mesh_path is None else model.mesh_path.absolute()
+        ids = [int(label) for label in model.keypoints.semantic_ids]
+        examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
+        on_progress(len(examples), len(models))
+    return examples
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Models as rows of one array.
+
+    Parameters
+    ----------
+    ids : tuple of int or str
+        All ids that a model has, sorted.
+    rows : (N, m + 2, 3) float
+        Keypoints and box corners; NaN for what a model lacks.
+    shapes : TrainingShapes
+        The models' ids, keypoints and meshes.
+    """
+
+    ids: tuple[KeypointId, ...]
+    rows: FloatArray
+    shapes: TrainingShapes
+
+    @classmethod
+    def of(cls, examples: Sequence[Example], *, least: int) -> Table:
+        """Tabulate models; see `ShapeModel.learn` for the errors raised.
+
+        If less than half of the models have bounds, the boxes are those of the keypoints.
+        """
+        if len(examples) < least:
+            raise InputError(
+                f"{len(examples)} models are too few to learn a shape from",
+                where="models",
+                fix=f"give at least {least}",
+            )
+        _check_names(examples)
+        ids = tuple(sorted({label for each in examples for label in each.ids}))
+        column = {label: row for row, label in enumerate(ids)}
+        rows = np.full((len(examples), len(ids) + BOX_ROWS, 3), np.nan)
+        measured = 2 * sum(each.bounds is not None for each in examples) >= len(examples)
+        for row, each in zip(rows, examples, strict=True):
+            row[[column[label] for label in each.ids]] = each.points_3d
+            if not measured:
+                row[-BOX_ROWS:] = each.points_3d.min(axis=0), each.points_3d.max(axis=0)
+            elif each.bounds is not None:
+                row[-BOX_ROWS:] = each.bounds
+        shapes = TrainingShapes(
+            tuple(each.model_id for each in examples),
+            rows[:, :-BOX_ROWS].astype(np.float32),
+            tuple(each.mesh_path for each in examples),
+        )
+        return cls(ids, rows, shapes)
+
+
+def _check_names(examples: Sequence[Example]) -> None:
+    kind = type(examples[0].ids[0])
+    words = {int: "numbers", str: "names"}
+    for each in examples:
+        if type(each.ids[0]) is not kind:
+            raise InputError(
+                f"its keypoints have {words[type(each.ids[0])]} as ids, those of model "
+                f"{examples[0].model_id} have {words[kind]}",
+                where=f"model {each.model_id}",
+                fix="use one kind in all models",
+            )
+    seen: set[str] = set()
+    for each in examples:
+        if each.model_id in seen:
+            raise InputError("occurs twice", where=f"model {quote(each.model_id)}")
+        seen.add(each.model_id)
+    sizes = {each.model_id: float(np.ptp(each.points_3d, axis=0).max()) for each in examples}
+    if max(sizes.values()) == 0:
+        raise InputError("in every model all keypoints coincide", where="models")

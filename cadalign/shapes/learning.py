@@ -1,0 +1,296 @@
+"""Learning of a shape model's components; what is not given is chosen by held-out likelihood.
+
+Likelihoods are those of the keypoints as an image shows them, at an accuracy of `_RESOLUTION`:
+finer detail would decide otherwise, though no photo tells it.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from threadpoolctl import threadpool_limits
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import InputError
+from cadalign.shapes.basis import component_of_covariance
+from cadalign.shapes.gaussians import (
+    Gaussians,
+    Vectors,
+    learn_gaussian,
+    learn_mixture,
+    log_likelihoods,
+)
+from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent
+from cadalign.shapes.reflections import find_reflection, mirrored_rows
+
+LEAST_MODELS = 4
+# Lengths relative to the models' median diagonal.
+_FLOOR = 1e-3
+_RESOLUTION = 5e-3  # 2 px where an object's diagonal has 400
+_UNLIKE = 0.01  # share of models
+_TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
+_MODE_TOLERANCE = 0.1  # modes cost next to nothing
+_FOLDS = 3
+_LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
+_ROUNDS = 25
+_STRENGTHS = (0.0, 0.1, 1.0, 10.0)
+_MIXTURE_STRENGTH = 10.0
+_MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
+_CLUSTER_MODES = 10
+_CLUSTERINGS = 5
+_STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
+_MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
+
+
+@dataclass(frozen=True)
+class LearnOptions:
+    """Options of `cadalign.ShapeModel.learn`."""
+
+    components: int | None = None
+    modes: int | None = None
+    reflection: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("components", "modes"):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if value is not None and (not whole or value < 1):
+                raise InputError(f"{value!r} is not a whole number >= 1", where=name)
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Result of `learn_components`."""
+
+    components: tuple[ShapeComponent, ...]
+    reflection: Reflection | None
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """Choices that are made before the components are learned."""
+
+    strength: float = _STRENGTHS[1]
+    reflection: Reflection | None = None
+    components: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """Models to learn from.
+
+    Parameters
+    ----------
+    ids : (m,) int or str
+    rows : (N, m + 2, 3) float
+        Keypoints and box corners, NaN where missing.
+    size : float
+        Their median diagonal.
+    """
+
+    ids: Sequence[KeypointId]
+    rows: FloatArray
+    size: float
+
+    def some(self, chosen: BoolArray) -> _Models:
+        """A part of the models."""
+        return replace(self, rows=self.rows[chosen])
+
+    def completed(self) -> FloatArray:
+        """The models with their expected missing keypoints, (N, m + 2, 3) float."""
+        vectors = _vectors(self.rows, None, self.ids)
+        common = learn_gaussian(vectors, strength=0.0, floor=_FLOOR * self.size, rounds=_ROUNDS)
+        return vectors.completed(common).reshape(self.rows.shape)
+
+    def mixture(self, recipe: _Recipe) -> Gaussians:
+        """Learn by a recipe."""
+        vectors = _vectors(self.rows, recipe.reflection, self.ids)
+        floor = _FLOOR * self.size
+        common = learn_gaussian(vectors, strength=recipe.strength, floor=floor, rounds=_ROUNDS)
+        if recipe.components == 1:
+            return common
+        return learn_mixture(
+            vectors,
+            _clusters(vectors, common, recipe.components),
+            common,
+            strength=_MIXTURE_STRENGTH,
+            floor=floor,
+            rounds=_ROUNDS,
+        )
+
+    def log_likelihoods(self, mixture: Gaussians) -> FloatArray:
+        """Log-likelihood of each model at the resolution of images, (N,) float.
+
+        One model in a hundred is taken as unlike any other, so that a few of these, whose
+        likelihood may be of any order, don't decide between mixtures.
+        """
+        values = self.rows.reshape(len(self.rows), -1)
+        common = log_likelihoods(values, mixture.widened(_RESOLUTION * self.size))
+        broad = Gaussians(
+            np.ones(1),
+            mixture.means.mean(axis=0)[None],
+            self.size**2 * np.eye(values.shape[1])[None],
+        )
+        unlike = log_likelihoods(values, broad)
+        return np.logaddexp(math.log1p(-_UNLIKE) + common, math.log(_UNLIKE) + unlike)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A recipe, what is learned by it without each fold, and how likely that makes the folds.
+
+    Parameters
+    ----------
+    recipe : _Recipe
+    learned : tuple of Gaussians
+    scores : (N,) float
+        Log-likelihood of each model under what was learned without its fold.
+    """
+
+    recipe: _Recipe
+    learned: tuple[Gaussians, ...]
+    scores: FloatArray
+
+
+class _CrossValidation:
+    """Recipes compared by the likelihood of models that were held out."""
+
+    def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
+        self._models = models
+        self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
+        self._on_progress, self._done = on_progress, 0
+
+    def choose(self, options: LearnOptions) -> tuple[_Recipe, int]:
+        """Choose a recipe and the number of modes."""
+        best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
+        if options.reflection:
+            best = self._with_reflection(best)
+        best = self._with_components(best, options.components)
+        return best.recipe, options.modes or self._modes(best)
+
+    def _with_reflection(self, best: _Trial) -> _Trial:
+        completed = self._models.completed()
+        mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
+        tried = [self._try(replace(best.recipe, reflection=each)) for each in mirrors]
+        mirrored = max(tried, key=_total)
+        # Twice as many models to learn from are worth a little.
+        return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
+
+    def _with_components(self, single: _Trial, wanted: int | None) -> _Trial:
+        if wanted is not None:
+            return self._try(replace(single.recipe, components=wanted))
+        counts = range(2, _MOST_COMPONENTS + 1)
+        tried = [single, *(self._try(replace(single.recipe, components=each)) for each in counts)]
+        return tried[_least_enough([each.scores for each in tried], _TOLERANCE)]
+
+    def _modes(self, trial: _Trial) -> int:
+        full = self._models.rows[0].size
+        counts = [*(count for count in _MODES if count < full), full]
+        parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
+        return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
+
+    def _try(self, recipe: _Recipe) -> _Trial:
+        learned = []
+        for fold in range(_FOLDS):
+            learned.append(self._models.some(self._folds != fold).mixture(recipe))
+            self._done += 1
+            self._on_progress(min(self._done, _STEPS - 1), _STEPS)
+        return _Trial(recipe, tuple(learned), self._scores(learned))
+
+    def _scores(self, learned: Sequence[Gaussians]) -> FloatArray:
+        found = np.empty(len(self._folds))
+        for fold, mixture in enumerate(learned):
+            held_out = self._folds == fold
+            found[held_out] = self._models.some(held_out).log_likelihoods(mixture)
+        return found
+
+
+def learn_components(
+    ids: Sequence[KeypointId],
+    rows: FloatArray,
+    options: LearnOptions,
+    on_progress: Callable[[int, int], object],
+) -> Learned:
+    """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing."""
+    if (options.components or 1) > len(rows):
+        what = f"{options.components} are more than the {len(rows)} models"
+        raise InputError(what, where="components")
+    extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
+    models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
+    # Threads of the linear algebra library make products of such small matrices 30 times slower.
+    with threadpool_limits(1):
+        if len(rows) < _LEAST_TO_CHOOSE:
+            recipe = _Recipe(components=options.components or 1)
+            modes = options.modes
+        else:
+            recipe, modes = _CrossValidation(models, on_progress).choose(options)
+        mixture = models.mixture(recipe)
+    on_progress(_STEPS, _STEPS)
+    return Learned(_components(mixture, modes), recipe.reflection)
+
+
+def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:
+    """Models as vectors, beside each its mirror image of the same weight."""
+    weight = 1.0
+    if reflection is not None:
+        rows = np.concatenate([rows, mirrored_rows(rows, ids, reflection)])
+        weight = 0.5
+    return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
+
+
+def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
+    """Cluster the completed vectors by their main coefficients."""
+    _, directions = np.linalg.eigh(common.covariances[0])
+    coefficients = (vectors.completed(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
+    tries = []
+    for seed in range(_CLUSTERINGS):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
+            centres, labels = kmeans2(coefficients, count, minit="++", seed=seed)
+        tries.append((float(((coefficients - centres[labels]) ** 2).sum()), seed, labels))
+    labels = min(tries)[2].astype(np.int64)
+    labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
+    return np.asarray(labels)
+
+
+def _components(mixture: Gaussians, modes: int | None) -> tuple[ShapeComponent, ...]:
+    weights = mixture.weights / mixture.weights.sum()
+    return tuple(
+        component_of_covariance(mean.reshape(-1, 3), covariance, weight=float(weight), modes=modes)
+        for weight, mean, covariance in sorted(
+            zip(weights, mixture.means, mixture.covariances, strict=True),
+            key=lambda part: -float(part[0]),
+        )
+    )
+
+
+def _truncated(mixture: Gaussians, modes: int) -> Gaussians:
+    """The mixture that is left of another one when only some modes are kept."""
+    parts = [
+        component_of_covariance(mean.reshape(-1, 3), covariance, modes=modes).covariance
+        for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
+    ]
+    return Gaussians(mixture.weights, mixture.means, np.array(parts))
+
+
+def _total(trial: _Trial) -> float:
+    """Log-likelihood of all models."""
+    return float(trial.scores.sum())
+
+
+def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
+    """The first that makes the models about as likely as any other."""
+    best = max(scores, key=np.sum)
+    enough = [row for row, each in enumerate(scores) if _is_enough(each, best, tolerance)]
+    return enough[0]
+
+
+def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
+    """Whether models are less likely by no more than a tolerance or the standard error."""
+    losses = best - scores
+    return float(losses.mean()) <= max(tolerance, float(losses.std()) / math.sqrt(len(losses)))

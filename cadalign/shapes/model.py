@@ -1,0 +1,433 @@
+"""`cadalign.ShapeModel`: the shapes of a category as a mixture of Gaussians."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray, as_floats
+from cadalign.errors import InputError, quote
+from cadalign.io.documents import in_file
+from cadalign.shapes.basis import component_of_basis, component_of_covariance
+from cadalign.shapes.examples import Dataset, Example, Table, examples_of
+from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
+from cadalign.shapes.parts import (
+    BOX_ROWS,
+    KeypointId,
+    NearestShape,
+    Reflection,
+    ShapeComponent,
+    TrainingShapes,
+    check_axis,
+    check_ids,
+)
+from cadalign.shapes.shape_file import read_shape, write_shape
+
+OnProgress = Callable[[int, int], object]
+"""Called with the number of steps that are done and that of all."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeModel:
+    """The shapes of a category: keypoints and bounding box, jointly Gaussian, or a mixture.
+
+    `ShapeModel.learn` and `ShapeModel.from_dataset` learn one from models, `ShapeModel.from_basis`
+    and `ShapeModel.from_covariance` make one from given numbers, `ShapeModel.open` reads one that
+    `ShapeModel.save` wrote.
+
+    Parameters
+    ----------
+    category : str
+    ids : tuple of int or str
+        Semantic ids or names of the m keypoints, in the order of the components' rows; sorted if
+        they were learned.
+    components : tuple of ShapeComponent
+        The mixture; weights sum to 1.
+    has_box : bool
+        Whether the rows of the box were learned or given; otherwise they are the extent of the
+        mean's keypoints and move with these.
+    up_axis : "x", "y", "z" or None
+        The model axis that points up, None where it is not known.
+    reflection : Reflection, optional
+        The mirror symmetry of the category.
+    training : TrainingShapes, optional
+        The models that it was learned from.
+    unit : str
+        Unit of lengths: "diagonal" for KeypointNet's models, "m" for metres.
+
+    Raises
+    ------
+    InputError
+        If the parts don't agree in their number of keypoints, or the weights don't sum to 1.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> names = ["origin", "right", "top", "front"]
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    >>> models = [
+    ...     Example(f"box {row}", names, corners * rng.uniform(0.8, 1.2, 3)) for row in range(50)
+    ... ]
+    >>> boxes = ShapeModel.learn(models, category="box")
+    >>> boxes
+    ShapeModel('box', 4 keypoints, 1 component, 50 models)
+    >>> boxes.nearest(models[7].points_3d, names).model_id
+    'box 7'
+    """
+
+    category: str
+    ids: tuple[KeypointId, ...]
+    components: tuple[ShapeComponent, ...]
+    has_box: bool = True
+    up_axis: Literal["x", "y", "z"] | None = None
+    reflection: Reflection | None = None
+    training: TrainingShapes | None = None
+    unit: str = "model units"
+
+    def __post_init__(self) -> None:
+        ids = check_ids(self.ids, "ids")
+        if not self.components:
+            raise InputError("there are none", where="components")
+        for row, component in enumerate(self.components):
+            if len(component.mean) != len(ids) + BOX_ROWS:
+                what = (
+                    f"{len(component.mean)} rows, expected {len(ids) + BOX_ROWS}: "
+                    f"{len(ids)} keypoints and {BOX_ROWS} box corners"
+                )
+                raise InputError(what, where=f"components[{row}]")
+        total = sum(component.weight for component in self.components)
+        if abs(total - 1) > 1e-6:
+            raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
+        if self.up_axis is not None:
+            check_axis(self.up_axis, "up_axis")
+        if self.reflection is not None:
+            self.reflection.partners(ids)
+        if self.training is not None and self.training.points_3d.shape[1] != len(ids):
+            what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
+            raise InputError(what, where="training")
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "components", tuple(self.components))
+
+    @classmethod
+    def learn(
+        cls,
+        models: Iterable[Example],
+        *,
+        category: str = "object",
+        up_axis: Literal["x", "y", "z"] | None = None,
+        unit: str = "model units",
+        components: int | None = None,
+        modes: int | None = None,
+        reflection: bool = True,
+        on_progress: OnProgress = lambda done, total: None,
+    ) -> ShapeModel:
+        """Learn the shapes of a category from models of it.
+
+        Models may lack keypoints; these are completed by expectation maximisation. What is not
+        given is chosen by the likelihood of models that were held out. Ids that few models have
+        keep wide deviations.
+
+        Parameters
+        ----------
+        models : iterable of Example
+            At least 4. If less than half of them have bounds, the boxes are those of the keypoints.
+        category, up_axis, unit
+            See `ShapeModel`.
+        components : int, optional
+            Number of Gaussians.
+        modes : int, optional
+            Number of modes of each.
+        reflection : bool
+            Whether to look for a mirror symmetry and, where it makes held-out models more likely,
+            to learn from the mirrored models, too.
+        on_progress : callable
+            Called with the number of steps done and of all.
+
+        Raises
+        ------
+        InputError
+            If there are too few models, a model id occurs twice, the models' ids are partly numbers
+            and partly names, or an option is out of range.
+        """
+        options = LearnOptions(components=components, modes=modes, reflection=reflection)
+        table = Table.of(list(models), least=LEAST_MODELS)
+        learned = learn_components(table.ids, table.rows, options, on_progress)
+        return cls(
+            category=category,
+            ids=table.ids,
+            components=learned.components,
+            up_axis=up_axis,
+            reflection=learned.reflection,
+            training=table.shapes,
+            unit=unit,
+        )
+
+    @classmethod
+    def from_dataset(
+        cls,
+        dataset: Dataset,
+        category: str,
+        *,
+        split: str | None = None,
+        meshes: bool = True,
+        components: int | None = None,
+        modes: int | None = None,
+        reflection: bool = True,
+        on_progress: OnProgress = lambda done, total: None,
+    ) -> ShapeModel:
+        """Learn the shapes of a category of `cadalign.datasets.KeypointNet`.
+
+        Parameters
+        ----------
+        dataset : KeypointNet
+        category : str
+            Its name or synset id.
+        split : str, optional
+            Learn from the models of this split only.
+        meshes : bool
+            Whether to read the meshes for the bounding boxes, where at least half of the models
+            have one; otherwise the boxes are those of the keypoints.
+        components, modes, reflection
+            See `ShapeModel.learn`.
+        on_progress : callable
+            Called with the number of steps done and of all, first of reading, then of learning.
+
+        Raises
+        ------
+        InputError
+            If category or split is unknown, or the category has too few models.
+        """
+        models = dataset.subset(categories=[category], split=split)[category]
+        where = f"{category}, split {split}" if split else category
+        if len(models) < LEAST_MODELS:
+            raise InputError(
+                f"{len(models)} models are too few to learn a shape from",
+                where=where,
+                fix=f"at least {LEAST_MODELS} are needed",
+            )
+        examples = examples_of(models, meshes=meshes, on_progress=on_progress)
+        return cls.learn(
+            examples,
+            category=models[0].category,
+            up_axis="y",
+            unit="diagonal",
+            components=components,
+            modes=modes,
+            reflection=reflection,
+            on_progress=on_progress,
+        )
+
+    @classmethod
+    def from_basis(
+        cls,
+        mean: npt.ArrayLike,
+        modes: npt.ArrayLike,
+        deviations: npt.ArrayLike,
+        *,
+        ids: Sequence[KeypointId] | None = None,
+        names: Sequence[str] | None = None,
+        box: npt.ArrayLike | None = None,
+        residual_sigma: float = 0.0,
+        size_sigma: npt.ArrayLike | None = None,
+        category: str = "object",
+        up_axis: Literal["x", "y", "z"] | None = None,
+        unit: str = "model units",
+    ) -> ShapeModel:
+        """Make a shape model from a mean and modes of deformation.
+
+        Parameters
+        ----------
+        mean : (m, 3) float
+            The keypoints of the mean shape.
+        modes : (K, m, 3) or (K, 3 m) float
+            Directions of deformation; as rows of 3 m they are x, y, z of the first keypoint, and so
+            on.
+        deviations : (K,) float
+            Standard deviations of their coefficients, 0 or more.
+        ids, names : (m,) int or str, optional
+            Semantic ids or names of the keypoints, one of both; by default ``0 ... m - 1``.
+        box : (2, 3) float, optional
+            Least and greatest corner of the mean shape's bounding box; by default the extent of its
+            keypoints. With each mode it moves by the shift and the stretch along each axis that fit
+            the keypoints' motion best.
+        residual_sigma : float
+            Standard deviation per coordinate of what the modes leave [model units].
+        size_sigma : float or (3,) float, optional
+            Standard deviation of the logarithm of the size, overall or along x, y and z, where the
+            modes are of objects of one size: further modes, which scale mean and box about the
+            origin.
+        category, up_axis, unit
+            See `ShapeModel`.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, a value is NaN or infinite, a deviation is negative, or an id
+            occurs twice.
+
+        Examples
+        --------
+        >>> mean = [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]]
+        >>> longer = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]]
+        >>> cars = ShapeModel.from_basis(mean, [longer], [0.5], names=["a", "b", "c", "d"],
+        ...                              size_sigma=0.1, unit="m")
+        >>> cars.components[0].modes.shape
+        (2, 6, 3)
+        """
+        component = component_of_basis(
+            mean,
+            modes,
+            deviations,
+            box=box,
+            residual_sigma=residual_sigma,
+            size_sigma=size_sigma,
+        )
+        return cls(
+            category=category,
+            ids=_given_ids(ids, names, len(component.mean) - BOX_ROWS),
+            components=(component,),
+            has_box=box is not None,
+            up_axis=up_axis,
+            unit=unit,
+        )
+
+    @classmethod
+    def from_covariance(
+        cls,
+        mean: npt.ArrayLike,
+        covariance: npt.ArrayLike,
+        *,
+        ids: Sequence[KeypointId] | None = None,
+        names: Sequence[str] | None = None,
+        modes: int | None = None,
+        category: str = "object",
+        up_axis: Literal["x", "y", "z"] | None = None,
+        unit: str = "model units",
+    ) -> ShapeModel:
+        """Make a shape model from the mean and covariance of keypoints and box.
+
+        Parameters
+        ----------
+        mean : (m + 2, 3) float
+            The keypoints, then the least and the greatest corner of the bounding box.
+        covariance : (3 (m + 2), 3 (m + 2)) float
+            Of x, y, z of the first row, and so on [model units squared].
+        ids, names
+            See `ShapeModel.from_basis`.
+        modes : int, optional
+            Number of modes to keep; what they leave is spread evenly over the coordinates.
+        category, up_axis, unit
+            See `ShapeModel`.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, a value is NaN or infinite, or the covariance is not symmetric and
+            positive semi-definite.
+        """
+        rows = as_floats(mean, name="mean", shape=(None, 3))
+        component = component_of_covariance(rows, covariance, modes=modes)
+        labels = _given_ids(ids, names, len(rows) - BOX_ROWS)
+        return cls(category, labels, (component,), up_axis=up_axis, unit=unit)
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> ShapeModel:
+        """Read a file that `ShapeModel.save` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file is missing, truncated, damaged, of another version, or of another format.
+        """
+        fields = read_shape(path)
+        with in_file(os.fspath(path)):
+            return cls(**fields._asdict())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model to a file atomically; raises DataError on failure."""
+        write_shape(path, self)
+
+    def __repr__(self) -> str:
+        count = len(self.components)
+        text = f"{len(self.ids)} keypoints, {count} component{'s' if count > 1 else ''}"
+        models = "" if self.training is None else f", {len(self.training)} models"
+        return f"ShapeModel({self.category!r}, {text}{models})"
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the mixture: keypoints, then the box's corners, (m + 2, 3) float."""
+        return np.asarray(sum(each.weight * each.mean for each in self.components))
+
+    def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
+        """Rows of the keypoints that have these ids, (n,) int.
+
+        Raises
+        ------
+        InputError
+            If ids are unknown; the message names them.
+        """
+        row_of = {label: row for row, label in enumerate(self.ids)}
+        wanted = [label.item() if isinstance(label, np.generic) else label for label in ids]
+        unknown = [label for label in wanted if label not in row_of]
+        if unknown:
+            raise InputError(
+                f"{self.category} has no keypoint {', '.join(quote(each) for each in unknown[:8])}",
+                where=where,
+                fix=f"known are {quote(list(self.ids))}",
+            )
+        return np.array([row_of[label] for label in wanted], dtype=np.int64)
+
+    def nearest(
+        self, points_3d: npt.ArrayLike, ids: Iterable[KeypointId] | None = None
+    ) -> NearestShape:
+        """Find the training model whose keypoints are nearest to given ones.
+
+        Parameters
+        ----------
+        points_3d : (n, 3) float
+            Keypoints in the model's coordinates [model units].
+        ids : (n,) int or str, optional
+            Their ids; by default all of the model's, in its order.
+
+        Raises
+        ------
+        InputError
+            If there are no training models, a shape is wrong, a value is NaN or infinite, or an id
+            is unknown.
+        """
+        if self.training is None or not len(self.training):
+            raise InputError("no training models are known", where=self.category)
+        rows = np.arange(len(self.ids)) if ids is None else self.rows(ids)
+        points = as_floats(points_3d, name="points_3d", shape=(len(rows), 3))
+        if not len(rows):
+            raise InputError("no keypoints", where="points_3d")
+        known = self.training.points_3d[:, rows].astype(np.float64)
+        squares = ((known - points) ** 2).sum(axis=2)
+        # Two objects of the category are this far apart in a keypoint on average.
+        expected = 2 * np.nanvar(self.training.points_3d[:, rows], axis=0).sum(axis=1)
+        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
+        best = int(np.argmin(distances))
+        return NearestShape(
+            self.training.model_ids[best],
+            self.training.points_3d[best].astype(np.float64),
+            self.training.mesh_paths[best],
+            float(np.sqrt(distances[best])),
+        )
+
+
+def _given_ids(
+    ids: Sequence[KeypointId] | None, names: Sequence[str] | None, count: int
+) -> tuple[KeypointId, ...]:
+    if ids is not None and names is not None:
+        raise InputError("both ids and names are given", where="names", fix="give one of them")
+    where = "ids" if names is None else "names"
+    given = ids if names is None else names
+    labels = check_ids(range(count) if given is None else list(given), where)
+    if len(labels) != count:
+        raise InputError(f"{len(labels)} for {count} keypoints", where=where)
+    return labels

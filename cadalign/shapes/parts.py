@@ -1,0 +1,209 @@
+"""Parts of a shape model: Gaussian components, the reflection, the shapes it was learned from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, is_number, read_only
+from cadalign.errors import InputError
+
+KeypointId = int | str
+"""A keypoint's semantic id or name."""
+
+AXES = ("x", "y", "z")
+BOX_ROWS = 2  # the box's least and greatest corner, after the keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeComponent:
+    """One Gaussian of a shape model.
+
+    Shapes are ``mean + sum_k c_k modes[k] + e``, with coefficients ``c`` of unit variance and a
+    residual ``e`` of the same variance in every coordinate.
+
+    Parameters
+    ----------
+    weight : float
+        Its share in the mixture.
+    mean : (m + 2, 3) float
+        The m keypoints, then the least and the greatest corner of the bounding box [model units].
+    modes : (K, m + 2, 3) float
+        Directions of deformation, one standard deviation long, the longest first [model units].
+    residual_sigma : float
+        Standard deviation, per coordinate, of what the modes leave [model units].
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value is NaN, infinite or negative, or the weight is not in (0, 1].
+    """
+
+    weight: float
+    mean: FloatArray
+    modes: FloatArray
+    residual_sigma: float
+
+    def __post_init__(self) -> None:
+        mean = as_floats(self.mean, name="mean", shape=(None, 3))
+        modes = as_floats(self.modes, name="modes", shape=(None, None, 3))
+        if len(mean) <= BOX_ROWS:
+            raise InputError(f"{len(mean)} rows hold no keypoints besides the box", where="mean")
+        if modes.shape[1] != len(mean):
+            what = f"shape {modes.shape}, expected (n, {len(mean)}, 3), one row for each of mean"
+            raise InputError(what, where="modes")
+        if not is_number(self.residual_sigma) or self.residual_sigma < 0:
+            what = f"{self.residual_sigma!r} is not a standard deviation"
+            raise InputError(what, where="residual_sigma", fix="give a number, 0 or more")
+        if not is_number(self.weight) or not 0 < self.weight <= 1:
+            raise InputError(f"{self.weight!r} is not in (0, 1]", where="weight")
+        object.__setattr__(self, "mean", read_only(mean))
+        object.__setattr__(self, "modes", read_only(modes))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the stacked rows, (3 (m + 2), 3 (m + 2)) float [model units squared]."""
+        flat = self.modes.reshape(len(self.modes), self.mean.size)
+        return np.asarray(flat.T @ flat + self.residual_sigma**2 * np.eye(flat.shape[1]))
+
+    @property
+    def variance(self) -> FloatArray:
+        """Sum of the rows' variances along each mode, (K,) float [model units squared]."""
+        return np.asarray((self.modes**2).sum(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """A category's mirror symmetry: mirrored objects are as likely as the objects themselves.
+
+    Parameters
+    ----------
+    axis : str
+        "x", "y" or "z": the axis across which the objects are mirrored.
+    offset : float
+        Where the mirror stands on that axis [model units].
+    pairs : tuple of pairs of ids
+        The keypoints that exchange places; the others are their own mirror image.
+    """
+
+    axis: str
+    offset: float
+    pairs: tuple[tuple[KeypointId, KeypointId], ...]
+
+    def __post_init__(self) -> None:
+        check_axis(self.axis, "axis")
+        if not is_number(self.offset):
+            raise InputError(f"{self.offset!r} is not a finite number", where="offset")
+        paired = [label for pair in self.pairs for label in pair]
+        if len(set(paired)) < len(paired):
+            raise InputError("a keypoint is mirrored twice", where="pairs")
+
+    def partners(self, ids: Sequence[KeypointId]) -> npt.NDArray[np.int64]:
+        """The row that each keypoint's mirror image has, (m,) int.
+
+        Examples
+        --------
+        >>> Reflection("x", 0.0, (("left", "right"),)).partners(["left", "top", "right"])
+        array([2, 1, 0])
+        """
+        row_of = {label: row for row, label in enumerate(ids)}
+        partner = np.arange(len(ids))
+        for first, second in self.pairs:
+            if first not in row_of or second not in row_of:
+                missing = first if first not in row_of else second
+                raise InputError(f"unknown keypoint {missing!r}", where="reflection")
+            partner[[row_of[first], row_of[second]]] = row_of[second], row_of[first]
+        return partner
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingShapes:
+    """The keypoints of the models that a shape model was learned from.
+
+    Parameters
+    ----------
+    model_ids : tuple of str
+        One for each model.
+    points_3d : (N, m, 3) float32
+        Their keypoints in the order of the shape model's ids [model units]; NaN where a model
+        lacks one.
+    mesh_paths : tuple of Path or None
+        Their meshes.
+
+    Raises
+    ------
+    InputError
+        If lengths or shapes don't match, or a coordinate is infinite.
+    """
+
+    model_ids: tuple[str, ...]
+    points_3d: npt.NDArray[np.float32]
+    mesh_paths: tuple[Path | None, ...]
+
+    def __post_init__(self) -> None:
+        points = np.ascontiguousarray(self.points_3d, dtype=np.float32)
+        count = len(self.model_ids)
+        if points.ndim != 3 or points.shape[0] != count or points.shape[2] != 3:
+            what = f"shape {points.shape}, expected ({count}, m, 3), one row for each model id"
+            raise InputError(what, where="points_3d")
+        if np.isinf(points).any():
+            raise InputError("infinite coordinates", where="points_3d")
+        if len(self.mesh_paths) != count:
+            what = f"{len(self.mesh_paths)} paths for {count} models"
+            raise InputError(what, where="mesh_paths")
+        object.__setattr__(self, "points_3d", read_only(points))
+
+    def __len__(self) -> int:
+        return len(self.model_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class NearestShape:
+    """The training model whose keypoints are nearest to given ones.
+
+    Parameters
+    ----------
+    model_id : str
+    points_3d : (m, 3) float
+        Its keypoints in the order of the shape model's ids [model units]; NaN where it lacks one.
+    mesh_path : Path or None
+    distance : float
+        Root of the mean squared distance of the keypoints [model units]; for those that the model
+        lacks the distance expected in the category.
+    """
+
+    model_id: str
+    points_3d: FloatArray
+    mesh_path: Path | None
+    distance: float
+
+
+def check_axis(axis: object, where: str) -> None:
+    """Refuse what is not the name of an axis."""
+    if axis not in AXES:
+        raise InputError(f"{axis!r} is not one of 'x', 'y', 'z'", where=where)
+
+
+def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
+    """Check a list of keypoints' ids or names: whole numbers or texts, not both, none twice."""
+    found: list[KeypointId] = []
+    for row, label in enumerate(ids):
+        if isinstance(label, int | np.integer) and not isinstance(label, bool | np.bool_):
+            found.append(int(label))
+        elif isinstance(label, str) and label.strip():
+            found.append(str(label))
+        else:
+            what = f"{label!r} is neither a whole number nor a name"
+            raise InputError(what, where=f"{where}[{row}]")
+    if not found:
+        raise InputError("there are none", where=where)
+    if len({type(label) for label in found}) > 1:
+        raise InputError("some are numbers and some are names", where=where, fix="use one kind")
+    twice = next((label for row, label in enumerate(found) if label in found[:row]), None)
+    if twice is not None:
+        raise InputError(f"{twice!r} occurs twice", where=where)
+    return tuple(found)

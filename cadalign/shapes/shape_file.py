@@ -1,0 +1,169 @@
+"""File format of shape models: a sealed MessagePack document.
+
+See `cadalign.io.sealed` for the header. The document holds the fields of `cadalign.ShapeModel`;
+arrays are little-endian numbers with their shape.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from cadalign.errors import InputError
+from cadalign.io.documents import Count, Document, Finite, Index, NotNegative, PathText, Positive
+from cadalign.io.files import damaged, reading
+from cadalign.io.sealed import Seal
+from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent, TrainingShapes
+
+if TYPE_CHECKING:
+    from cadalign.shapes.model import ShapeModel
+
+SEAL = Seal(
+    magic=b"cadalign shape\n\0",
+    version=1,
+    noun="shape file",
+    fix="learn it with: cadalign shape learn",
+)
+_MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
+
+Axis = Literal["x", "y", "z"]
+Label = Index | str
+
+
+class _Array(Document):
+    """Little-endian numbers in C order."""
+
+    shape: Annotated[list[Count], Meta(max_length=3)]
+    data: bytes
+
+    @classmethod
+    def of(cls, array: npt.NDArray[np.float32] | npt.NDArray[np.float64]) -> _Array:
+        return cls(list(array.shape), array.astype(array.dtype.newbyteorder("<")).tobytes())
+
+    def read(self, kind: str) -> npt.NDArray[Any]:
+        numbers = np.frombuffer(self.data, dtype=kind) if self.data else np.empty(0, dtype=kind)
+        if math.prod(self.shape) != len(numbers):
+            raise InputError(f"{len(numbers)} numbers are not of the shape {self.shape}")
+        return numbers.reshape(self.shape).astype(np.dtype(kind).newbyteorder("="))
+
+
+class _Component(Document):
+    weight: Positive
+    mean: _Array
+    modes: _Array
+    residual_sigma: NotNegative
+
+
+class _Reflection(Document):
+    axis: Axis
+    offset: Finite
+    pairs: list[tuple[Label, Label]]
+
+
+class _Training(Document):
+    model_ids: list[str]
+    points_3d: _Array
+    mesh_paths: list[PathText | None]
+
+
+class _Shape(Document):
+    category: str
+    ids: list[Label]
+    components: list[_Component]
+    has_box: bool
+    up_axis: Axis | None
+    reflection: _Reflection | None
+    training: _Training | None
+    unit: str
+
+
+class ShapeFields(NamedTuple):
+    """The fields of a `cadalign.ShapeModel`."""
+
+    category: str
+    ids: tuple[KeypointId, ...]
+    components: tuple[ShapeComponent, ...]
+    has_box: bool
+    up_axis: Axis | None
+    reflection: Reflection | None
+    training: TrainingShapes | None
+    unit: str
+
+
+def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
+    """Write a shape model's file atomically."""
+    mirror, training = model.reflection, model.training
+    document = _Shape(
+        category=model.category,
+        ids=list(model.ids),
+        components=[
+            _Component(
+                each.weight, _Array.of(each.mean), _Array.of(each.modes), each.residual_sigma
+            )
+            for each in model.components
+        ],
+        has_box=model.has_box,
+        up_axis=model.up_axis,
+        reflection=None
+        if mirror is None
+        else _Reflection(mirror.axis, mirror.offset, list(mirror.pairs)),  # type: ignore[arg-type]
+        training=None
+        if training is None
+        else _Training(
+            list(training.model_ids),
+            _Array.of(training.points_3d),
+            [None if each is None else str(each) for each in training.mesh_paths],
+        ),
+        unit=model.unit,
+    )
+    SEAL.write(Path(path), msgspec.msgpack.encode(document))
+
+
+def read_shape(path: str | os.PathLike[str]) -> ShapeFields:
+    """Read and check a shape model's file."""
+    file = Path(path)
+    with reading(file):
+        size = file.stat().st_size
+        if size > _MAX_BYTES:
+            raise damaged(f"{size} bytes are too many for a shape file", file)
+        content = file.read_bytes()
+    payload = SEAL.unwrap(content, str(file))
+    try:
+        return _fields(msgspec.msgpack.decode(payload, type=_Shape))
+    except (msgspec.DecodeError, InputError, ValueError, RecursionError) as error:
+        raise SEAL.error(f"is invalid: {str(error)[:200]}", str(file)) from None
+
+
+def _fields(read: _Shape) -> ShapeFields:
+    components = tuple(
+        ShapeComponent(
+            each.weight, each.mean.read("<f8"), each.modes.read("<f8"), each.residual_sigma
+        )
+        for each in read.components
+    )
+    mirror, training = read.reflection, read.training
+    return ShapeFields(
+        category=read.category,
+        ids=tuple(read.ids),
+        components=components,
+        has_box=read.has_box,
+        up_axis=read.up_axis,
+        reflection=None
+        if mirror is None
+        else Reflection(mirror.axis, mirror.offset, tuple(mirror.pairs)),
+        training=None
+        if training is None
+        else TrainingShapes(
+            tuple(training.model_ids),
+            training.points_3d.read("<f4"),
+            tuple(None if each is None else Path(each) for each in training.mesh_paths),
+        ),
+        unit=read.unit,
+    )

@@ -1,0 +1,1 @@
+"""Kernels that estimate poses, scales and shape from all evidence together."""

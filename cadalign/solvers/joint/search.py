@@ -1,0 +1,193 @@
+"""Search for the minima of a joint estimate from several starts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
+from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.refine import refine_joint
+from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
+from cadalign.solvers.linalg import cholesky, solve_cholesky
+
+_PROBE_ITERATIONS = 8
+_MAX_ITERATIONS = 200
+_SAME_CHORD = 1e-3
+_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
+
+
+class Minima(NamedTuple):
+    """Minima of a joint estimate, the best score first.
+
+    ``poses`` (M, P, 12), ``log_scales`` (M, 3), ``coefficients`` (M, K), ``displacements``
+    (M, m, 3). The ``costs`` (M,) are the whitened squared residuals and priors; the ``scores`` (M,)
+    are -2 log of the evidence by Laplace's approximation, up to a constant.
+    """
+
+    poses: FloatArray
+    log_scales: FloatArray
+    coefficients: FloatArray
+    displacements: FloatArray
+    costs: FloatArray
+    scores: FloatArray
+
+
+@kernel
+def search_joint(
+    evidence: Evidence, poses: FloatArray, log_scales: FloatArray
+) -> tuple[Minima, int, int]:
+    """Refine starts ``poses`` (S, P, 12) with ``log_scales`` (S, 3) to distinct minima.
+
+    Returns the minima, their number, and the number of iterations.
+    """
+    starts, points = poses.shape[0], evidence.shape.mean.shape[0]
+    modes = evidence.shape.modes.shape[0]
+    minima = Minima(
+        np.empty((starts, poses.shape[1], 12)),
+        np.empty((starts, 3)),
+        np.empty((starts, modes)),
+        np.empty((starts, points, 3)),
+        np.full(starts, np.inf),
+        np.full(starts, np.inf),
+    )
+    found = 0
+    iterations = 0
+    system = empty_system(evidence)
+    probed = np.full(starts, np.inf)
+    states = [_start(poses[s], log_scales[s], modes, points) for s in range(starts)]
+    for s in range(starts):
+        probed[s], used, _ = refine_joint(evidence, _PROBE_ITERATIONS, states[s])
+        iterations += used
+    best = np.inf
+    for s in np.argsort(probed):
+        if not probed[s] < min(best, probed.min()) + _UNLIKELY:
+            break
+        state = states[s]
+        if _find(state, minima, found) >= 0:
+            continue
+        cost, used, _ = refine_joint(evidence, _MAX_ITERATIONS, state)
+        iterations += used
+        if not cost < np.inf or _find(state, minima, found) >= 0:
+            continue
+        best = min(best, cost)
+        _insert(state, cost, score_of(evidence, state, system), minima, found)
+        found += 1
+    return minima, found, iterations
+
+
+@kernel
+def _start(poses: FloatArray, log_scales: FloatArray, modes: int, points: int) -> State:
+    return State(poses.copy(), log_scales.copy(), np.zeros(modes), np.zeros((points, 3)))
+
+
+@kernel
+def _find(state: State, minima: Minima, found: int) -> int:
+    """Row of the minimum that a state coincides with, or -1."""
+    for k in range(found):
+        square = 0.0
+        for p in range(state.poses.shape[0]):
+            for i in range(9):
+                square += (minima.poses[k, p, i] - state.poses[p, i]) ** 2
+        for a in range(3):
+            square += (minima.log_scales[k, a] - state.log_scales[a]) ** 2
+        if square < _SAME_CHORD * _SAME_CHORD:
+            return k
+    return -1
+
+
+@kernel
+def _insert(state: State, cost: float, score: float, minima: Minima, found: int) -> None:
+    """Insert a minimum by its score."""
+    row = found
+    while row > 0 and minima.scores[row - 1] > score:
+        minima.poses[row] = minima.poses[row - 1]
+        minima.log_scales[row] = minima.log_scales[row - 1]
+        minima.coefficients[row] = minima.coefficients[row - 1]
+        minima.displacements[row] = minima.displacements[row - 1]
+        minima.costs[row] = minima.costs[row - 1]
+        minima.scores[row] = minima.scores[row - 1]
+        row -= 1
+    minima.poses[row] = state.poses
+    minima.log_scales[row] = state.log_scales
+    minima.coefficients[row] = state.coefficients
+    minima.displacements[row] = state.displacements
+    minima.costs[row] = cost
+    minima.scores[row] = score
+
+
+@kernel
+def score_of(evidence: Evidence, state: State, system: System) -> float:
+    """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
+    cost = evaluate_joint(evidence, state, system)
+    unknowns = system.gradient.shape[0]
+    factor = system.hessian.copy()
+    if not cost < np.inf or not cholesky(factor, unknowns, 0.0):
+        return np.inf
+    score = cost
+    for k in range(unknowns):
+        score += 2.0 * np.log(factor[k, k])
+    score += system.log_determinant[0]
+    return float(score)
+
+
+@kernel
+def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the unknowns (U, U), and of every point (m, 3, 3) in the model's frame.
+
+    Both are the inverse information at a state; zero for log scales that are held. The points'
+    covariance is that of the pose-independent shape, scales and displacements included.
+    """
+    system = empty_system(evidence)
+    evaluate_joint(evidence, state, system)
+    unknowns = system.gradient.shape[0]
+    factor = system.hessian.copy()
+    covariance = np.zeros((unknowns, unknowns))
+    points = evidence.shape.mean.shape[0]
+    of_points = np.zeros((points, 3, 3))
+    modes = evidence.shape.modes.shape[0]
+    first = unknowns - modes - 3
+    if not cholesky(factor, unknowns, 0.0):
+        covariance[:] = np.inf
+        of_points[:] = np.inf
+        return covariance, of_points
+    column = np.empty(unknowns)
+    for k in range(unknowns):
+        if first <= k < first + 3 and evidence.scales.free[k - first] == 0.0:
+            continue
+        column[:] = 0.0
+        column[k] = 1.0
+        solve_cholesky(factor, unknowns, column)
+        covariance[:, k] = column
+    scale = np.exp(state.log_scales)
+    starts = np.zeros(points, dtype=np.int64)
+    ends = np.zeros(points, dtype=np.int64)
+    for n in range(evidence.sightings.point.shape[0]):
+        i = evidence.sightings.point[n]
+        if ends[i] == 0:
+            starts[i] = system.first[n]
+        ends[i] = system.first[n + 1]
+    for i in range(points):
+        rows = np.zeros((3, unknowns))
+        own = np.zeros((3, 3))
+        for a in range(3):
+            value = evidence.shape.mean[i, a]
+            for k in range(modes):
+                value += state.coefficients[k] * evidence.shape.modes[k, i, a]
+                rows[a, first + 3 + k] = scale[a] * evidence.shape.modes[k, i, a]
+            rows[a, first + a] = scale[a] * value
+        square = evidence.shape.spread[i] ** 2
+        for a in range(3):
+            own[a, a] = square
+        for c in range(starts[i], ends[i]):
+            by_own = system.rows[unknowns + 1 :, c]
+            by_others = system.rows[:unknowns, c]
+            for a in range(3):
+                for b in range(3):
+                    own[a, b] -= square * square * by_own[a] * by_own[b]
+                for k in range(unknowns):
+                    rows[a, k] -= square * by_own[a] * by_others[k]
+        of_points[i] = rows @ covariance @ rows.T + own
+    return covariance, of_points

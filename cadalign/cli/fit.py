@@ -15,7 +15,7 @@ from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
+from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,7 +59,12 @@ class Fit(ObservationCommand):
     observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
     """JSON file with camera and keypoints, optionally image and model."""
     similar: bool = False
-    """Estimate sigma from the residuals: for a model that is only similar to the object."""
+    """Estimate sigma from the residuals: for a model that is only similar to the object. Its
+    proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
+    otherwise."""
+    scale_prior: bool = True
+    """Take a prior on the stretch: the flag's, the file's, or with --similar the default one; with
+    --no-scale-prior none."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     shape: Path | None = None
@@ -146,9 +151,25 @@ class Fit(ObservationCommand):
         prior = None
         if focal == "estimate" and self.exif and observation.image is not None:
             prior = FocalPrior.from_exif(observation.image)
-        sigma = self._sigma(observation, given)
+        options = {**set_by_flags, "sigma": self._sigma(observation, given), "focal": focal}
         with named_as_flags(self.fitting):
-            return replace(stored, **set_by_flags, sigma=sigma, focal=focal, focal_prior=prior)
+            chosen = replace(stored, **options, focal_prior=prior)
+            return self._with_scale_prior(chosen, is_stored="scale_prior_sigma" in given)
+
+    def _with_scale_prior(self, options: FitOptions, *, is_stored: bool) -> FitOptions:
+        """The options with the default prior on a similar model's stretch, or without any."""
+        if not self.scale_prior:
+            if self.fitting.scale_prior_sigma is not None:
+                raise InputError(
+                    "--no-scale-prior leaves out the prior, which --scale-prior-sigma gives",
+                    where="--no-scale-prior",
+                    fix="give one of the two options",
+                )
+            return replace(options, scale_prior_sigma=None)
+        chosen = is_stored or options.scale_prior_sigma is not None
+        if chosen or not self.similar or options.method != "optimal" or not options.stretched_axes:
+            return options
+        return replace(options, scale_prior_sigma=SIMILAR_SCALE_SIGMA)
 
     def _sigma(self, observation: Observation, stored: Mapping[str, Any]) -> Sigma | None:
         """Choose the standard deviation: None to estimate it, the given one, the file's, or 1."""

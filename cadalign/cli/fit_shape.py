@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cadalign.cli.fit import Fit
 
 _RANSAC = ("max_reproj_error", "seed")  # options that the search for inliers has here
+_SWITCHES = ("exif", "scale_prior")  # options that are on
 _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks
 
 
@@ -79,15 +80,13 @@ def _check_flags(command: Fit) -> None:
             fix="give one of the two options",
         )
     flag = "--shape" if command.shape is not None else "--shape-sigma"
-    changed = [name for name in ("similar", "focal", "exif") if _is_changed(command, name)]
-    changed += [name for name in ("method",) if _is_changed(command.fitting, name)]
-    if command.shape is not None:
-        changed += [name for name in _OF_THE_MODEL if _is_changed(command.fitting, name)]
+    changed = [name for name in ("similar", "focal", *_SWITCHES) if _is_changed(command, name)]
+    names = ["method", *(_OF_THE_MODEL if command.shape is not None else ())]
+    changed += [name for name in names if _is_changed(command.fitting, name)]
     names = [field.name for field in fields(command.ransac) if field.name not in _RANSAC]
     changed += [name for name in names if _is_changed(command.ransac, name)]
     for name in changed:
-        where = "--no-exif" if name == "exif" else "--" + name.replace("_", "-")
-        where = "--no-refine" if name == "refine" else where
+        where = ("--no-" if name in (*_SWITCHES, "refine") else "--") + name.replace("_", "-")
         raise InputError(
             f"has no effect together with {flag}", where=where, fix="leave out one of the two"
         )

@@ -12,7 +12,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError
 from cadalign.fitting.degeneracy import no_redundancy_error, solver_error
 from cadalign.fitting.focal.search import search_focal
-from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.noise import check_sigmas, rays_of, whitening_of
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.solutions import Solutions
@@ -48,6 +48,8 @@ def solve(
     if options.focal == "known":
         for camera in problems.cameras:
             camera.require_focal()
+    if options.method != "optimal":  # which would not notice
+        check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
     if options.method == "optimal":
         found = _solve_optimal(problems, options, points, sigmas)
     elif options.method == "aepnp":

@@ -13,7 +13,7 @@ from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.frame import LIGHT_GREY
+from cadalign.render.frame import LIGHT_GREY, check_image_size
 
 
 def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
@@ -27,12 +27,13 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
         camera,
         est_box=Box.from_model(_bounds(observation), result.alignment),
         observed=observation.points_2d,
-        reprojected=camera.project(result.alignment.apply(observation.points_3d)),
+        reprojected=camera.project_where_ahead(result.alignment.apply(observation.points_3d)),
     )
 
 
 def photo_of(observation: Observation, camera: Camera) -> ByteImage:
-    """The photo (h, w, 3), grey where there is none."""
+    """The photo (h, w, 3), grey where there is none; refuses images that are too large."""
+    check_image_size(camera)
     if observation.image is None:
         return np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
     return read_image(observation.image, camera)

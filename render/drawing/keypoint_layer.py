@@ -27,12 +27,13 @@ _LEAST_REGION = 3.0  # px across; smaller ones are hidden by the markers
 class KeypointMarks:
     """Keypoints to be drawn [px]; None for what is not.
 
-    ``seen`` and ``back`` (k, 2) belong together, row by row, ``unseen`` is (n, 2), and ``regions``
-    holds closed curves (r, j, 2).
+    ``seen`` (k, 2), ``back`` (m, 2) and ``unseen`` (n, 2) are points, ``residuals`` (r, 2, 2) lines
+    from one to another, and ``regions`` (q, j, 2) closed curves.
     """
 
     seen: FloatArray | None = None
     back: FloatArray | None = None
+    residuals: FloatArray | None = None
     unseen: FloatArray | None = None
     regions: FloatArray | None = None
 
@@ -46,16 +47,18 @@ class KeypointMarks:
     ) -> KeypointMarks:
         """The marks of `draw_overlay`'s arguments; raises InputError where they don't match."""
         seen = None if observed is None else as_points(observed, name="observed", dimension=2)
-        back = (
-            None if reprojected is None else as_points(reprojected, name="reprojected", dimension=2)
-        )
+        back = None
+        if reprojected is not None:
+            back = as_floats(reprojected, name="reprojected", shape=(None, 2), finite=False)
         if seen is not None and back is not None and len(seen) != len(back):
             raise InputError(
                 f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
             )
+        pairs = None if seen is None or back is None else _finite(np.stack([seen, back], axis=1))
         return cls(
             seen,
-            back,
+            None if back is None else _finite(back),
+            pairs,
             None if unseen is None else as_points(unseen, name="unseen", dimension=2),
             None if regions is None else as_floats(regions, name="regions", shape=(None, None, 2)),
         )
@@ -72,9 +75,8 @@ class KeypointMarks:
         canvas.blend_from(before, opacity=_REGION_OPACITY)
         for point in () if self.unseen is None else self.unseen:
             canvas.ring(point, UNSEEN_COLOR, radius=2.5)
-        if self.seen is not None and self.back is not None:
-            for pair in np.stack([self.seen, self.back], axis=1):
-                canvas.line(pair, REPROJECTED_COLOR, width=1.0)
+        for pair in () if self.residuals is None else self.residuals:
+            canvas.line(pair, REPROJECTED_COLOR, width=1.0)
         for point in () if self.seen is None else self.seen:
             canvas.ring(point, OBSERVED_COLOR, radius=5)
         for point in () if self.back is None else self.back:
@@ -102,7 +104,7 @@ class KeypointMarks:
 
     @property
     def _all(self) -> tuple[Any, ...]:
-        return self.seen, self.back, self.unseen, self.regions
+        return self.seen, self.back, self.residuals, self.unseen, self.regions
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -134,3 +136,8 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
     circle = np.stack([np.cos(angles), np.sin(angles)])
     axes = vectors[kept] * reach[kept, None, :]
     return np.asarray(points_2d[kept, None] + (axes @ circle).swapaxes(1, 2))
+
+
+def _finite(points: FloatArray) -> FloatArray:
+    """The rows that are finite, those behind the camera left out."""
+    return np.asarray(points[np.isfinite(points).reshape(len(points), -1).all(axis=1)])

@@ -83,7 +83,8 @@ def draw_overlay(
     model_style : str
         How to show it: ``translucent``, with its edges, or ``lines`` for the edges alone.
     observed, reprojected : (k, 2) float, optional
-        Keypoints [px]; if both are given they belong together, row by row.
+        Keypoints [px]; if both are given they belong together, row by row. Reprojected ones that
+        are not finite, behind the camera, are left out.
     unseen : (n, 2) float, optional
         Predicted keypoints that were not observed [px].
     regions : (r, j, 2) float, optional

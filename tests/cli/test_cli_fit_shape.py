@@ -257,6 +257,7 @@ def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ["--similar"],
         ["--focal", "known"],
         ["--no-exif"],
+        ["--no-scale-prior"],
         ["--method", "aepnp"],
         ["--no-refine"],
         ["--minimal", "aepnp"],

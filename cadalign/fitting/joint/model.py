@@ -11,11 +11,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points, is_number, read_only
 from cadalign.errors import InputError, quote
-from cadalign.fitting.options import FitOptions
+from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.geometry.mesh import Mesh
-
-SIMILAR_SCALE_SIGMA = 0.2
-"""Default deviation of the log scales of an object that is only similar to its model."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -93,7 +93,7 @@ def errors(problem: Problem, sigma: float) -> tuple[float, float]:
 def main(arguments: Arguments) -> None:
     """Print the median errors of every category and prior."""
     names = ["none" if np.isinf(sigma) else f"{sigma:g}" for sigma in arguments.sigmas]
-    table = new_table("Median rotation error [deg] / box IoU, by prior", "category", *names)
+    table = new_table("Median rotation error in degrees / box IoU, by prior", "category", *names)
     dataset = KeypointNet(arguments.root)
     for category in dataset.categories:
         models = dataset[category]
@@ -109,7 +109,7 @@ def main(arguments: Arguments) -> None:
         ]
         label = f"{category} ({len(problems)})"
         table.add_row(label, *(f"{angle:.1f} / {iou:.2f}" for angle, iou in cells))
-    Console().print(table)
+    Console(width=100).print(table)
 
 
 def _keypoints(model: AnnotatedModel) -> tuple[FloatArray, FloatArray]:

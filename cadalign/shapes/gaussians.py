@@ -1,20 +1,22 @@
 """Mixtures of Gaussians, learned from vectors with missing entries.
 
 Expectation maximisation as in Ghahramani and Jordan, "Supervised learning from incomplete data via
-an EM approach", NIPS 1994, with a prior on the covariances: that of a component is drawn towards a
-wider one by as much as `Shrinkage.strength` vectors count, so that components of few vectors, and
-entries that few vectors have, keep sensible covariances.
+an EM approach", NIPS 1994, with a prior that draws each covariance towards a wider one, so that
+components of few vectors keep sensible covariances.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from cadalign.arrays import FloatArray, IntArray
+
+_UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,30 @@ class Gaussians:
     weights: FloatArray
     means: FloatArray
     covariances: FloatArray
+
+    def widened(self, sigma: float) -> Gaussians:
+        """The distribution of the vectors with independent noise in every entry."""
+        noise = sigma**2 * np.eye(self.means.shape[1])
+        return Gaussians(self.weights, self.means, self.covariances + noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Prior on the covariances.
+
+    Parameters
+    ----------
+    covariance : (d, d) float
+        What the covariances are drawn towards.
+    strength : float
+        How many vectors it counts as.
+    floor : float
+        Standard deviation that no direction falls below.
+    """
+
+    covariance: FloatArray
+    strength: float
+    floor: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,182 +80,160 @@ class Pattern:
     values: FloatArray
 
 
-def patterns_of(vectors: FloatArray) -> list[Pattern]:
-    """Group vectors, (N, d) float with NaN for what is missing, by the entries that they have."""
-    seen = ~np.isnan(vectors)
-    kinds, kind_of = np.unique(seen, axis=0, return_inverse=True)
-    found = []
-    for number, kind in enumerate(kinds):
-        rows = np.flatnonzero(kind_of.ravel() == number)
-        entries = np.flatnonzero(kind)
-        values = vectors[np.ix_(rows, entries)]
-        found.append(Pattern(rows, entries, np.flatnonzero(~kind), values))
-    return found
-
-
-def log_densities(patterns: list[Pattern], count: int, model: Gaussians) -> FloatArray:
-    """Log of weight times density of every vector under every component, (N, g) float."""
-    found = np.empty((count, len(model.weights)))
-    for pattern in patterns:
-        for number, weight in enumerate(model.weights):
-            whitened, log_root = _whiten(pattern, model, number)
-            squares = (whitened**2).sum(axis=0)
-            constant = math.log(weight) - log_root - len(pattern.seen) / 2 * math.log(2 * math.pi)
-            found[pattern.rows, number] = constant - squares / 2
-    return found
-
-
-def log_likelihoods(vectors: FloatArray, model: Gaussians) -> FloatArray:
-    """Log density of each vector's entries under the mixture, (N,) float."""
-    densities = log_densities(patterns_of(vectors), len(vectors), model)
-    return np.asarray(np.logaddexp.reduce(densities, axis=1))
-
-
-def _whiten(pattern: Pattern, model: Gaussians, number: int) -> tuple[FloatArray, float]:
-    seen = pattern.seen
-    root = np.linalg.cholesky(model.covariances[number][np.ix_(seen, seen)])
-    offsets = pattern.values - model.means[number][seen]
-    whitened = solve_triangular(root, offsets.T, lower=True, check_finite=False)
-    return whitened, float(np.log(np.diag(root)).sum())
-
-
 @dataclass(frozen=True, eq=False)
-class Moments:
-    """Expected vectors and their scatter under one component.
+class Vectors:
+    """Weighted vectors with missing entries.
 
     Parameters
     ----------
-    vectors : (N, d) float
-        The vectors, what is missing replaced by its expectation.
-    spread : (d, d) float
-        Sum over the vectors of responsibility times the covariance of what is missing.
-    """
-
-    vectors: FloatArray
-    spread: FloatArray
-
-
-def expect(
-    patterns: list[Pattern], responsibilities: FloatArray, mean: FloatArray, covariance: FloatArray
-) -> Moments:
-    """Complete vectors by their expectations under one Gaussian."""
-    vectors = np.empty((len(responsibilities), len(mean)))
-    spread = np.zeros_like(covariance)
-    for pattern in patterns:
-        seen, missing = pattern.seen, pattern.missing
-        vectors[np.ix_(pattern.rows, seen)] = pattern.values
-        if not len(missing):
-            continue
-        root = np.linalg.cholesky(covariance[np.ix_(seen, seen)])
-        across = covariance[np.ix_(seen, missing)]
-        gain = cho_solve((root, True), across, check_finite=False)
-        offsets = pattern.values - mean[seen]
-        vectors[np.ix_(pattern.rows, missing)] = mean[missing] + offsets @ gain
-        rest = covariance[np.ix_(missing, missing)] - across.T @ gain
-        spread[np.ix_(missing, missing)] += responsibilities[pattern.rows].sum() * rest
-    return Moments(vectors, spread)
-
-
-@dataclass(frozen=True)
-class Shrinkage:
-    """Prior on the covariances.
-
-    Parameters
-    ----------
-    strength : float
-        How many vectors the prior counts as.
-    floor : float
-        Standard deviation that no direction falls below.
-    """
-
-    strength: float
-    floor: float
-
-
-def learn_gaussian(
-    vectors: FloatArray, weights: FloatArray, shrinkage: Shrinkage, rounds: int = 25
-) -> Gaussians:
-    """Learn one Gaussian from vectors with missing entries.
-
-    Parameters
-    ----------
-    vectors : (N, d) float
-        NaN for what is missing; every entry is there once at least.
+    values : (N, d) float
+        NaN for what is missing; every vector has an entry.
     weights : (N,) float
         How often each vector counts.
     """
-    patterns, count = patterns_of(vectors), len(vectors)
-    mean = np.nansum(weights[:, None] * vectors, axis=0)
-    mean /= np.where(np.isnan(vectors), 0.0, weights[:, None]).sum(axis=0)
-    width = np.nanmean((vectors - mean) ** 2) + shrinkage.floor**2
-    target = width * np.eye(len(mean))
-    covariance = target
+
+    values: FloatArray
+    weights: FloatArray
+
+    @cached_property
+    def patterns(self) -> tuple[Pattern, ...]:
+        """The vectors grouped by the entries that they have."""
+        kinds, kind_of = np.unique(~np.isnan(self.values), axis=0, return_inverse=True)
+        found = []
+        for number, kind in enumerate(kinds):
+            rows, seen = np.flatnonzero(kind_of.ravel() == number), np.flatnonzero(kind)
+            values = self.values[np.ix_(rows, seen)]
+            found.append(Pattern(rows, seen, np.flatnonzero(~kind), values))
+        return tuple(found)
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """Mean of each entry; of the entries that no vector has, the mean of all entries."""
+        missing = np.isnan(self.values)
+        totals = np.where(missing, 0.0, self.weights[:, None]).sum(axis=0)
+        sums = (self.weights[:, None] * np.where(missing, 0.0, self.values)).sum(axis=0)
+        overall = sums.sum() / totals.sum()
+        return np.asarray(np.where(totals > 0, sums / np.where(totals > 0, totals, 1.0), overall))
+
+    @property
+    def variance(self) -> float:
+        """Mean squared distance of the entries from their means."""
+        return float(np.nanmean((self.values - self.mean) ** 2))
+
+    def completed(self, model: Gaussians, number: int = 0) -> FloatArray:
+        """The vectors with their expected missing entries under a component, (N, d) float."""
+        return _expect(self, np.zeros(len(self.values)), model, number)[0]
+
+
+def log_likelihoods(values: FloatArray, model: Gaussians) -> FloatArray:
+    """Log density of the entries of vectors, (N, d) float, under a mixture; (N,) float."""
+    densities = _log_densities(Vectors(values, np.ones(len(values))), model)
+    return np.asarray(np.logaddexp.reduce(densities, axis=1))
+
+
+def learn_gaussian(vectors: Vectors, *, strength: float, floor: float, rounds: int) -> Gaussians:
+    """Learn one Gaussian; its covariance is drawn towards that of independent, equal entries."""
+    width = (vectors.variance + floor**2) * np.eye(vectors.values.shape[1])
+    start = Gaussians(np.ones(1), vectors.mean[None], width[None])
+    model, prior = start, Prior(width, strength, floor)
+    shares = vectors.weights[:, None]
     for _ in range(rounds):
-        moments = expect(patterns, weights, mean, covariance)
-        mean = weights @ moments.vectors / weights.sum()
-        covariance = _covariance(moments, mean, weights, shrinkage, target)
-    del count
-    return Gaussians(np.ones(1), mean[None], covariance[None])
+        model = _maximise(vectors, shares, model, prior)
+    return model
 
 
 def learn_mixture(
-    vectors: FloatArray,
-    weights: FloatArray,
-    responsibilities: FloatArray,
+    vectors: Vectors,
+    labels: IntArray,
     common: Gaussians,
-    shrinkage: Shrinkage,
-    rounds: int = 40,
+    *,
+    strength: float,
+    floor: float,
+    rounds: int,
 ) -> Gaussians:
-    """Learn a mixture from first responsibilities, (N, g) float.
+    """Learn a mixture from a first clustering.
 
-    Covariances are drawn towards that of ``common``, the Gaussian of all vectors.
+    Parameters
+    ----------
+    vectors : Vectors
+    labels : (N,) int
+        The component that each vector starts in.
+    common : Gaussians
+        The Gaussian of all vectors, towards which covariances are drawn.
+    strength, floor : float
+        See `Prior`.
+    rounds : int
     """
-    patterns = patterns_of(vectors)
-    count = responsibilities.shape[1]
-    target = common.covariances[0]
+    count = int(labels.max()) + 1
     model = Gaussians(
         np.full(count, 1 / count),
         np.repeat(common.means, count, axis=0),
         np.repeat(common.covariances, count, axis=0),
     )
+    prior = Prior(common.covariances[0], strength, floor)
+    responsibilities = np.eye(count)[labels]
     for turn in range(rounds):
         if turn:
-            densities = log_densities(patterns, len(vectors), model)
+            densities = _log_densities(vectors, model)
             densities -= np.logaddexp.reduce(densities, axis=1, keepdims=True)
             responsibilities = np.exp(densities)
-        model = _maximised(patterns, weights[:, None] * responsibilities, model, target, shrinkage)
+        shares = vectors.weights[:, None] * responsibilities
+        model = _maximise(vectors, shares, model, prior)
     return model
 
 
-def _maximised(
-    patterns: list[Pattern],
-    shares: FloatArray,
-    model: Gaussians,
-    target: FloatArray,
-    shrinkage: Shrinkage,
-) -> Gaussians:
+def _log_densities(vectors: Vectors, model: Gaussians) -> FloatArray:
+    """Log of weight times density of every vector under every component, (N, g) float."""
+    found = np.empty((len(vectors.values), len(model.weights)))
+    for pattern in vectors.patterns:
+        seen = pattern.seen
+        constant = len(seen) / 2 * math.log(2 * math.pi)
+        for number, (weight, mean) in enumerate(zip(model.weights, model.means, strict=True)):
+            root = np.linalg.cholesky(model.covariances[number][np.ix_(seen, seen)])
+            whitened = _solve(root, (pattern.values - mean[seen]).T)
+            volume = np.log(np.diag(root)).sum() + constant
+            squares = (whitened**2).sum(axis=0)
+            found[pattern.rows, number] = math.log(max(weight, 1e-300)) - volume - squares / 2
+    return found
+
+
+def _expect(
+    vectors: Vectors, shares: FloatArray, model: Gaussians, number: int
+) -> tuple[FloatArray, FloatArray]:
+    """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
+    mean, covariance = model.means[number], model.covariances[number]
+    completed, spread = np.empty_like(vectors.values), np.zeros_like(covariance)
+    for pattern in vectors.patterns:
+        seen, missing = pattern.seen, pattern.missing
+        completed[np.ix_(pattern.rows, seen)] = pattern.values
+        if not len(missing):
+            continue
+        root = np.linalg.cholesky(covariance[np.ix_(seen, seen)])
+        whitened = _solve(root, (pattern.values - mean[seen]).T)
+        across = _solve(root, covariance[np.ix_(seen, missing)])
+        completed[np.ix_(pattern.rows, missing)] = mean[missing] + whitened.T @ across
+        rest = covariance[np.ix_(missing, missing)] - across.T @ across
+        spread[np.ix_(missing, missing)] += shares[pattern.rows].sum() * rest
+    return completed, spread
+
+
+def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Prior) -> Gaussians:
+    """One round: the mixture that makes the completed vectors most likely."""
     means, covariances = [], []
     for number, share in enumerate(shares.T):
-        moments = expect(patterns, share, model.means[number], model.covariances[number])
-        # The prior's vectors lie at the mean of the component as it was: it stays where nobody is.
-        mean = share @ moments.vectors + 1e-6 * model.means[number]
-        mean /= share.sum() + 1e-6
+        completed, spread = _expect(vectors, share, model, number)
+        mean = share @ completed + _UNSEEN * model.means[number]
+        mean /= share.sum() + _UNSEEN
+        offsets = completed - mean
+        scatter = offsets.T @ (share[:, None] * offsets) + spread
+        scatter += (prior.strength + _UNSEEN) * prior.covariance
+        covariance = scatter / (share.sum() + prior.strength + _UNSEEN)
+        covariance[np.diag_indices_from(covariance)] += prior.floor**2
         means.append(mean)
-        covariances.append(_covariance(moments, mean, share, shrinkage, target))
-    totals = shares.sum(axis=0) + 1e-9
+        covariances.append(covariance)
+    totals = shares.sum(axis=0) + _UNSEEN
     return Gaussians(totals / totals.sum(), np.array(means), np.array(covariances))
 
 
-def _covariance(
-    moments: Moments,
-    mean: FloatArray,
-    weights: FloatArray,
-    shrinkage: Shrinkage,
-    target: FloatArray,
-) -> FloatArray:
-    offsets = moments.vectors - mean
-    scatter = offsets.T @ (weights[:, None] * offsets) + moments.spread
-    scatter += shrinkage.strength * target
-    covariance = scatter / (weights.sum() + shrinkage.strength)
-    covariance[np.diag_indices_from(covariance)] += shrinkage.floor**2
-    return np.asarray(covariance)
+def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(solve_triangular(root, right, lower=True, check_finite=False))

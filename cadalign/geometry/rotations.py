@@ -21,6 +21,19 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
+def vector_from_rotation(rotation: FloatArray) -> FloatArray:
+    """The rotation vector (3,) of a rotation matrix (3, 3): axis times angle, 0 to pi [rad].
+
+    Examples
+    --------
+    >>> vector_from_rotation(rotation_from_vector(np.array([0.1, -0.2, 0.3]))).round(12).tolist()
+    [0.1, -0.2, 0.3]
+    """
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
 

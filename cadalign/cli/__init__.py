@@ -19,6 +19,7 @@ from cadalign.cli.observe import Observe
 from cadalign.cli.render import Render
 from cadalign.cli.report import Report
 from cadalign.cli.retrieve import Retrieve
+from cadalign.cli.shape import ShapeCommand
 from cadalign.cli.simulate import Simulate
 from cadalign.errors import CadalignError
 
@@ -29,6 +30,7 @@ Command = (
     | Annotated[Annotate, tyro.conf.subcommand("annotate")]
     | Annotated[Retrieve, tyro.conf.subcommand("retrieve")]
     | Annotated[LibraryCommand, tyro.conf.subcommand("library")]
+    | Annotated[ShapeCommand, tyro.conf.subcommand("shape")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Report, tyro.conf.subcommand("report")]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from cadalign.arrays import FloatArray, IntArray
 
@@ -188,11 +188,11 @@ def _log_densities(vectors: Vectors, model: Gaussians) -> FloatArray:
     for pattern in vectors.patterns:
         seen = pattern.seen
         constant = len(seen) / 2 * math.log(2 * math.pi)
-        for number, (weight, mean) in enumerate(zip(model.weights, model.means, strict=True)):
-            root = np.linalg.cholesky(model.covariances[number][np.ix_(seen, seen)])
-            whitened = _solve(root, (pattern.values - mean[seen]).T)
-            volume = np.log(np.diag(root)).sum() + constant
-            squares = (whitened**2).sum(axis=0)
+        for number, weight in enumerate(model.weights):
+            root = _root(model.covariances[number][seen[:, None], seen])
+            whitened = _solve(root, (pattern.values - model.means[number][seen]).T)
+            volume = np.log(root.diagonal()).sum() + constant
+            squares = np.einsum("nr,nr->r", whitened, whitened)
             found[pattern.rows, number] = math.log(max(weight, 1e-300)) - volume - squares / 2
     return found
 
@@ -202,18 +202,17 @@ def _expect(
 ) -> tuple[FloatArray, FloatArray]:
     """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
     mean, covariance = model.means[number], model.covariances[number]
-    completed, spread = np.empty_like(vectors.values), np.zeros_like(covariance)
+    completed, spread = vectors.values.copy(), np.zeros_like(covariance)
     for pattern in vectors.patterns:
         seen, missing = pattern.seen, pattern.missing
-        completed[np.ix_(pattern.rows, seen)] = pattern.values
         if not len(missing):
             continue
-        root = np.linalg.cholesky(covariance[np.ix_(seen, seen)])
+        root = _root(covariance[seen[:, None], seen])
         whitened = _solve(root, (pattern.values - mean[seen]).T)
-        across = _solve(root, covariance[np.ix_(seen, missing)])
-        completed[np.ix_(pattern.rows, missing)] = mean[missing] + whitened.T @ across
-        rest = covariance[np.ix_(missing, missing)] - across.T @ across
-        spread[np.ix_(missing, missing)] += shares[pattern.rows].sum() * rest
+        across = _solve(root, covariance[seen[:, None], missing])
+        completed[pattern.rows[:, None], missing] = mean[missing] + whitened.T @ across
+        rest = covariance[missing[:, None], missing] - across.T @ across
+        spread[missing[:, None], missing] += shares[pattern.rows].sum() * rest
     return completed, spread
 
 
@@ -235,5 +234,16 @@ def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Pri
     return Gaussians(totals / totals.sum(), np.array(means), np.array(covariances))
 
 
+# SciPy's own checks would take longer than the factorisation of such small matrices.
+def _root(covariance: FloatArray) -> FloatArray:
+    """Lower Cholesky factor."""
+    root, info = dpotrf(covariance, lower=1, clean=1)
+    if info:
+        raise np.linalg.LinAlgError("a covariance is not positive definite")
+    return np.asarray(root)
+
+
 def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(solve_triangular(root, right, lower=True, check_finite=False))
+    """Solve with a lower Cholesky factor."""
+    solution, _ = dtrtrs(root, right, lower=1)
+    return np.asarray(solution)

@@ -6,6 +6,7 @@ finer detail would decide otherwise, though no photo tells it.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +32,14 @@ LEAST_MODELS = 4
 # Lengths relative to the models' median diagonal.
 _FLOOR = 1e-3
 _RESOLUTION = 5e-3  # 2 px where an object's diagonal has 400
+_UNLIKE = 0.01  # share of models
+_TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
+_MODE_TOLERANCE = 0.1  # modes cost next to nothing
 _FOLDS = 3
 _LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
-_MIXTURE_STRENGTH = 20.0
+_MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
 _CLUSTERINGS = 5
@@ -119,13 +123,41 @@ class _Models:
             rounds=_ROUNDS,
         )
 
-    def log_likelihoods(self, model: Gaussians) -> FloatArray:
-        """Log-likelihood of each model at the resolution of images, (N,) float."""
-        seen = model.widened(_RESOLUTION * self.size)
-        return log_likelihoods(self.rows.reshape(len(self.rows), -1), seen)
+    def log_likelihoods(self, mixture: Gaussians) -> FloatArray:
+        """Log-likelihood of each model at the resolution of images, (N,) float.
+
+        One model in a hundred is taken as unlike any other, so that a few of these, whose
+        likelihood may be of any order, don't decide between mixtures.
+        """
+        values = self.rows.reshape(len(self.rows), -1)
+        common = log_likelihoods(values, mixture.widened(_RESOLUTION * self.size))
+        broad = Gaussians(
+            np.ones(1),
+            mixture.means.mean(axis=0)[None],
+            self.size**2 * np.eye(values.shape[1])[None],
+        )
+        unlike = log_likelihoods(values, broad)
+        return np.logaddexp(math.log1p(-_UNLIKE) + common, math.log(_UNLIKE) + unlike)
 
 
-class _Trials:
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A recipe, what is learned by it without each fold, and how likely that makes the folds.
+
+    Parameters
+    ----------
+    recipe : _Recipe
+    learned : tuple of Gaussians
+    scores : (N,) float
+        Log-likelihood of each model under what was learned without its fold.
+    """
+
+    recipe: _Recipe
+    learned: tuple[Gaussians, ...]
+    scores: FloatArray
+
+
+class _CrossValidation:
     """Recipes compared by the likelihood of models that were held out."""
 
     def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
@@ -133,61 +165,49 @@ class _Trials:
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
         self._on_progress, self._done = on_progress, 0
 
-    def trained(self, recipe: _Recipe) -> list[Gaussians]:
-        """What is learned without each fold."""
-        return [
-            self._stepping(self._models.some(self._folds != fold).mixture(recipe))
-            for fold in range(_FOLDS)
-        ]
+    def choose(self, options: LearnOptions) -> tuple[_Recipe, int]:
+        """Choose a recipe and the number of modes."""
+        best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
+        if options.reflection:
+            best = self._with_reflection(best)
+        best = self._with_components(best, options.components)
+        return best.recipe, options.modes or self._modes(best)
 
-    def scores(self, learned: list[Gaussians]) -> FloatArray:
-        """Log-likelihood of each model under what was learned without its fold, (N,) float."""
+    def _with_reflection(self, best: _Trial) -> _Trial:
+        completed = self._models.completed()
+        mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
+        tried = [self._try(replace(best.recipe, reflection=each)) for each in mirrors]
+        mirrored = max(tried, key=_total)
+        # Twice as many models to learn from are worth a little.
+        return mirrored if _is_enough(mirrored.scores, best.scores, _TOLERANCE) else best
+
+    def _with_components(self, single: _Trial, wanted: int | None) -> _Trial:
+        if wanted is not None:
+            return self._try(replace(single.recipe, components=wanted))
+        counts = range(2, _MOST_COMPONENTS + 1)
+        tried = [single, *(self._try(replace(single.recipe, components=each)) for each in counts)]
+        return tried[_least_enough([each.scores for each in tried], _TOLERANCE)]
+
+    def _modes(self, trial: _Trial) -> int:
+        full = self._models.rows[0].size
+        counts = [*(count for count in _MODES if count < full), full]
+        parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
+        return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
+
+    def _try(self, recipe: _Recipe) -> _Trial:
+        learned = []
+        for fold in range(_FOLDS):
+            learned.append(self._models.some(self._folds != fold).mixture(recipe))
+            self._done += 1
+            self._on_progress(min(self._done, _STEPS - 1), _STEPS)
+        return _Trial(recipe, tuple(learned), self._scores(learned))
+
+    def _scores(self, learned: Sequence[Gaussians]) -> FloatArray:
         found = np.empty(len(self._folds))
         for fold, mixture in enumerate(learned):
             held_out = self._folds == fold
             found[held_out] = self._models.some(held_out).log_likelihoods(mixture)
         return found
-
-    def _stepping(self, learned: Gaussians) -> Gaussians:
-        self._done += 1
-        self._on_progress(min(self._done, _STEPS - 1), _STEPS)
-        return learned
-
-    def recipe(self, options: LearnOptions) -> _Recipe:
-        """Choose strength, reflection and number of components, in this order."""
-        candidates = [_Recipe(strength=strength) for strength in _STRENGTHS]
-        scored = [(self.scores(self.trained(each)), each) for each in candidates]
-        scores, best = max(scored, key=_total)
-        if options.reflection:
-            completed = self._models.completed()
-            mirrors = [find_reflection(completed, self._models.ids, axis) for axis in range(3)]
-            candidates = [replace(best, reflection=each) for each in mirrors]
-            scored = [(self.scores(self.trained(each)), each) for each in candidates]
-            mirrored = max(scored, key=_total)
-            # Of models about equally likely the symmetric one says more.
-            if _gain(mirrored[0], scores) > -1:
-                scores, best = mirrored
-        if options.components is not None:
-            return replace(best, components=options.components)
-        for count in range(2, _MOST_COMPONENTS + 1):
-            candidate = replace(best, components=count)
-            tried = self.scores(self.trained(candidate))
-            if _gain(tried, scores) < 1:
-                break
-            scores, best = tried, candidate
-        return best
-
-    def modes(self, recipe: _Recipe) -> int:
-        """Choose the least number of modes that is about as likely as any."""
-        learned = self.trained(recipe)
-        full = self._models.rows[0].size
-        counts = [*(count for count in _MODES if count < full), full]
-        scores = [self.scores([_truncated(each, count) for each in learned]) for count in counts]
-        best = max(scores, key=lambda each: float(each.sum()))
-        enough = (
-            count for count, each in zip(counts, scores, strict=True) if _gain(each, best) >= -1
-        )
-        return int(next(enough, full))
 
 
 def learn_components(
@@ -202,11 +222,10 @@ def learn_components(
     # Threads of the linear algebra library make products of such small matrices 30 times slower.
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
-            recipe, modes = _Recipe(components=options.components or 1), options.modes
+            recipe = _Recipe(components=options.components or 1)
+            modes = options.modes
         else:
-            trials = _Trials(models, on_progress)
-            recipe = trials.recipe(options)
-            modes = options.modes or trials.modes(recipe)
+            recipe, modes = _CrossValidation(models, on_progress).choose(options)
         mixture = models.mixture(recipe)
     on_progress(_STEPS, _STEPS)
     return Learned(_components(mixture, modes), recipe.reflection)
@@ -256,12 +275,19 @@ def _truncated(mixture: Gaussians, modes: int) -> Gaussians:
     return Gaussians(mixture.weights, mixture.means, np.array(parts))
 
 
-def _total(scored: tuple[FloatArray, _Recipe]) -> float:
-    return float(scored[0].sum())
+def _total(trial: _Trial) -> float:
+    """Log-likelihood of all models."""
+    return float(trial.scores.sum())
 
 
-def _gain(scores: FloatArray, others: FloatArray) -> float:
-    """Mean of the paired differences, in units of its standard error."""
-    gains = scores - others
-    error = float(gains.std() / np.sqrt(len(gains)))
-    return float(gains.mean()) / error if error > 0 else 0.0
+def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
+    """The first that makes the models about as likely as any other."""
+    best = max(scores, key=np.sum)
+    enough = [row for row, each in enumerate(scores) if _is_enough(each, best, tolerance)]
+    return enough[0]
+
+
+def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
+    """Whether models are less likely by no more than a tolerance or the standard error."""
+    losses = best - scores
+    return float(losses.mean()) <= max(tolerance, float(losses.std()) / math.sqrt(len(losses)))

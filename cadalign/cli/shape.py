@@ -1,0 +1,169 @@
+"""`cadalign shape`: learn and inspect shape models."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from cadalign.cli.options import JsonOption
+from cadalign.cli.output import make_folder, new_console
+
+if TYPE_CHECKING:
+    from cadalign.shapes.model import ShapeModel
+
+_MODES = 5  # whose share of the variance is listed
+
+
+@dataclass(frozen=True)
+class ShapeLearn:
+    """Learn the shapes of a category from a data set's annotated models, as one file."""
+
+    root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
+    """Folder in KeypointNet's layout."""
+    category: str
+    """Category to learn, such as chair."""
+    out: Path | None = None
+    """File to write; by default <category>.shape."""
+    split: str | None = None
+    """Split of the data set to learn from, such as train; all models by default."""
+    shapenet: Path | None = None
+    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
+    components: int | None = None
+    """Number of Gaussians; chosen by the likelihood of held-out models by default."""
+    modes: int | None = None
+    """Number of modes of each; chosen likewise by default."""
+
+    def run(self) -> int:
+        """Learn the model; returns the exit code."""
+        from rich.progress import Progress
+
+        from cadalign.datasets import KeypointNet
+        from cadalign.shapes.model import ShapeModel
+
+        console = new_console()
+        dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task(f"learning {self.category}", total=None)
+            model = ShapeModel.from_dataset(
+                dataset,
+                self.category,
+                split=self.split,
+                components=self.components,
+                modes=self.modes,
+                on_progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )
+        out = Path(f"{model.category}.shape") if self.out is None else self.out
+        make_folder(out.absolute().parent)
+        model.save(out)
+        console.print(_text(model), markup=False)
+        console.print(f"Written: {out} ({out.stat().st_size / 1e6:.1f} MB)", markup=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class ShapeShow(JsonOption):
+    """Describe a shape model and draw its mean and its first modes."""
+
+    shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
+    """File that `cadalign shape learn` wrote."""
+    out: Path | None = None
+    """Picture to write; by default <shape>.png beside the file."""
+
+    def run(self) -> int:
+        """Open the model and describe it; returns the exit code."""
+        from cadalign.render.drawing.shape_picture import draw_shape
+        from cadalign.shapes.model import ShapeModel
+
+        model = ShapeModel.open(self.shape)
+        out = self.shape.with_suffix(".png") if self.out is None else self.out
+        make_folder(out.absolute().parent)
+        draw_shape(out, model)
+        console = new_console(stderr=False)
+        if self.json:
+            console.print_json(json.dumps({**_summary(model), "picture": str(out)}))
+        else:
+            console.print(_text(model), markup=False)
+            console.print(f"Written: {out}", markup=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class ShapeCommand:
+    """Learn and inspect the shapes of categories."""
+
+    shape: (
+        Annotated[ShapeLearn, tyro.conf.subcommand("learn")]
+        | Annotated[ShapeShow, tyro.conf.subcommand("show")]
+    )
+
+    def run(self) -> int:
+        """Run the chosen command; returns its exit code."""
+        return self.shape.run()
+
+
+def _summary(model: ShapeModel) -> dict[str, Any]:
+    """Numbers of a shape model, for JSON and for its text."""
+    training, mirror = model.training, model.reflection
+    counts = None
+    if training is not None:
+        seen = np.isfinite(training.points_3d[..., 0]).sum(axis=0)
+        counts = {str(label): int(count) for label, count in zip(model.ids, seen, strict=True)}
+    return {
+        "category": model.category,
+        "unit": model.unit,
+        "up_axis": model.up_axis,
+        "keypoints": len(model.ids),
+        "models": None if training is None else len(training),
+        "models_with_keypoint": counts,
+        "reflection": None
+        if mirror is None
+        else {"axis": mirror.axis, "offset": mirror.offset, "pairs": mirror.pairs},
+        "components": [
+            {
+                "weight": each.weight,
+                "modes": len(each.modes),
+                "sigma": float(np.sqrt(np.diag(each.covariance).mean())),
+                "residual_sigma": each.residual_sigma,
+                "variance_shares": (
+                    each.variance / max(np.trace(each.covariance), 1e-300)
+                ).tolist(),
+            }
+            for each in model.components
+        ],
+    }
+
+
+def _text(model: ShapeModel) -> str:
+    """A shape model in lines."""
+    summary = _summary(model)
+    models = "given" if summary["models"] is None else f"learned from {summary['models']} models"
+    lines = [
+        f"{model.category}: {len(model.ids)} keypoints, {models}; lengths in {model.unit}",
+        f"  up axis      {model.up_axis or 'unknown'}",
+    ]
+    mirror = model.reflection
+    if mirror is not None:
+        pairs = ", ".join(f"{first}-{second}" for first, second in mirror.pairs)
+        lines.append(f"  reflection   across {mirror.axis}, pairs {pairs or 'none'}")
+    for number, each in enumerate(summary["components"], start=1):
+        shares = each["variance_shares"]
+        listed = ", ".join(f"{100 * share:.0f}" for share in shares[:_MODES])
+        lines.append(
+            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes; the first "
+            f"{len(shares[:_MODES])} hold {listed} % of the variance; standard deviation of a "
+            f"coordinate {each['sigma']:.3g}, {each['residual_sigma']:.2g} besides the modes"
+        )
+    counts = summary["models_with_keypoint"]
+    if counts is not None:
+        rare = [
+            f"{label} ({count})"
+            for label, count in counts.items()
+            if count < len(model.training or ()) / 4
+        ]
+        lines.append(f"  rare keypoints (models that have it): {', '.join(rare) or 'none'}")
+    return "\n".join(lines)

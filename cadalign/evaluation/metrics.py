@@ -190,8 +190,15 @@ ROTATION_90 = replace(
     head="R error, 90 %",
     symbol="R90",
 )
+BEST_ROTATION = replace(
+    ROTATION,
+    key="best_rotation_error_deg",
+    label="rotation error of the best alternative",
+    head="R error, best alternative",
+    symbol="best R",
+)
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
-"""Root mean square, in the model's frame, of a method's estimate of all keypoints."""
+"""Root mean square, up to scale, of a method's estimate of all keypoints."""
 # Shares of the truths within regions of a stated probability.
 _COVERED = replace(_RATE, digits=0, better=None)
 ROTATION_IN_68 = replace(

@@ -30,7 +30,8 @@ from cadalign.evaluation.summary import (
 )
 
 _MEDIANS = (
-    *(metrics.ROTATION, metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
+    *(metrics.ROTATION, metrics.BEST_ROTATION),
+    *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
     *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
 )
 _COVERAGE = (
@@ -61,6 +62,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     shown = (
         *(metrics.INSTANCES, metrics.FAILED),
         *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
+        replace(metrics.BEST_ROTATION, digits=2),
         *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
         *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
     )

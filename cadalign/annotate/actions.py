@@ -202,5 +202,7 @@ def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:
 def _inside(uv: Pixel, state: PhotoState) -> Pixel:
     """Refuse a place outside the photo."""
     if not state.intrinsics.camera.contains(np.array([uv]))[0]:
-        raise InputError(f"({uv[0]:.1f}, {uv[1]:.1f}) is outside the photo", where="uv")
+        raise InputError(
+            f"({uv[0]:.1f}, {uv[1]:.1f}) is outside the photo", where="uv", fix="place it inside"
+        )
     return uv

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.outliers import Rows, find_outliers
 from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit
+from cadalign.fitting.outliers import Rows, find_outliers
 from cadalign.fitting.result import FitResult
 
 LEAST_PAIRS = 4
@@ -23,31 +26,23 @@ _LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, if the pairs leave
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
-    """Alignment of the pairs placed so far, as `cadalign fit` finds it.
+    """Alignment of the pairs placed so far.
 
     It is provisional if the pairs alone did not suffice: stretch or focal length were assumed.
     """
 
-    result: FitResult | None  # None without enough pairs, or if they are degenerate
+    result: FitResult | None  # at the given sigma; None without enough pairs, or degenerate ones
+    cautious: FitResult | None  # as shown and saved: at a sigma that explains the residuals
     message: str  # reason for a missing result, or an assumption that was made
     outliers: dict[int, float]  # see `find_outliers`
     sigma: float  # of the pairs [px], larger if the residuals are
     provisional: bool
+    fit_options: Mapping[str, Any]  # with which `cadalign fit` finds ``cautious``
 
     @classmethod
     def missing(cls, message: str) -> LiveAlignment:
         """No alignment, for the reason that the message gives."""
-        return cls(None, message, {}, _LEAST_SIGMA, provisional=False)
-
-    @property
-    def cautious(self) -> FitResult | None:
-        """The result with its covariance scaled to the residuals, where they exceed 1 px.
-
-        A model that is only similar to the object has larger residuals than the clicks' noise.
-        """
-        if self.result is None or self.result.covariance is None:
-            return self.result
-        return replace(self.result, covariance=self.result.covariance * self.sigma**2)
+        return cls(None, None, message, {}, _LEAST_SIGMA, provisional=False, fit_options={})
 
 
 def align(
@@ -64,33 +59,51 @@ def align(
         return LiveAlignment.missing(
             f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
-    fitter = _Fitter(points_3d, points_2d, sigma, intrinsics, choice, None)
+    fitter = _Fitter(points_3d, points_2d, intrinsics, choice, None)
+    given = _LEAST_SIGMA if sigma is None else sigma
     message = ""
     if not choice.known and count <= LEAST_PAIRS:
         fitter = replace(fitter, choice=replace(choice, known=True))
         message = "With 4 pairs the focal length is assumed; it is estimated from 5 pairs on."
     try:
-        result = fitter.fit()
+        result = fitter.fit(given)
     except DegenerateError as error:
         message = f"The stretch shown is assumed: {error.what}. Add a pair elsewhere."
         fitter = replace(fitter, scale_prior_sigma=_LIKELY_STRETCH)
         try:
-            result = fitter.fit()
+            result = fitter.fit(given)
         except CadalignError:
             return LiveAlignment.missing(f"No alignment yet: {error.what}.")
     except CadalignError as error:
         return LiveAlignment.missing(f"No alignment: {error}.")
     unknowns = 8 if result.covariance is None else len(result.covariance)
-    whitened = result.residuals if sigma is None else result.residuals / sigma[:, None]
-    redundancy = 2 * count - unknowns
-    estimated = np.sqrt(float((whitened**2).sum()) / redundancy) if redundancy > 0 else 0.0
+    estimated = _estimate_sigma(result, sigma, redundancy=2 * count - unknowns)
+    cautious, options = result, dict[str, Any]()
+    if estimated > _LEAST_SIGMA:
+        # A model that is only similar to the object has larger residuals than the clicks' noise.
+        scaled = None if sigma is None else estimated * sigma
+        options = {"sigma": None if scaled is None else scaled.tolist()}
+        try:
+            cautious = fitter.fit(scaled)
+        except CadalignError as error:
+            return LiveAlignment.missing(f"No alignment: {error}.")
     return LiveAlignment(
         result=result,
+        cautious=cautious,
         message=message,
         outliers=find_outliers(points_3d, points_2d, fitter.fit_rows, unknowns=unknowns),
-        sigma=max(_LEAST_SIGMA, float(estimated)),
+        sigma=max(_LEAST_SIGMA, estimated),
         provisional=bool(message),
+        fit_options={} if message else options,
     )
+
+
+def _estimate_sigma(result: FitResult, sigma: FloatArray | None, *, redundancy: int) -> float:
+    """Estimate the common factor of the sigmas, by default 1 px, from the residuals."""
+    if redundancy <= 0:
+        return 0.0
+    whitened = result.residuals if sigma is None else result.residuals / sigma[:, None]
+    return math.sqrt(float((whitened**2).sum()) / redundancy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +112,16 @@ class _Fitter:
 
     points_3d: FloatArray
     points_2d: FloatArray
-    sigma: FloatArray | None
     intrinsics: Intrinsics
     choice: FocalChoice
     scale_prior_sigma: float | None
 
-    def fit(self) -> FitResult:
-        """Fit all pairs as `cadalign fit` does."""
-        sigma = 1.0 if self.sigma is None else self.sigma
+    def fit(self, sigma: float | FloatArray | None) -> FitResult:
+        """Fit all pairs as `cadalign fit` does, with one sigma or (n,) [px], or to be estimated."""
         return self._fit(np.arange(len(self.points_3d)), sigma, "linear")
 
     def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
-        """Fit some pairs; see `cadalign.annotate.outliers.FitRows`."""
+        """Fit some pairs; see `cadalign.fitting.outliers.FitRows`."""
         result = self._fit(rows, _LEAST_SIGMA, "linear")
         if robust:
             # sigma=None iterates until nothing changes, which takes ten times as long.
@@ -120,7 +131,7 @@ class _Fitter:
                 result = self._fit(rows, sigma, "cauchy")
         return result
 
-    def _fit(self, rows: Rows, sigma: float | FloatArray, loss: str) -> FitResult:
+    def _fit(self, rows: Rows, sigma: float | FloatArray | None, loss: str) -> FitResult:
         return fit(
             self.points_3d[rows],
             self.points_2d[rows],

@@ -8,16 +8,19 @@ Beside the observation `photo.json` there may be
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cadalign.annotate.document import Document, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.names import unfinished_file
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.model_keypoints import SUFFIX, ModelKeypoint, ModelKeypoints
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
@@ -29,13 +32,15 @@ from cadalign.io.documents import (
     convert,
     in_file,
     path_from,
-    read_document,
     read_json,
 )
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 
+logger = logging.getLogger("cadalign")
+
 _UNFINISHED = "cadalign unfinished pairs"
+_RENAME = "rename it: the annotator writes a file of this name"
 SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
 
@@ -47,7 +52,7 @@ class _Half(Labelled, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.uv is None and self.semantic_id is None:
-            raise InputError("uv and semantic_id are both missing")
+            raise InputError("uv and semantic_id are both missing", fix="give one of them")
 
 
 class _Unfinished(JsonDocument):
@@ -68,7 +73,7 @@ class AnnotationFiles:
     @property
     def unfinished(self) -> Path:
         """File of the pairs with only one half placed."""
-        return self.observation.with_name(f"{self.observation.stem}.unfinished.json")
+        return unfinished_file(self.observation)
 
     @property
     def fit(self) -> Path:
@@ -85,12 +90,20 @@ class AnnotationFiles:
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
+            self._warn_of_options(observation)
             document = _document_of(observation, registry, diagonal)
         if self.unfinished.exists():
             document = _with_halves(document, self.unfinished, registry)
+        self._refuse_other_fit()
         return document, camera
 
-    def write(self, document: Document, registry: KeypointRegistry, camera: Camera) -> None:
+    def write(
+        self,
+        document: Document,
+        registry: KeypointRegistry,
+        camera: Camera,
+        fit_options: Mapping[str, Any],
+    ) -> None:
         """Write the photo's observation and its unfinished pairs; raises DataError on failure."""
         pairs = document.complete_pairs
         keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
@@ -104,6 +117,7 @@ class AnnotationFiles:
             confidences=filled(pair.confidence for pair in pairs),
             image=self.image,
             model=self.model,
+            fit_options=fit_options,
         )
         observation.save(self.observation)
         halves = [pair for pair in document.pairs if not pair.complete]
@@ -125,6 +139,27 @@ class AnnotationFiles:
                 return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
+
+    def _warn_of_options(self, observation: Observation) -> None:
+        """Warn of stored options of the fit that the page does not use."""
+        options = observation.fit_options.items()
+        others = [name for name, value in options if name != "sigma" or isinstance(value, float)]
+        if others:
+            logger.warning(
+                "%s: the annotator fits without the stored %s, and replaces the stored options "
+                "at the first change; keep a copy of the file if they matter",
+                *(self.observation, ", ".join(others)),
+            )
+
+    def _refuse_other_fit(self) -> None:
+        """Refuse a file in the alignment's place that is something else, before it is replaced."""
+        folder = self.fit.parent
+        if folder.exists() and not folder.is_dir():
+            raise DataError("not a folder", where=str(folder), fix=_RENAME)
+        if self.fit.exists():
+            data = read_json(self.fit)
+            if not isinstance(data, dict) or "alignment" not in data:
+                raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
@@ -161,11 +196,6 @@ def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
         where=str(where),
         fix="give another --observation or --out",
     )
-
-
-def keypoints_file(model: Path, folder: Path) -> Path:
-    """Path of a model's keypoints file in a folder."""
-    return folder / f"{model.stem}{SUFFIX}"
 
 
 def write_keypoints(
@@ -219,7 +249,11 @@ def _registered(
 
 
 def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> Document:
-    data = read_document(path, _Unfinished)
+    found = read_json(path)
+    if isinstance(found, dict) and "pairs" not in found:
+        raise DataError(f"not a file of {_UNFINISHED}", where=str(path), fix=_RENAME)
+    with in_file(path):
+        data: _Unfinished = convert(found, _Unfinished)
     if data.format != _UNFINISHED:
         raise DataError(
             f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to start without them"

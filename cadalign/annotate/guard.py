@@ -37,9 +37,14 @@ class Access:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
     @property
+    def address(self) -> str:
+        """Address of the page, for browsers that have the cookie."""
+        return f"http://127.0.0.1:{self.port}/"
+
+    @property
     def url(self) -> str:
         """Address of the page with the token."""
-        return f"http://127.0.0.1:{self.port}/?token={self.token}"
+        return f"{self.address}?token={self.token}"
 
     @property
     def cookie(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from typing import Any
 
@@ -38,7 +39,7 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
                 "trouble": state.save_error,
             },
             "selected": outcome.selected,
-            "message": outcome.message,
+            "message": outcome.message or _moved(state),
             "can_undo": state.history.can_undo,
             "can_redo": state.history.can_redo,
             "focal": {
@@ -52,6 +53,18 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
             "alignment": _alignment(session, live),
             "suggestion": _suggestion(session, suggestion),
         }
+
+
+def _moved(state: PhotoState) -> str:
+    """Say that the photo or the model is no longer where it was; empty while both are."""
+    files = state.files
+    gone = [path.name for path in (files.image, files.model) if not os.path.exists(path)]
+    if not gone:
+        return ""
+    return (
+        f"{' and '.join(gone)}: moved, renamed or deleted. Go on here, or start anew with the new "
+        f"name and --observation {files.observation.name}."
+    )
 
 
 def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
@@ -69,8 +82,8 @@ def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dic
             "off": None,
         }
         if pair.complete:
-            if live.result is not None:
-                residual = live.result.residuals[row]
+            if live.cautious is not None:
+                residual = live.cautious.residuals[row]
                 entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
                 entry["off"] = live.outliers.get(row)
             row += 1
@@ -92,7 +105,7 @@ def _keypoints(session: Session, state: PhotoState) -> list[dict[str, Any]]:
 
 
 def _alignment(session: Session, live: LiveAlignment) -> dict[str, Any]:
-    result = live.result
+    result = live.cautious
     if result is None:
         return {"status": "none" if session.ready else "preparing", "message": live.message}
     camera = result.camera

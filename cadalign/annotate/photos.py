@@ -14,6 +14,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, read_json
+from cadalign.io.files import reading
 from cadalign.io.images import open_photo, photo_size
 from cadalign.render.views.camera_files import read_camera_views
 
@@ -57,8 +58,11 @@ class Photo:
 
 def find_photos(path: Path) -> list[Path]:
     """List the photos of a folder by name, or the given photo."""
-    if path.is_dir():
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS and p.is_file())
+    with reading(path):
+        in_folder, exists = path.is_dir(), path.exists()
+        entries = list(path.iterdir()) if in_folder else []
+    if in_folder:
+        found = sorted(p for p in entries if p.suffix.lower() in ENDINGS and p.is_file())
         if not found:
             raise InputError(
                 "there are no photos in this folder",
@@ -66,7 +70,7 @@ def find_photos(path: Path) -> list[Path]:
                 fix=f"file names of photos end in {', '.join(ENDINGS)}",
             )
         return found
-    if not path.exists():
+    if not exists:
         raise DataError("no such file or folder", where=str(path))
     return [path]
 
@@ -105,7 +109,9 @@ class Intrinsics:
 
 def read_camera(path: Path) -> Camera:
     """Read a camera in COLMAP's form, or the first one of an Open3D, NeRF or COLMAP file."""
-    if not path.is_dir():
+    with reading(path):
+        in_folder = path.is_dir()
+    if not in_folder:
         data = read_json(path)
         if isinstance(data, dict) and "params" in data:
             with in_file(path):

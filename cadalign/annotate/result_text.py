@@ -91,15 +91,16 @@ def _stretch(result: FitResult, axis: str) -> Fact:
 def _distance(result: FitResult) -> Fact:
     translation = result.alignment.translation
     distance = float(np.linalg.norm(translation))
-    if result.covariance is None or not distance > 0:
+    covariance = result.posterior_covariance
+    if covariance is None or not distance > 0:
         return Fact("Distance", f"{distance:.3g} model units", "")
     along = translation / distance
-    std = math.sqrt(max(float(along @ result.covariance[3:6, 3:6] @ along), 0.0))
+    std = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
     return Fact("Distance", f"{distance:.3g} ± {_short(std)}", "model units")
 
 
 def _focal(result: FitResult) -> Fact:
-    focal, covariance = result.camera.fx, result.covariance
+    focal, covariance = result.camera.fx, result.posterior_covariance
     if covariance is None or len(covariance) < 9:
         return Fact("Focal length", f"{focal:.0f} px", "taken as known")
     relative = math.sqrt(max(float(covariance[8, 8]), 0.0))

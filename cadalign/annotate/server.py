@@ -99,13 +99,15 @@ class _Routes:
 
     async def act(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            raise InputError("the content type is not application/json", where="content-type")
+            raise InputError(
+                "not application/json", where="content-type", fix="send an action as JSON"
+            )
         try:
             action = json.loads(await request.body())
         except (ValueError, RecursionError):
-            raise InputError("the body is not JSON", where="body") from None
+            raise InputError("not JSON", where="body", fix="send an action as JSON") from None
         if not isinstance(action, dict):
-            raise InputError("the body is not a JSON object", where="body")
+            raise InputError("not a JSON object", where="body", fix="send an action as JSON")
         return await self._answer(request.path_params["number"], action)
 
     async def _answer(self, number: int, action: dict[str, Any] | None) -> Response:

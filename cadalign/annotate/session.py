@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from cadalign.annotate.model import CadModel
 from cadalign.annotate.photos import Intrinsics, Photo
 from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.annotate.wireframe import Wireframe
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, InputError, quote
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.io.documents import convert
 
@@ -55,6 +55,7 @@ class Session:
     registry: KeypointRegistry
     photos: list[PhotoState]
     keypoints_path: Path  # file to which the model's keypoints are written
+    before_saving: Callable[[], None]  # raises a CadalignError where nothing may be written
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 
     def __post_init__(self) -> None:
@@ -112,7 +113,9 @@ class Session:
             kind = ACTIONS.get(name) if isinstance(name, str) else None
             if kind is None:
                 raise InputError(
-                    f"{name!r} is not an action", where="do", fix=f"known are {', '.join(ACTIONS)}"
+                    f"{quote(name)} is not an action",
+                    where="do",
+                    fix=f"known are {', '.join(ACTIONS)}",
                 )
             before = state.document
             outcome: Outcome = convert(action, kind).apply(self, state)
@@ -121,18 +124,48 @@ class Session:
             return outcome
 
     def save(self, state: PhotoState) -> None:
-        """Write the files of a photo and of the model; an error is kept for the page."""
+        """Write the files of a photo and of the model; an error is kept for the page.
+
+        Photos that could not be written before are written too.
+        """
+        self._write(state)
+        if not state.save_error:
+            for other in self.unsaved:
+                self._write(other)
+
+    @property
+    def unsaved(self) -> list[PhotoState]:
+        """Photos whose last change could not be written."""
+        return [state for state in self.photos if state.save_error]
+
+    def save_unsaved(self, folder: Path | None = None) -> None:
+        """Write the photos that could not be written, if given into another folder from now on."""
+        with self.lock:
+            unsaved = self.unsaved
+            if folder is not None:
+                self.before_saving = lambda: None
+                self.keypoints_path = folder / self.keypoints_path.name
+                for state in unsaved:
+                    path = folder / state.files.observation.name
+                    state.files = replace(state.files, observation=path)
+            for state in unsaved:
+                self._write(state)
+
+    def _write(self, state: PhotoState) -> None:
         document = state.document
         ready = self.ready  # asked first: it may become so at any time
         state.fit_pending = not ready
         live, _ = self.live(state)
         # An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
-        result = None if live.provisional else live.result
+        result = None if live.provisional else live.cautious
         used = frozenset[int]().union(*(other.document.keypoints for other in self.photos))
         try:
+            self.before_saving()
             # First the keypoints, which the observation names.
             write_keypoints(self.keypoints_path, self.registry, used, state.files.model)
-            state.files.write(document, self.registry, state.intrinsics.to_write(document.focal))
+            state.files.write(
+                document, self.registry, state.intrinsics.to_write(document.focal), live.fit_options
+            )
             if ready:
                 state.files.write_fit(result)
         except CadalignError as error:

@@ -47,7 +47,8 @@ def suggest(
 ) -> Suggestion | None:
     """Choose among the visible keypoints that are not used; if none is left, among corners."""
     result = live.cautious
-    if result is None or result.covariance is None:
+    covariance = None if result is None else result.posterior_covariance
+    if result is None or covariance is None:
         return None
     camera, alignment = result.camera, result.alignment
     own = [point for number, point in registry if number not in used]
@@ -59,7 +60,7 @@ def suggest(
             continue
         points = np.array([point.xyz for point in candidates])
         seen = np.flatnonzero(visible_keypoints(model.scene, points, camera, alignment))
-        next_best = find_next_best(points[seen], camera, alignment, result.covariance, live.sigma)
+        next_best = find_next_best(points[seen], camera, alignment, covariance, live.sigma)
         if next_best is not None:
             chosen = seen[next_best.row]
             ((u, v),) = camera.project(alignment.apply(points[chosen : chosen + 1])).tolist()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
@@ -59,6 +60,9 @@ class Fit(ObservationCommand):
     """Focal length: known (the file's) or estimate; by default known, if the file has one."""
     exif: bool = True
     """Use the photo's EXIF data as a prior on an estimated focal length."""
+    stored: bool = True
+    """Take the options that the file stores, except for those that flags set to another value than
+    their defaults; with --no-stored flags alone count."""
     fitting: tyro.conf.OmitArgPrefixes[_FitOptions] = _FitOptions()
     ransac: tyro.conf.OmitArgPrefixes[_RansacOptions] = _RansacOptions()
 
@@ -72,17 +76,12 @@ class Fit(ObservationCommand):
 
         observation = Observation.load(self.observation)
         console = new_console()
-        focal = self.focal or ("known" if observation.camera.focal_known else "estimate")
-        prior = None
-        if focal == "estimate" and self.exif and observation.image is not None:
-            prior = FocalPrior.from_exif(observation.image)
+        options = self._options(observation)
+        prior = options.focal_prior
         if prior is not None:
             share = 100 * prior.relative_sigma
             text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
             console.print(text, markup=False)
-        options = replace(
-            self.fitting, sigma=self._sigma(observation), focal=focal, focal_prior=prior
-        )
         status = console.status("fitting (the first time after an installation takes a minute)")
         with status, named_as_flags(self, options):
             result = fit(
@@ -106,7 +105,28 @@ class Fit(ObservationCommand):
             console.print(f"Picture: {out / 'overlay.png'}", markup=False)
         return 0
 
-    def _sigma(self, observation: Observation) -> Sigma | None:
+    def _options(self, observation: Observation) -> FitOptions:
+        """Options of the fit: those of the flags, otherwise those of the file."""
+        from cadalign.io.documents import in_file, within
+
+        given = observation.fit_options if self.stored else {}
+        with in_file(self.observation), within("fit"):
+            stored = FitOptions(**given)
+        set_by_flags = {
+            field.name: getattr(self.fitting, field.name)
+            for field in fields(self.fitting)
+            if getattr(self.fitting, field.name) != field.default
+        }
+        known = "known" if observation.camera.focal_known else "estimate"
+        focal = self.focal or given.get("focal", known)
+        prior = None
+        if focal == "estimate" and self.exif and observation.image is not None:
+            prior = FocalPrior.from_exif(observation.image)
+        sigma = self._sigma(observation, given)
+        with named_as_flags(self.fitting):
+            return replace(stored, **set_by_flags, sigma=sigma, focal=focal, focal_prior=prior)
+
+    def _sigma(self, observation: Observation, stored: Mapping[str, Any]) -> Sigma | None:
         """Choose the standard deviation: None to estimate it, the given one, the file's, or 1."""
         if self.similar:
             if self.sigma is not None:
@@ -116,4 +136,6 @@ class Fit(ObservationCommand):
                     fix="give one of the two options",
                 )
             return None
+        if self.sigma is None and "sigma" in stored:
+            return cast("Sigma | None", stored["sigma"])
         return self.sigma_of(observation)

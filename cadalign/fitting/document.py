@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from cadalign.arrays import as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.noise import pixel_information
+from cadalign.fitting.options import FitOptions
 from cadalign.fitting.result import Alternative, FitResult, FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -18,6 +21,7 @@ from cadalign.io.documents import (
     ForeignDocument,
     NotNegative,
     Point3,
+    Positive,
     convert,
     within,
 )
@@ -29,8 +33,22 @@ class _Alternative(ForeignDocument):
     camera: Any  # in the form of `Camera.from_dict`
 
 
+class _Options(ForeignDocument):
+    """The fields of `FitOptions`."""
+
+    method: str
+    sigma: Any  # None, a number, one for each keypoint, or a 2 x 2 covariance for each
+    loss: str
+    loss_scale: Positive
+    stretch: str | None
+    scale_prior_sigma: Positive | None
+    known_axis: str
+    focal: str
+    focal_prior: FocalPrior | None
+
+
 class _Result(ForeignDocument):
-    """The fields of `FitResult`; ``rms``, ``std`` and ``warnings`` follow from them."""
+    """The fields of `FitResult`; ``rms``, ``std``, ``misfit`` and ``warnings`` follow from them."""
 
     alignment: Any
     camera: Any
@@ -46,6 +64,7 @@ class _Result(ForeignDocument):
     focal_prior: FocalPrior | None
     alternatives: list[_Alternative]
     stats: FitStats
+    options: _Options | None = None  # not in files of earlier versions
 
     def __post_init__(self) -> None:
         for name in ("residuals", "inliers"):
@@ -95,7 +114,22 @@ def _result(read: _Result) -> FitResult:
             for row, entry in enumerate(read.alternatives)
         ),
         stats=read.stats,
+        options=None if read.options is None else _options(read.options, len(read.points_3d)),
     )
+
+
+def _options(read: _Options, count: int) -> FitOptions:
+    with within("options"):
+        sigma: Any = read.sigma
+        if isinstance(sigma, list):
+            covariances = sigma and isinstance(sigma[0], list)
+            shape = (count, 2, 2) if covariances else (count,)
+            sigma = as_floats(sigma, name="sigma", shape=shape)
+        elif sigma is not None:
+            sigma = float(as_floats(sigma, name="sigma", shape=()))
+        if sigma is not None:
+            pixel_information(sigma, count)  # checks it
+        return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
 
 
 def _alternative(entry: _Alternative, where: str) -> Alternative:

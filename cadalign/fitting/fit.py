@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -131,8 +132,8 @@ def fit(
     chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
     try:
         options = _checked_options(*chosen)
-    except TypeError:  # an array as sigma has no hash
-        options = FitOptions(*chosen)
+    except TypeError:  # an array as sigma has no hash, and the caller may go on to change it
+        options = FitOptions(method, deepcopy(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
     if ransac is None:
@@ -315,6 +316,7 @@ def _fit_robustly(
         points_3d=problems.points_3d.copy(),
         residuals=residuals_of(problems, result.alignment, result.camera),
         inliers=inliers,
+        options=options,
         method="ransac-optimal",
         stats=replace(
             consensus.stats,
@@ -372,6 +374,7 @@ def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult
         focal_prior=options.focal_prior,
         alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
+        options=options,
     )
 
 
@@ -387,7 +390,8 @@ def _alternatives(
     """The other minima that are likely enough."""
     costs = solutions.costs[0, :minima]
     if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        ratios = (max(costs[0], 1e-300) / np.maximum(costs, 1e-300)) ** len(problems.points_3d)
+        # Costs are in units of sigma^2; below 1 they are those of exact fits.
+        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
     return tuple(

@@ -33,7 +33,7 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
         if not (is_number(sigma) and sigma > 0):
             raise InputError(f"{quote(sigma)} is not a standard deviation", where="sigma", fix=_FIX)
         return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
-    information = _pixel_information(sigma, len(rays))
+    information = pixel_information(sigma, len(rays))
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
     of_rays = np.swapaxes(to_pixels, 1, 2) @ information @ to_pixels
     a = np.sqrt(of_rays[:, 0, 0])
@@ -45,8 +45,8 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
 _FIX = "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
 
 
-def _pixel_information(sigma: Any, count: int) -> FloatArray:
-    """Inverse covariances (n, 2, 2) of the pixels."""
+def pixel_information(sigma: Any, count: int) -> FloatArray:
+    """Inverse covariances (n, 2, 2) of the pixels of n keypoints; checks sigma."""
     dimensions = np.ndim(sigma)
     if dimensions < 2:
         shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, is_number
+from cadalign.arrays import FloatArray, IntArray, is_number
 from cadalign.errors import InputError, quote
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -171,6 +171,17 @@ class FitOptions(AlignmentOptions):
     def unknowns(self) -> int:
         """The number of unknowns that are estimated."""
         return 6 + len(self.stretched_axes) + (self.focal == "estimate")
+
+    @property
+    def estimated_unknowns(self) -> IntArray:
+        """Rows of a result's covariance that belong to unknowns that are estimated.
+
+        Scales come in cyclic order from the known axis, so that names of axes change no result.
+        """
+        scales = "xyz".replace(self.known_axis, "")
+        cyclic = ["xyz"[axis] for axis in self.axis_order[1:]]
+        stretched = [6 + scales.index(axis) for axis in cyclic if axis in self.stretched_axes]
+        return np.array([*range(6), *stretched, *[8][: self.focal == "estimate"]])
 
     @property
     def min_points(self) -> int:

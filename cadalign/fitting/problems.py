@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -49,6 +50,12 @@ class Problems:
     def counts(self) -> IntArray:
         """Number of points of each problem, (B,) int."""
         return self.offsets[1:] - self.offsets[:-1]
+
+    @cached_property
+    def distinct_counts(self) -> IntArray:
+        """Number of different pairs of points of each problem, (B,) int."""
+        pairs = np.concatenate([self.points_3d, self.points_2d], axis=1)
+        return np.array([distinct_rows(pairs[self.rows(b)]) for b in range(len(self))])
 
     def each_camera(self) -> Sequence[Camera]:
         """The camera of every problem; none at all where no lens has distortion."""
@@ -114,6 +121,14 @@ def pack_many(
         offsets.astype(np.int64),
         cameras,
     )
+
+
+def distinct_rows(rows: FloatArray) -> int:
+    """The number of different rows among (n, k), told apart by a fixed combination of columns."""
+    combined = np.zeros(len(rows))
+    for k in range(rows.shape[1]):
+        combined += math.sqrt(k + 2.0) * rows[:, k]
+    return len(np.unique(combined))
 
 
 def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:

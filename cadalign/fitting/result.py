@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,13 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_doubt
+from cadalign.fitting.options import FitOptions
 from cadalign.fitting.uncertainty import Uncertainty, uncertainty_of, warnings_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from cadalign.fitting.misfit import Misfit
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,9 @@ class FitResult:
         Of the rotation vector in the camera frame [rad], the translation [model units], the
         logarithms of the two unknown scales, in the order of the axes, and, where it was
         estimated, the logarithm of the focal length; zero for what was held fixed. The inverse of
-        the Fisher information at the optimum. None for the methods that are not statistical.
+        the Fisher information at the optimum, which is the Cramer-Rao bound there: with few
+        keypoints errors are larger, see `posterior_covariance`. None for the methods that are not
+        statistical.
     known_axis : {"x", "y", "z"}
         The model's axis whose scale was taken as 1.
     stretched_axes : str
@@ -99,6 +105,8 @@ class FitResult:
         Other alignments that explain the keypoints as well: with 4 points all other exact
         solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
     stats : FitStats
+    options : FitOptions, optional
+        Those of the fit; None in files of earlier versions.
     """
 
     alignment: Alignment
@@ -115,6 +123,7 @@ class FitResult:
     focal_prior: FocalPrior | None
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = FitStats(0, 0, 0.0)
+    options: FitOptions | None = None
 
     @property
     def rms(self) -> float:
@@ -122,28 +131,68 @@ class FitResult:
         kept = self.residuals[self.inliers]
         return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
 
+    @cached_property
+    def posterior_covariance(self) -> FloatArray | None:
+        """Covariance of the errors, calibrated for few keypoints, in the form of `covariance`.
+
+        The second moments of the posterior about the alignment, from some thousand draws (always
+        the same), scaled such that the 95 % ellipsoid holds what the likelihood ratio does not
+        reject at 5 %. Where sigma was estimated, it is widened for the few degrees of freedom of
+        that estimate. It does not reach to the ``alternatives``. Beyond 100 keypoints it is
+        ``covariance`` but for that widening; for results without ``options`` it is ``covariance``.
+        """
+        if self.covariance is None or self.options is None:
+            return self.covariance
+        from cadalign.fitting.posterior import posterior_covariance  # loads the compiler
+
+        return posterior_covariance(self, self.options)
+
     @property
     def std(self) -> Uncertainty | None:
-        """Standard deviations from the covariance; None for methods that have none."""
-        if self.covariance is None:
+        """Standard deviations from `posterior_covariance`; None for methods that have none."""
+        if self.posterior_covariance is None:
             return None
-        return uncertainty_of(self.covariance, self.known_axis)
+        return uncertainty_of(self.posterior_covariance, self.known_axis)
+
+    @cached_property
+    def misfit(self) -> Misfit | None:
+        """What a chi-square test says of residuals that the given sigma does not explain.
+
+        None if they pass (of right data, 99.5 % or more do), for an estimated sigma, for methods
+        that are not statistical, and for results without ``options``.
+        """
+        if self.covariance is None or self.options is None:
+            return None
+        from cadalign.fitting.misfit import find_misfit
+
+        return find_misfit(self, self.options)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about parts of the alignment that the keypoints do not determine."""
+        """Warnings about a misfit, and about what the keypoints do not determine."""
         std = self.std
         if std is None:
             return ()
         kept = self.points_3d[self.inliers]
         unknowns = 6 + len(self.stretched_axes) + (self.focal == "estimate")
-        return warnings_of(
+        return self._contradictions() + warnings_of(
             kept,
             self.alignment,
             std,
             redundancy=2 * len(kept) - unknowns,
             doubt=focal_doubt(self.camera, self.focal_prior) if self.focal == "estimate" else None,
         )
+
+    def _contradictions(self) -> tuple[str, ...]:
+        """Warnings about a misfit, or about a constraint that cannot be tested."""
+        if self.misfit is not None:
+            return (str(self.misfit),)
+        if self.options is None:
+            return ()
+        from cadalign.fitting.misfit import unverified_stretch
+
+        doubt = unverified_stretch(self, self.options)
+        return () if doubt is None else (doubt,)
 
     def __str__(self) -> str:
         count = int(self.inliers.sum())
@@ -193,6 +242,8 @@ class FitResult:
             "sigma": self.sigma,
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "std": None if std is None else asdict(std),
+            "options": None if self.options is None else _plain_options(self.options),
+            "misfit": None if self.misfit is None else self.misfit.to_dict(),
             "known_axis": self.known_axis,
             "stretched_axes": self.stretched_axes,
             "focal": self.focal,
@@ -241,3 +292,10 @@ class FitResult:
             what = f"not valid JSON: {str(error)[:200]}"
             raise InputError(what, where="fit result") from None
         return cls.from_dict(data)
+
+
+def _plain_options(options: FitOptions) -> dict[str, Any]:
+    """Options as plain lists and numbers."""
+    sigma = options.sigma
+    plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
+    return {**asdict(replace(options, sigma=None)), "sigma": plain}

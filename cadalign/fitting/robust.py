@@ -131,6 +131,7 @@ def find_consensus(
         focal=options.focal,
         focal_prior=options.focal_prior,
         stats=FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score)),
+        options=options,
     )
 
 

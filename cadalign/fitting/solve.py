@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -22,12 +23,12 @@ from cadalign.solvers.projection import reproject_batch
 
 _SIGMA_ROUNDS = 20
 _SIGMA_TOLERANCE = 1e-3
-# Median length of a two-dimensional Gaussian error of unit standard deviation: sqrt(2 ln 2).
-_RAYLEIGH_MEDIAN = 1.1774100225154747
-# Errors of the model's shape aside, no keypoint is known better: keeps a perfect fit from
+# No keypoint is known better, over the keypoints' spread in the image: keeps a perfect fit from
 # claiming to be certain of everything.
-_LEAST_SIGMA = 1e-9
+_LEAST_SIGMA = 1e-6
+_HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
 _EXACT_COST = 1e-6
+_TINY = 1e-100
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
 _ONE_MINIMUM = np.array([1, 0, 1, -1])
 
@@ -153,12 +154,15 @@ def _with_estimated_sigmas(
             sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0
         ):
             break
-    covariances = found.covariances
-    exact = np.flatnonzero(2 * problems.counts <= options.unknowns).tolist()
-    too_few = {b: no_redundancy_error(int(problems.counts[b])) for b in exact}
+    assert found.covariances is not None
+    covariances = found.covariances * (sigmas**2)[:, None, None]
+    overflows = ~np.isfinite(covariances).all(axis=(1, 2)) & (found.statuses == OK)
+    exact = np.flatnonzero(2 * problems.distinct_counts <= options.unknowns).tolist()
+    too_few = {b: no_redundancy_error(int(problems.distinct_counts[b])) for b in exact}
     return found._replace(
         costs=found.costs / sigmas[:, None] ** 2,
-        covariances=None if covariances is None else covariances * (sigmas**2)[:, None, None],
+        covariances=covariances,
+        statuses=np.where(overflows, OUT_OF_RANGE, found.statuses),
         sigmas=sigmas,
         errors={**found.errors, **too_few},
     )
@@ -167,20 +171,37 @@ def _with_estimated_sigmas(
 def _estimate_sigmas(
     problems: Problems, options: FitOptions, points: FloatArray, found: Solutions
 ) -> FloatArray:
-    """Standard deviations (B,) [px] from the sum of squares, or the median for a robust loss."""
+    """Standard deviations (B,) [px] from the sum of squares, or an order statistic if robust.
+
+    Keypoints that are given repeatedly count once for the redundancy.
+    """
     seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
     residuals, _ = _residuals(seen, points, found)
     sigmas = np.ones(len(problems))
     for b in range(len(problems)):
-        squares = (residuals[problems.rows(b)] ** 2).sum(axis=1)
-        equations = 2 * len(squares)
-        redundancy = max(equations - options.unknowns, 1)
+        rows = problems.rows(b)
+        squares = (residuals[rows] ** 2).sum(axis=1)
+        redundancy = max(2 * int(problems.distinct_counts[b]) - options.unknowns, 1)
         if options.loss == "linear":
             sigma = np.sqrt(squares.sum() / redundancy)
         else:
-            sigma = np.sqrt(np.median(squares) * equations / redundancy) / _RAYLEIGH_MEDIAN
-        sigmas[b] = max(sigma, _LEAST_SIGMA) if np.isfinite(sigma) else 1.0
+            sigma = _robust_sigma(squares, redundancy)
+        least = _LEAST_SIGMA * np.sqrt(problems.points_2d[rows].var(axis=0).sum())
+        sigmas[b] = max(sigma, least, _TINY) if np.isfinite(sigma) else 1.0
     return sigmas
+
+
+def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
+    """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
+
+    The unknowns can make as many keypoints fit exactly as they have equations. The quantile is the
+    median of the others' lengths: that of all would be zero with few keypoints.
+    """
+    count = len(squares)
+    place = math.ceil(count - redundancy / 4)
+    quantile = min((place - 0.5) / count, _HIGHEST_QUANTILE)
+    expected = -2 * math.log(1 - quantile) * redundancy / (2 * count)
+    return math.sqrt(float(np.partition(squares, place - 1)[place - 1]) / expected)
 
 
 def _residuals(

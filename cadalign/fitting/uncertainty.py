@@ -9,7 +9,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 
-_WEAK_SCALE = 0.1  # relative standard deviation worth a warning
+WEAK_SCALE = 0.1
+"""Relative standard deviation of a scale that is worth a warning."""
 _WEAK_FOCAL = 0.02
 _SHALLOW = 0.5  # differences of depth over the distance
 _WEAK_ROTATION_DEG = 10.0
@@ -82,15 +83,15 @@ def warnings_of(
         )
     if std.focal > _WEAK_FOCAL:
         warnings.append(
-            f"the focal length is known only to +-{_percent(std.focal)}: "
+            f"the focal length is known only to +-{percent(std.focal)}: "
             f"{_why_focal_is_weak(points_3d, alignment)}"
         )
     if doubt is not None:
         warnings.append(doubt)
     for axis, relative in enumerate(std.scale):
-        if relative > _WEAK_SCALE:
+        if relative > WEAK_SCALE:
             warnings.append(
-                f"s_{'xyz'[axis]} is known only to +-{_percent(relative)}: "
+                f"s_{'xyz'[axis]} is known only to +-{percent(relative)}: "
                 f"{_why_scale_is_weak(points_3d, alignment, axis)}"
             )
     if std.rotation_deg > _WEAK_ROTATION_DEG:
@@ -99,7 +100,7 @@ def warnings_of(
     spread = float(np.linalg.norm(std.translation))
     if spread > _WEAK_DISTANCE * distance:
         direction = "xyz"[int(np.argmax(std.translation))]
-        share = f" ({_percent(spread / distance)} of the distance)" if distance > 0 else ""
+        share = f" ({percent(spread / distance)} of the distance)" if distance > 0 else ""
         warnings.append(
             f"the translation along the camera's {direction} is known only to "
             f"+-{max(std.translation):.2g} model units{share}"
@@ -133,5 +134,6 @@ def _why_scale_is_weak(points_3d: FloatArray, alignment: Alignment, axis: int) -
     return "there are few keypoints for their noise"
 
 
-def _percent(fraction: float) -> str:
+def percent(fraction: float) -> str:
+    """A share in percent, for a sentence."""
     return f"{100 * fraction:.0f} %" if fraction < 100 else "more than 10000 %"

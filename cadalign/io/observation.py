@@ -11,7 +11,8 @@ The file holds one object::
         ...
       ],
       "image": "photo.png",
-      "model": "chair.obj"
+      "model": "chair.obj",
+      "fit": {"sigma": null, "loss": "linear"}
     }
 
 ``camera`` is COLMAP's form, principal point in COLMAP's convention (the top-left corner of the
@@ -20,18 +21,21 @@ image is (0, 0)), see `cadalign.Camera.from_dict`; an unknown focal length is ``
 with integers at pixel centres, of the photo as it is seen: turned upright where EXIF says so.
 ``sigma`` [px], ``semantic_id``, ``name`` and ``confidence`` (a detector's score, not negative) are
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
-relative to the file.
+relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
+``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import DataError
@@ -64,6 +68,19 @@ class _Keypoint(Labelled, kw_only=True):
     confidence: NotNegative | None = None
 
 
+class _FitFields(Document):
+    """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
+
+    method: Text | UnsetType = UNSET
+    sigma: Positive | list[Positive] | UnsetType | None = UNSET
+    loss: Text | UnsetType = UNSET
+    loss_scale: Positive | UnsetType = UNSET
+    stretch: Text | UnsetType | None = UNSET
+    scale_prior_sigma: Positive | UnsetType | None = UNSET
+    known_axis: Text | UnsetType = UNSET
+    focal: Literal["known", "estimate"] | UnsetType = UNSET
+
+
 class _ObservationFile(Document):
     """The file's only object."""
 
@@ -71,6 +88,7 @@ class _ObservationFile(Document):
     keypoints: Annotated[list[_Keypoint], Meta(min_length=1)]
     image: PathText | None = None
     model: PathText | None = None
+    fit: _FitFields = msgspec.field(default_factory=_FitFields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +112,8 @@ class Observation:
         Trust in each keypoint, for the ``confidences`` of `cadalign.fit`.
     image, model : Path, optional
         The photo and the CAD model.
+    fit_options : mapping
+        Keyword arguments for `cadalign.fit` where they are not its defaults; see the module.
     """
 
     points_3d: FloatArray
@@ -105,6 +125,7 @@ class Observation:
     confidences: FloatArray | None = None
     image: Path | None = None
     model: Path | None = None
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
@@ -135,6 +156,10 @@ class Observation:
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
         read: _ObservationFile = convert(data, _ObservationFile)
+        sigma = read.fit.sigma
+        if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
+            what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
+            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
         names = _column(read.keypoints, "name")
         ids = _column(read.keypoints, "semantic_id")
         return cls(
@@ -147,6 +172,7 @@ class Observation:
             confidences=_column(read.keypoints, "confidence"),
             image=None if read.image is None else path_from(read.image, folder),
             model=None if read.model is None else path_from(read.model, folder),
+            fit_options=msgspec.to_builtins(read.fit),
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
@@ -169,6 +195,8 @@ class Observation:
         for name, path in (("image", self.image), ("model", self.model)):
             if path is not None:
                 data[name] = written_path(path, folder=folder)
+        if self.fit_options:
+            data["fit"] = dict(self.fit_options)
         return data
 
     def save(self, path: str | Path) -> None:

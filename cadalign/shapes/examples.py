@@ -96,7 +96,7 @@ class Dataset(Protocol):
 
 
 def examples_of(
-    models: Sequence[AnnotatedModel], *, meshes: bool, on_model: Callable[[], object]
+    models: Sequence[AnnotatedModel], *, meshes: bool, on_progress: Callable[[int, int], object]
 ) -> list[Example]:
     """Convert a data set's models; boxes are those of the meshes if at least half have one."""
     with_mesh = sum(model.mesh_path is not None for model in models)
@@ -112,7 +112,7 @@ def examples_of(
         path = None if model.mesh_path is None else model.mesh_path.absolute()
         ids = [int(label) for label in model.keypoints.semantic_ids]
         examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
-        on_model()
+        on_progress(len(examples), len(models))
     return examples
 
 

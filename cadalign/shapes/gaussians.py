@@ -1,7 +1,7 @@
 """Mixtures of Gaussians, learned from vectors with missing entries.
 
 Expectation maximisation as in Ghahramani and Jordan, "Supervised learning from incomplete data via
-an EM approach", NIPS 1994, with a prior that draws each covariance towards a wider one, so that
+an EM approach", NIPS 1994, with a prior that draws each covariance towards a common one, so that
 components of few vectors keep sensible covariances.
 """
 
@@ -153,13 +153,15 @@ def learn_mixture(
 ) -> Gaussians:
     """Learn a mixture from a first clustering.
 
+    Covariances are drawn towards their mean over the components.
+
     Parameters
     ----------
     vectors : Vectors
     labels : (N,) int
         The component that each vector starts in.
     common : Gaussians
-        The Gaussian of all vectors, towards which covariances are drawn.
+        The Gaussian of all vectors, from which the components start.
     strength, floor : float
         See `Prior`.
     rounds : int
@@ -170,15 +172,15 @@ def learn_mixture(
         np.repeat(common.means, count, axis=0),
         np.repeat(common.covariances, count, axis=0),
     )
-    prior = Prior(common.covariances[0], strength, floor)
     responsibilities = np.eye(count)[labels]
     for turn in range(rounds):
         if turn:
             densities = _log_densities(vectors, model)
             densities -= np.logaddexp.reduce(densities, axis=1, keepdims=True)
             responsibilities = np.exp(densities)
+        within = np.einsum("g,gij->ij", model.weights, model.covariances)
         shares = vectors.weights[:, None] * responsibilities
-        model = _maximise(vectors, shares, model, prior)
+        model = _maximise(vectors, shares, model, Prior(within, strength, floor))
     return model
 
 

@@ -191,8 +191,10 @@ class ShapeModel:
         meshes : bool
             Whether to read the meshes for the bounding boxes, where at least half of the models
             have one; otherwise the boxes are those of the keypoints.
-        components, modes, reflection, on_progress
+        components, modes, reflection
             See `ShapeModel.learn`.
+        on_progress : callable
+            Called with the number of steps done and of all, first of reading, then of learning.
 
         Raises
         ------
@@ -207,7 +209,7 @@ class ShapeModel:
                 where=where,
                 fix=f"at least {LEAST_MODELS} are needed",
             )
-        examples = examples_of(models, meshes=meshes, on_model=lambda: None)
+        examples = examples_of(models, meshes=meshes, on_progress=on_progress)
         return cls.learn(
             examples,
             category=models[0].category,

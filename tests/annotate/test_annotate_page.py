@@ -225,6 +225,25 @@ def test_clicks_on_the_model_give_the_surface_point(opened: tuple[Driver, Case, 
     assert np.median(gaps) < 1e-3
 
 
+def test_tabs_of_one_photo_add_to_each_other_and_are_undone_apart(
+    opened: tuple[Driver, Case, Access],
+) -> None:
+    first, _, access = opened
+    first.session.act(0, {"do": "place_uv", "uv": [100, 100]})
+    second = Driver(first.page.context.new_page(), first.session)
+    second.open(access)
+    for tab, step in ((first, [1, 0]), (second, [0, 1])):
+        tab.page.evaluate("annotator.api.refresh()")  # as the tab does when it comes to the front
+        tab.wait_for_state(lambda state: len(state["pairs"]) == 1)
+        tab.page.evaluate("step => { annotator.select(1); annotator.nudge(...step); }", step)
+        tab.wait_for_state(lambda state: state["pairs"][0]["uv"] != [100, 100])
+    second.wait_for_state(lambda state: state["pairs"][0]["uv"] == [101, 101])
+    second.page.evaluate("annotator.undo()")
+    second.wait_for_state(lambda state: state["pairs"][0]["uv"] != [101, 101])
+    assert first.session.photos[0].document.pairs[0].uv == (101, 100)
+    assert second.errors == []
+
+
 def test_click_is_fitted_and_redrawn_within_100_ms_at_20_pairs(
     opened: tuple[Driver, Case, Access],
 ) -> None:

@@ -94,6 +94,36 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+@pytest.mark.parametrize(
+    ("flags", "options"),
+    [
+        ([], {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}),
+        (
+            ["--sigma", "2", "--stretch", "z"],
+            {"sigma": 2.0, "loss": "cauchy", "stretch": "z", "scale_prior_sigma": 0.3},
+        ),
+        (["--no-stored"], {"sigma": np.linspace(0.2, 5, 10)}),
+    ],
+)
+def test_options_stored_in_the_file_are_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], options: dict[str, Any]
+) -> None:
+    stored = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}
+    sigma = np.linspace(0.2, 5, 10)
+    path = write_observation(tmp_path / "chair.json", sigma=sigma, fit_options=stored)
+    assert main(["fit", str(path), *flags]) == 0
+    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, **options)
+    assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_wrong_stored_options_name_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_observation(tmp_path / "chair.json", fit_options={"stretch": "x"})
+    message = refusal_line(capsys, "fit", str(path))
+    assert message.startswith(f"{path}: fit.stretch: 'x' are not axes that can stretch")
+
+
 def test_options_of_fit_are_those_of_the_function(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -165,7 +165,7 @@ def test_covariance_is_the_inverse_information_at_the_optimum(camera: Camera, sh
 
 def test_std_restates_the_covariance() -> None:
     result = fit_problem(problem_of(9))
-    std, deviation = result.std, np.sqrt(result.covariance.diagonal())
+    std, deviation = result.std, np.sqrt(result.posterior_covariance.diagonal())
     assert std.rotation_deg == pytest.approx(np.degrees(np.linalg.norm(deviation[:3])))
     assert std.translation == pytest.approx(deviation[3:6])
     assert std.scale == pytest.approx([0.0, *deviation[6:]])

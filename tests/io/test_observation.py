@@ -69,6 +69,31 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     assert Observation.load(absolute).image == Path("/elsewhere/photo.png")
 
 
+def test_options_of_the_fit_are_kept(tmp_path: Path) -> None:
+    """An explicit null, which estimates sigma, differs from a missing one."""
+    options = {"sigma": None, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}
+    observation = Observation.from_dict(DATA | {"fit": options})
+    assert observation.fit_options == options
+    observation.save(tmp_path / "chair.json")
+    assert Observation.load(tmp_path / "chair.json").fit_options == options
+    assert Observation.from_dict(DATA).fit_options == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sigma": [1.0]}, r"fit\.sigma: 1 numbers for 6 keypoints; give one for each"),
+        ({"sigma": [1.0, -1.0]}, r"fit\.sigma\[1\]: -1\.0 is not a positive number"),
+        ({"sigma": 0}, r"fit\.sigma: 0 is not a positive number"),
+        ({"noise": 1}, r"fit: .*noise"),
+        ({"focal": "guess"}, r"fit\.focal"),
+    ],
+)
+def test_wrong_options_of_the_fit_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        Observation.from_dict(DATA | {"fit": options})
+
+
 @pytest.mark.parametrize("extras", [True, False])
 def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
     written = Observation(
@@ -102,7 +127,8 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("keypoints", {}), "{path}: keypoints: {{}} is not a list"),
         (
             DATA | {"cameras": 3},
-            "{path}: top level: unknown field 'cameras'; known are camera, image, keypoints, model",
+            "{path}: top level: unknown field 'cameras'; "
+            "known are camera, fit, image, keypoints, model",
         ),
         (
             DATA | {"x` - at `$.y": 3},

@@ -15,7 +15,7 @@ class App {
   constructor() {
     this.state = null;
     this.selected = null;
-    this.gesture = 0;
+    this.gesture = Math.floor(Math.random() * 2 ** 40); // another than in other tabs
     this.api = new Api({
       onState: (state) => this.show(state),
       onTrouble: (text) => this.layout.tell(text),

@@ -1,0 +1,174 @@
+"""One writer per file: locks on an annotator's files, which end with its process, also if killed.
+
+An annotator of one photo holds a lock for each file that it writes, an annotator of a folder the
+folder's own. Both pass through the folder's lock, so that neither overlooks the other.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from filelock import FileLock, Timeout
+
+from cadalign.annotate.names import file_name
+from cadalign.errors import DataError
+
+logger = logging.getLogger("cadalign")
+
+_ENDING = "annotate-lock"
+_PATIENCE = 0.2  # for a lock that is just being removed [s]
+_QUEUE = 2.0  # for others that are passing through the folder's lock [s]
+_LONGEST_NOTE = 150
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+
+
+class WriterLocks:
+    """Locks on the files of one folder that a session writes, as a context.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The files, all in one folder.
+    whole_folder : bool
+        Hold the folder's lock in place of one for each file.
+    address : str
+        Address of the session's page, which others are told.
+    """
+
+    def __init__(self, files: Sequence[Path], *, whole_folder: bool, address: str) -> None:
+        self._files = {_lock_path(file): file for file in files}
+        self._folder = files[0].parent
+        self._whole_folder = whole_folder
+        self._note = f"{address}, process {os.getpid()} on {platform.node()}"
+        self._held = ExitStack()
+        self._locks: list[_Lock] = []
+
+    def __enter__(self) -> Self:
+        """Lock the files; raises DataError if another annotator has one of them."""
+        self._acquire()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Unlock the files."""
+        self._release()
+
+    def confirm(self) -> None:
+        """Lock the files anew if their locks are gone, such as with a deleted folder.
+
+        Raises DataError if another annotator has one of them by now.
+        """
+        if not self._locks or not all(lock.intact for lock in self._locks):
+            self._release()
+            self._acquire()
+
+    def _acquire(self) -> None:
+        with ExitStack() as passing, ExitStack() as held:
+            gate_holder = held if self._whole_folder else passing
+            gate = _Lock(self._folder / f".{_ENDING}", self._folder, self._note)
+            gate_holder.enter_context(gate.hold(_QUEUE))
+            locks = [gate] if self._whole_folder else []
+            for path, file in self._files.items():
+                lock = _Lock(path, file, self._note)
+                if not self._whole_folder:
+                    held.enter_context(lock.hold(_PATIENCE))
+                    locks.append(lock)
+                elif path.exists():
+                    passing.enter_context(lock.hold(_PATIENCE))
+            self._locks, self._held = locks, held.pop_all()
+
+    def _release(self) -> None:
+        self._locks = []
+        self._held.close()
+
+
+class _Lock:
+    """Lock file with a note on its holder."""
+
+    def __init__(self, path: Path, file: Path, note: str) -> None:
+        self._path = path
+        self._file = file
+        self._note = note
+        self._identity: tuple[int, int] | None = None
+
+    @property
+    def intact(self) -> bool:
+        """False if the lock file was removed or replaced, so that it keeps nobody off."""
+        return self._identity is None or self._identity == _identity(self._path)
+
+    @contextmanager
+    def hold(self, timeout: float) -> Iterator[None]:
+        """Hold the lock; raises DataError if another has it, or the folder cannot be written to."""
+        if not self._path.parent.is_dir():  # which FileLock would make
+            raise DataError(
+                "the folder is gone",
+                where=str(self._path.parent),
+                fix="put it back: everything is saved with the next change, or at the end",
+            )
+        lock = FileLock(self._path, timeout=timeout, thread_local=False)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise self._refusal() from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise self._unwritable(error.strerror or str(error)) from None
+            logger.warning("%s: no locks here: use one annotator only", self._path.parent)
+            yield
+            return
+        try:
+            with suppress(OSError):  # Windows lets nobody write to a locked file
+                self._path.write_text(self._note, encoding="utf-8")
+            self._identity = _identity(self._path)
+            yield
+        finally:
+            if self.intact:
+                with suppress(OSError):
+                    self._path.unlink()  # while it is held: whoever waits for it notices
+            lock.release()
+
+    def _refusal(self) -> DataError:
+        note = ""
+        try:
+            note = self._path.read_text(encoding="utf-8", errors="replace")[:_LONGEST_NOTE]
+        except FileNotFoundError:
+            return self._unwritable("No lock can be made")
+        except OSError:
+            pass
+        return DataError(
+            "another annotator has it open" + (f": {note}" if note else ""),
+            where=str(self._file),
+            fix="go on in its page or end it, or give another --observation or --out",
+        )
+
+    def _unwritable(self, reason: str) -> DataError:
+        return DataError(
+            f"the folder cannot be written to ({reason})",
+            where=str(self._path.parent),
+            fix="make it writable, or choose another one by --out",
+        )
+
+
+def _lock_path(file: Path) -> Path:
+    # Without the ending: files that differ only in that share those derived from them.
+    return file.with_name(file_name(f".{file.stem}", f".{_ENDING}"))
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino

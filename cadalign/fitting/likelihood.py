@@ -1,0 +1,76 @@
+"""Likelihood of alignments near that of a result: its noise, loss and priors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.fitting.noise import pixel_information
+from cadalign.fitting.options import FitOptions
+
+if TYPE_CHECKING:
+    from cadalign.fitting.result import FitResult
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Negative log likelihoods, times two, of residuals in pixels.
+
+    Parameters
+    ----------
+    information : (2, 2) or (n, 2, 2) float
+        Inverse covariance of the keypoints [1 / px^2].
+    options : FitOptions
+        Loss and priors.
+    """
+
+    information: FloatArray
+    options: FitOptions
+
+    @classmethod
+    def of(cls, result: FitResult, options: FitOptions) -> Likelihood:
+        """The likelihood of the inliers that the result maximises, at its estimated sigma."""
+        sigma: Any = result.sigma if options.sigma is None else options.sigma
+        if np.ndim(sigma) == 0:
+            return cls(np.eye(2) / float(sigma) ** 2, options)
+        information = pixel_information(sigma, len(result.inliers))
+        return cls(information[result.inliers], options)
+
+    def squares(self, residuals: FloatArray) -> FloatArray:
+        """Squared whitened lengths (..., n) of residuals (..., n, 2) [px]."""
+        u, v = residuals[..., 0], residuals[..., 1]
+        (a, b), (_, c) = self.information.T
+        squares = u * u * a + v * v * c
+        if b.any():
+            squares += 2 * b * u * v
+        return np.asarray(squares)
+
+    def losses(self, residuals: FloatArray) -> FloatArray:
+        """The loss (n,) on each of the residuals (n, 2) [px], at most its whitened square."""
+        squares, bend = self.squares(residuals), self.options.loss_scale
+        if self.options.loss == "huber":
+            bent = 2 * bend * np.sqrt(squares) - bend**2
+            return np.asarray(np.where(squares <= bend**2, squares, bent))
+        if self.options.loss == "cauchy":
+            return np.asarray(bend**2 * np.log1p(squares / bend**2))
+        return squares
+
+    def weights(self, residuals: FloatArray) -> FloatArray:
+        """Weights (n,) of the squares that stand for the loss near residuals (n, 2) [px]."""
+        squares, bend = self.squares(residuals), self.options.loss_scale
+        if self.options.loss == "huber":
+            return np.asarray(bend / np.maximum(np.sqrt(squares), bend))
+        if self.options.loss == "cauchy":
+            return np.asarray(1 / (1 + squares / bend**2))
+        return np.ones(len(squares))
+
+    def penalties(self, log_scales: FloatArray, log_focals: FloatArray) -> FloatArray:
+        """Squared deviations (k,) from the priors, of the log scales (k, 3) and focals (k,)."""
+        total = self.options.prior_weight * (log_scales**2).sum(axis=1)
+        prior = self.options.focal_prior
+        if prior is not None:
+            total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2
+        return np.asarray(total)

@@ -1,0 +1,279 @@
+"""One writer per file: what a second annotator is told, and what outlives a killed one."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.annotating import Case, place
+from support.refusals import refusal_line, refusal_text
+
+from cadalign.annotate.locks import WriterLocks
+from cadalign.annotate.opening import find_session_files, open_session
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.page_state import page_state
+from cadalign.io.observation import Observation
+
+PROGRAM = "import sys; from cadalign.cli import main; sys.exit(main())"
+LOCK = "*annotate-lock"
+
+
+class Annotator:
+    """A process of `cadalign annotate`."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        self.process = process
+        url = process.stdout.readline().strip()
+        match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=(.+)", url)
+        assert match, process.communicate()[1]
+        self.port, self.token = int(match[1]), match[2]
+
+    def act(self, action: dict[str, Any]) -> dict[str, Any]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        headers = {"X-Cadalign-Token": self.token, "Content-Type": "application/json"}
+        connection.request("POST", "/act/0", body=json.dumps(action), headers=headers)
+        answer: dict[str, Any] = json.loads(connection.getresponse().read())
+        connection.close()
+        return answer
+
+    def end(self, how: signal.Signals = signal.SIGINT) -> tuple[int, str]:
+        self.process.send_signal(how)
+        _, err = self.process.communicate(timeout=60)
+        return self.process.returncode, err
+
+
+@contextmanager
+def annotator(case: Case, *arguments: object) -> Iterator[Annotator]:
+    command = [sys.executable, "-c", PROGRAM, "annotate", "--no-open", "--model", str(case.model)]
+    given = [*command, "--camera", str(case.camera), *map(str, arguments)]
+    process = subprocess.Popen(given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield Annotator(process)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def second(case: Case, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The line by which a second annotator is refused."""
+    return refusal_line(
+        capsys, "annotate", "--no-open", "--model", case.model, "--camera", case.camera, *arguments
+    )
+
+
+# --- processes -------------------------------------------------------------------------------
+
+
+def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with annotator(case, "--image", case.photo) as first:
+        first.act({"do": "place_uv", "uv": [10, 20]})
+        first.act({"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
+        message = second(case, capsys, "--image", case.photo)
+        assert re.fullmatch(
+            rf"{case.folder}/\S+: another annotator has it open: "
+            rf"http://127\.0\.0\.1:{first.port}/, "
+            rf"process {first.process.pid} on \S+; "
+            r"go on in its page or end it, or give another --observation or --out",
+            message,
+        )
+        assert first.token not in message
+        # A folder is not opened while one of its photos is.
+        assert "another annotator has it open" in second(case, capsys, "--image", case.folder)
+        first.act({"do": "place_uv", "uv": [30, 40]})
+        first.process.send_signal(signal.SIGKILL)
+        first.process.wait()
+    assert Observation.load(case.observation).points_2d.tolist() == [[10, 20]]
+    with annotator(case, "--image", case.photo) as third:
+        pairs = third.act({"do": "place_uv", "uv": [50, 60]})["pairs"]
+        assert [pair["uv"] for pair in pairs] == [[10, 20], [30, 40], [50, 60]]
+        code, err = third.end(signal.SIGTERM)
+    assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
+    assert not list(case.folder.glob(LOCK))
+
+
+def test_folder_keeps_annotators_of_its_photos_out(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = case.folder / "out"
+    with annotator(case, "--image", case.folder, "--out", out) as first:
+        for arguments in (
+            ("--image", case.folder, "--out", out),
+            ("--image", case.photo, "--out", out),
+            ("--image", case.photo, "--observation", out / "photo.json"),
+        ):
+            message = second(case, capsys, *arguments)
+            assert message.startswith(f"{out}: another annotator has it open: http://127.0.0.1:")
+        with annotator(case, "--image", case.photo) as elsewhere:  # another folder's files
+            elsewhere.act({"do": "undo"})
+            assert elsewhere.end()[0] == 0
+        first.act({"do": "undo"})
+        assert first.end()[0] == 0
+    assert list(out.iterdir()) == []
+
+
+def test_deleted_folder_loses_nothing(case: Case) -> None:
+    out = case.folder / "out"
+    with annotator(case, "--image", case.photo, "--out", out) as first:
+        first.act({"do": "place_uv", "uv": [10, 20]})
+        shutil.rmtree(out)
+        state = first.act({"do": "place_uv", "uv": [30, 40]})
+        assert state["saved"]["trouble"] == (
+            f"{out}: the folder is gone; "
+            "put it back: everything is saved with the next change, or at the end"
+        )
+        code, err = first.end()
+    *_, trouble, place = err.strip().splitlines()
+    assert code == 1
+    assert trouble.startswith(f"Not saved: {out}: the folder is gone")
+    match = re.fullmatch(r"Saved in (\S+) instead", place)
+    assert match
+    rescued = json.loads(Path(match[1], "photo.unfinished.json").read_text())
+    assert rescued["pairs"] == [{"uv": [10, 20]}, {"uv": [30, 40]}]
+    assert json.loads(Path(match[1], "photo.json").read_text())["image"].endswith("photo.png")
+    shutil.rmtree(match[1])
+
+
+# --- locks -----------------------------------------------------------------------------------
+
+
+def locks_of(case: Case, **options: Any) -> WriterLocks:
+    files = find_session_files(SessionOptions(image=case.photo, model=case.model, **options))
+    return WriterLocks(files.written, whole_folder=False, address="http://127.0.0.1:1/")
+
+
+def test_other_photos_and_other_models_are_free(case: Case) -> None:
+    model = case.folder / "table.ply"
+    shutil.copy(case.model, model)
+    options = SessionOptions(case.photo, model, observation=case.folder / "table of photo.json")
+    files = find_session_files(options)
+    with locks_of(case), WriterLocks(files.written, whole_folder=False, address=""):
+        pass
+    # The same model's keypoints are one file, whatever the photo.
+    shutil.copy(case.photo, case.folder / "other.png")
+    options = SessionOptions(case.folder / "other.png", case.model)
+    files = find_session_files(options)
+    locks = WriterLocks(files.written, whole_folder=False, address="")
+    with locks_of(case):
+        message = refusal_text(locks.__enter__)
+    assert message.startswith(f"{files.keypoints}: another annotator has it open: http://127.0.0.1")
+    with locks:
+        pass
+
+
+def test_observation_in_the_place_of_derived_files_is_locked_with_them(case: Case) -> None:
+    taken = locks_of(case, observation=case.folder / "photo.unfinished.json")
+    with locks_of(case):
+        assert "another annotator has it open" in refusal_text(taken.__enter__)
+
+
+def test_removed_locks_are_taken_again_unless_another_was_faster(case: Case) -> None:
+    with locks_of(case) as first:
+        for path in case.folder.glob(LOCK):
+            path.unlink()
+        first.confirm()
+        assert "another annotator" in refusal_text(locks_of(case).__enter__)
+        for path in case.folder.glob(LOCK):
+            path.unlink()
+        with locks_of(case):
+            session = open_session(
+                SessionOptions(image=case.photo, model=case.model), before_saving=first.confirm
+            )
+            session.act(0, {"do": "place_uv", "uv": [10, 20]})
+            trouble = page_state(session, 0)["saved"]["trouble"]
+            assert "another annotator has it open" in trouble
+            assert not case.observation.exists()
+        session.act(0, {"do": "place_uv", "uv": [30, 40]})
+        assert page_state(session, 0)["saved"]["trouble"] == ""
+        assert case.observation.exists()
+    assert not list(case.folder.glob(LOCK))
+
+
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="no folder that refuses all users")
+def test_folder_that_cannot_be_written_to_is_refused_before_any_work(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = Path("/sys/kernel")
+    message = second(case, capsys, "--image", case.photo, "--out", out)
+    assert re.fullmatch(
+        r"/sys/kernel: the folder cannot be written to \(.+\); "
+        r"make it writable, or choose another one by --out",
+        message,
+    )
+
+
+def test_without_locks_of_the_system_one_is_warned(
+    case: Case, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", none)
+    with locks_of(case) as locks:
+        locks.confirm()
+    assert "use one annotator only" in caplog.text
+
+
+# --- several photos, several tabs --------------------------------------------------------------
+
+
+def test_photos_that_could_not_be_saved_are_saved_with_the_next(case: Case) -> None:
+    shutil.copy(case.photo, case.folder / "z.png")
+    out = case.folder / "out"
+    out.mkdir()
+    session = case.open(image=case.folder, out=out)
+    shutil.rmtree(out)
+    place(session, 0, [10, 20], image=0)
+    assert page_state(session, 0)["saved"]["trouble"].startswith(str(out))
+    out.mkdir()
+    place(session, 1, [30, 40], image=1)
+    assert Observation.load(out / "photo.json").points_2d.tolist() == [[10, 20]]
+    assert Observation.load(out / "z.json").points_2d.tolist() == [[30, 40]]
+    assert page_state(session, 0)["saved"]["trouble"] == ""
+
+
+def test_renamed_photo_is_told_and_its_pairs_go_on(case: Case) -> None:
+    session = case.open()
+    place(session, 0, [10, 20])
+    assert page_state(session, 0)["message"] == ""
+    renamed = case.photo.rename(case.folder / "renamed.png")
+    place(session, 1, [30, 40])
+    state = page_state(session, 0)
+    assert state["message"] == (
+        "photo.png: moved, renamed or deleted. Go on here, or start anew with the new name and "
+        "--observation photo.json."
+    )
+    assert state["saved"]["trouble"] == ""
+    again = case.open(image=renamed, observation=case.observation)
+    assert len(page_state(again, 0)["pairs"]) == 2
+    again.act(0, {"do": "delete", "pair": 2})
+    assert Observation.load(case.observation).image == renamed
+
+
+def test_tabs_share_one_annotation(case: Case) -> None:
+    """What one tab does is no answer to the state that another shows, but adds to it."""
+    session = case.open()
+    shown = page_state(session, 0)  # by a tab that is not refreshed
+    assert shown["pairs"] == []
+    place(session, 0, [10, 20])
+    place(session, 1, [30, 40])
+    session.act(0, {"do": "place_uv", "uv": [50, 60], "pair": None})
+    session.act(0, {"do": "delete", "pair": 2})
+    assert refusal_text(lambda: session.act(0, {"do": "move", "pair": 2, "uv": [1, 2]})) == (
+        "pair: there is no pair 2; reload the page"
+    )
+    session.act(0, {"do": "undo"})
+    pairs = page_state(case.open(), 0)["pairs"]
+    assert [pair["uv"] for pair in pairs] == [(10, 20), (30, 40), (50, 60)]

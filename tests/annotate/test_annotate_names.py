@@ -1,0 +1,186 @@
+"""Names of the annotator's files: no photo's file is another's, however the photos are called."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.annotating import Case, place
+from support.refusals import refusal_text
+
+from cadalign.annotate.names import file_name, observation_file, refuse_collisions
+from cadalign.annotate.opening import find_session_files
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.page_state import page_state
+from cadalign.datasets import ModelKeypoints
+from cadalign.io.observation import Observation
+
+AWKWARD = (
+    *("x.jpg", "x.png", "X.webp", "x.jpg.jpg", "x.jpg.json.jpg", "x.unfinished.jpg"),
+    *("x.unfinished.png", "x.unfinished.unfinished.jpg", "x_fit.jpg", "y.UNFINISHED.jpg", "y.png"),
+    *("sample_chair_000.keypoints.jpg", "sample_chair_000.jpg", "sample_chair_000.png.png"),
+    *("a" * 240 + ".jpg", "a" * 240 + "b.jpg", "a" * 251 + ".jpg", "ä" * 125 + ".png"),
+)
+
+
+def write_observation(path: Path, case: Case, image: Path | None) -> Path:
+    instance = case.instance
+    Observation(instance.points_3d, instance.points_2d, instance.camera, image=image).save(path)
+    return path
+
+
+def test_every_photo_of_a_folder_keeps_its_own_pairs(case: Case) -> None:
+    folder = case.folder / "awkward"
+    folder.mkdir()
+    photos = [folder / name for name in AWKWARD]
+    for photo in photos:
+        shutil.copy(case.photo, photo)
+    session = case.open(image=folder)
+    numbers = {state.photo.path.name: k for k, state in enumerate(session.photos)}
+    assert set(numbers) == set(AWKWARD)
+    for k, name in enumerate(AWKWARD):
+        place(session, 0, [10.0 + k, 20], image=numbers[name])
+        session.act(numbers[name], {"do": "place_uv", "uv": [10.0 + k, 40]})  # a half
+    for again in (case.open(image=folder), *(case.open(image=photo) for photo in photos)):
+        for k, state in enumerate(again.photos):
+            (first, half) = page_state(again, k)["pairs"]
+            assert first["uv"] == (10.0 + AWKWARD.index(state.photo.path.name), 20)
+            assert half["uv"][1] == 40
+    assert ModelKeypoints.load(folder / "sample_chair_000.keypoints.json").keypoints
+
+
+def test_longest_names_are_shortened_apart_and_others_kept() -> None:
+    assert file_name("photo", ".json") == "photo.json"
+    long = [file_name("ä" * 120 + tail, ".unfinished.json") for tail in ("aaa", "aab", "a")]
+    assert len(set(long)) == 3
+    for name in long:
+        assert len(os.fsencode(name)) <= 255
+        assert name.endswith(".unfinished.json")
+    assert file_name("b" * 250, ".json") == "b" * 250 + ".json"
+
+
+def test_model_of_a_long_name(case: Case) -> None:
+    model = case.folder / f"{'m' * 248}.ply"
+    shutil.copy(case.model, model)
+    session = case.open(model=model)
+    place(session, 0, [10, 20])
+    assert page_state(session, 0)["saved"]["trouble"] == ""
+    assert len(case.open(model=model, keypoints=None).registry) == len(session.registry)
+
+
+@pytest.mark.parametrize("option", ["image", "model", "camera", "keypoints", "observation"])
+def test_names_too_long_for_a_file_are_refused(case: Case, option: str) -> None:
+    path = case.folder / ("n" * 300 + ".ply")
+    message = refusal_text(lambda: case.open(**{option: path}))
+    assert message.startswith(("--observation: the name is too long", str(path)))
+
+
+def test_photo_alone_or_among_others_has_its_usual_name(tmp_path: Path) -> None:
+    photo = tmp_path / "x.jpg"
+    photo.write_text("")
+    assert observation_file(photo, tmp_path).name == "x.json"
+    (tmp_path / "x.png").write_text("")
+    assert observation_file(photo, tmp_path).name == "x.jpg.json"
+    (tmp_path / "x.obj").write_text("")
+    (tmp_path / "x.png").unlink()
+    assert observation_file(photo, tmp_path).name == "x.json"
+
+
+@pytest.mark.parametrize("name", ["x.unfinished", "x.keypoints", "x.jpg", "x"])
+def test_file_of_an_earlier_session_is_found_under_its_name(case: Case, name: str) -> None:
+    photo = case.folder / f"{name}.jpg"
+    shutil.copy(case.photo, photo)
+    shutil.copy(case.photo, photo.with_suffix(".png"))
+    earlier = write_observation(case.folder / f"{name}.json", case, photo)
+    session = case.open(image=photo)
+    assert len(page_state(session, 0)["pairs"]) == len(case.clicks)
+    session.act(0, {"do": "delete", "pair": 1})
+    assert len(Observation.load(earlier).points_2d) == len(case.clicks) - 1
+    other = case.open(image=photo.with_suffix(".png"))
+    assert page_state(other, 0)["pairs"] == []
+
+
+def test_photos_of_one_name_in_two_folders_do_not_share_a_file(case: Case) -> None:
+    second, third = (case.folder / name / case.photo.name for name in ("second", "third"))
+    for copy in (second, third):
+        copy.parent.mkdir()
+        shutil.copy(case.photo, copy)
+    out = case.folder / "out"
+    out.mkdir()
+    for k, photo in enumerate((case.photo, second)):
+        place(case.open(image=photo, out=out), 0, [10 + k, 20])
+    for k, photo in enumerate((case.photo, second)):
+        (pair,) = page_state(case.open(image=photo, out=out), 0)["pairs"]
+        assert pair["uv"] == (10 + k, 20)
+    message = refusal_text(lambda: case.open(image=third, out=out))
+    assert message.startswith(f"{out / 'photo.png.json'}: belongs to the photo ")
+    assert message.endswith("give another --observation or --out")
+
+
+def test_observation_whose_photo_was_renamed_with_it_is_kept(case: Case) -> None:
+    write_observation(case.observation, case, case.folder / "former name.png")
+    assert len(page_state(case.open(), 0)["pairs"]) == len(case.clicks)
+
+
+@pytest.mark.parametrize("name", ["sample_chair_000.keypoints.json", "camera.json", "photo.png"])
+def test_observation_in_another_files_place_is_refused(case: Case, name: str) -> None:
+    path = case.folder / name
+    before = path.read_bytes() if path.exists() else None
+    assert refusal_text(lambda: case.open(observation=path)) == (
+        f"{path}: would be written twice, or over a file that is read; "
+        "rename it, or give another --observation or --out"
+    )
+    assert (path.read_bytes() if path.exists() else None) == before
+
+
+def test_earlier_observation_in_the_keypoints_place_is_kept(case: Case) -> None:
+    photo = case.folder / "sample_chair_000.keypoints.png"
+    shutil.copy(case.photo, photo)
+    earlier = write_observation(photo.with_suffix(".json"), case, photo)
+    assert "rename it" in refusal_text(lambda: case.open(image=photo))
+    earlier.rename(photo.with_name(f"{photo.name}.json"))
+    assert len(page_state(case.open(image=photo), 0)["pairs"]) == len(case.clicks)
+
+
+def test_other_files_in_the_place_of_derived_ones_are_kept(case: Case) -> None:
+    unfinished = case.folder / "photo.unfinished.json"
+    write_observation(unfinished, case, None)
+    assert refusal_text(case.open) == (
+        f"{unfinished}: not a file of cadalign unfinished pairs; "
+        "rename it: the annotator writes a file of this name"
+    )
+    unfinished.unlink()
+    fit = case.folder / "photo_fit"
+    fit.write_text("")
+    assert refusal_text(case.open).startswith(f"{fit}: not a folder; rename it")
+    fit.unlink()
+    fit.mkdir()
+    (fit / "fit.json").write_text(json.dumps({"clothes": "L"}))
+    assert refusal_text(case.open).startswith(f"{fit / 'fit.json'}: not an alignment of cadalign")
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
+@pytest.mark.parametrize("name", ["photo.json", "photo.unfinished.json"])
+def test_folders_and_pipes_in_a_files_place_are_refused(
+    case: Case, name: str, make: Callable[[Path], None]
+) -> None:
+    make(case.folder / name)
+    assert refusal_text(case.open).startswith(f"{case.folder / name}: not a regular file; ")
+
+
+def test_files_are_compared_by_place(tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    refuse_collisions([tmp_path / "a.json"], [tmp_path / "b.json"])
+    message = refusal_text(lambda: refuse_collisions([tmp_path / "a"], [link / "a"]))
+    assert message.startswith(f"{tmp_path / 'a'}: would be written twice")
+
+
+def test_written_files_are_named_before_anything_is_read(case: Case) -> None:
+    options = SessionOptions(image=case.photo, model=case.folder / "nowhere.obj")
+    names = {path.name for path in find_session_files(options).written}
+    assert names == {"nowhere.keypoints.json", "photo.json", "photo.unfinished.json"}

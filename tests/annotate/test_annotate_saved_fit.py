@@ -1,0 +1,114 @@
+"""The saved observation gives `cadalign fit` the page's numbers, deviations included."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.annotating import Case
+
+from cadalign import FitResult
+from cadalign.annotate.page_state import page_state
+from cadalign.cli import main
+from cadalign.io.observation import Observation
+
+
+def with_exif(case: Case) -> None:
+    """Give the photo a focal length of 35 mm in its EXIF data."""
+    image = Image.open(case.photo)
+    image.load()
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 35
+    image.save(case.photo, exif=exif)
+
+
+@pytest.mark.parametrize("exif", [False, True])
+@pytest.mark.parametrize("calibrated", [False, True])
+@pytest.mark.parametrize("noise", [0.2, 8.0])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_fit_of_the_observation_gives_the_pages_numbers(
+    case: Case,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    exif: bool,
+    calibrated: bool,
+    noise: float,
+    weighted: bool,
+) -> None:
+    if exif:
+        with_exif(case)
+    rng = np.random.default_rng(0)
+    instance = case.instance
+    count = len(instance.points_3d)
+    exact = instance.camera.project(instance.cam_from_model.apply(instance.points_3d))
+    Observation(
+        instance.points_3d,
+        exact + noise * rng.normal(size=(count, 2)),
+        instance.camera,
+        sigma=rng.uniform(0.5, 2, count) if weighted else None,
+    ).save(case.observation)
+    session = case.open()
+    if not calibrated:
+        session.act(0, {"do": "focal", "known": False})
+    session.act(0, {"do": "delete", "pair": 2})
+    live, _ = session.live(session.photos[0])
+    page = live.cautious
+    assert page is not None
+    assert (live.sigma > 1) == (noise > 1)
+
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command = json.loads(capsys.readouterr().out)
+    saved = FitResult.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    assert page.std is not None
+    np.testing.assert_allclose(flat(command["std"]), flat(asdict(page.std)), rtol=1e-9)
+    for fitted in (FitResult.from_json(json.dumps(command)), saved):
+        np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(
+            flat(fitted.alignment.to_dict()), flat(page.alignment.to_dict()), rtol=1e-9, atol=1e-9
+        )
+        assert fitted.camera.fx == pytest.approx(page.camera.fx, rel=1e-9)
+        assert fitted.warnings == page.warnings
+    shown = page_state(session, 0)["alignment"]
+    assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
+    assert shown["rms"] == page.rms
+
+
+def flat(value: Any) -> list[float]:
+    """All numbers of nested lists and objects."""
+    if isinstance(value, dict):
+        return flat(list(value.values()))
+    if isinstance(value, list | tuple):
+        return [number for item in value for number in flat(item)]
+    return [] if isinstance(value, str) else [value]
+
+
+def test_stored_options_that_the_page_does_not_use_are_named(
+    case: Case, caplog: pytest.LogCaptureFixture
+) -> None:
+    instance = case.instance
+    for options in ({"sigma": None}, {"sigma": 3.0, "loss": "cauchy"}):
+        Observation(
+            instance.points_3d, instance.points_2d, instance.camera, fit_options=options
+        ).save(case.observation)
+        assert caplog.text == ""
+        case.open()
+    assert f"{case.observation}: the annotator fits without the stored sigma, loss" in caplog.text
+
+
+def test_options_follow_the_pairs(case: Case) -> None:
+    """What was estimated for other pairs is not left in the file."""
+    instance = case.instance
+    points_2d = instance.points_2d + 8 * np.random.default_rng(0).normal(
+        size=instance.points_2d.shape
+    )
+    Observation(instance.points_3d, points_2d, instance.camera).save(case.observation)
+    session = case.open()
+    session.act(0, {"do": "move", "pair": 1, "uv": [50, 60]})
+    assert Observation.load(case.observation).fit_options == {"sigma": None}
+    while len(session.photos[0].document.pairs) > 4:
+        session.act(0, {"do": "delete", "pair": session.photos[0].document.pairs[-1].number})
+    assert Observation.load(case.observation).fit_options == {}

@@ -1,0 +1,354 @@
+"""`ShapeModel`: what is learned and given, its file, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.refusals import refusal_text
+
+import cadalign
+from cadalign.arrays import FloatArray
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, InputError
+from cadalign.io.sealed import Seal
+from cadalign.shapes.examples import Example
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import ShapeComponent
+from cadalign.shapes.shape_file import SEAL
+
+TABLE = np.array(
+    [[-1, 0, -2], [1, 0, -2], [-1, 0, 2], [1, 0, 2], [-1, 1, -2], [1, 1, -2], [0, 1.5, 0]],
+    dtype=float,
+)
+IDS = list(range(7))
+
+
+def tables(
+    count: int, *, seed: int = 0, spread: float = 0.2, missing: float = 0.0
+) -> list[Example]:
+    """Tables of random sizes, some without some keypoints."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for row in range(count):
+        points = TABLE * rng.lognormal(0, spread, 3) + rng.normal(0, 0.02, TABLE.shape)
+        kept = np.flatnonzero(rng.random(len(points)) >= missing)
+        kept = kept if len(kept) else np.arange(2)
+        bounds = np.array([points.min(axis=0) - 0.1, points.max(axis=0) + 0.1])
+        found.append(Example(f"table {row}", kept.tolist(), points[kept], bounds))
+    return found
+
+
+@pytest.fixture(scope="module")
+def learned() -> ShapeModel:
+    return ShapeModel.learn(tables(120, missing=0.2), category="table", up_axis="y")
+
+
+def test_the_mean_is_that_of_the_models(learned: ShapeModel) -> None:
+    expected = np.mean([each.points_3d for each in tables(120)], axis=0)
+    assert learned.ids == tuple(IDS)
+    assert np.abs(learned.mean[:-2] - expected).max() < 0.1
+    assert learned.mean[-2:] == pytest.approx(
+        np.mean([each.bounds for each in tables(120)], axis=0), abs=0.1
+    )
+
+
+def test_the_modes_are_the_three_sizes(learned: ShapeModel) -> None:
+    component = max(learned.components, key=lambda each: each.weight)
+    shares = component.variance / np.trace(component.covariance)
+    assert shares[:3].sum() > 0.9
+    assert (np.diff(component.variance) <= 1e-12).all()
+
+
+def test_the_mirror_symmetry_is_found(learned: ShapeModel) -> None:
+    assert learned.reflection is not None
+    partners = learned.reflection.partners(learned.ids)
+    mirrored = learned.mean[:-2].copy()
+    axis = "xyz".index(learned.reflection.axis)
+    mirrored[:, axis] = 2 * learned.reflection.offset - mirrored[:, axis]
+    assert np.abs(mirrored[partners] - learned.mean[:-2]).max() < 0.1
+
+
+def test_a_symmetric_mixture_is_its_own_mirror_image() -> None:
+    model = ShapeModel.learn(tables(60), components=1)
+    assert model.reflection is not None
+    axis = "xyz".index(model.reflection.axis)
+    partners = model.reflection.partners(model.ids)
+    mean = model.components[0].mean[:-2]
+    mirrored = mean[partners]
+    mirrored[:, axis] = 2 * model.reflection.offset - mirrored[:, axis]
+    assert mirrored == pytest.approx(mean, abs=1e-6)
+
+
+def test_two_kinds_of_objects_get_two_components() -> None:
+    rng = np.random.default_rng(5)
+    high = [Example(f"{row}", IDS, TABLE + rng.normal(0, 0.05, (7, 3))) for row in range(60)]
+    flat = [
+        Example(f"flat {row}", IDS, TABLE * [1, 0.2, 0.5] + rng.normal(0, 0.05, (7, 3)))
+        for row in range(30)
+    ]
+    model = ShapeModel.learn([*high, *flat])
+    assert len(model.components) == 2
+    assert model.components[0].weight == pytest.approx(2 / 3, abs=0.02)
+    assert len(ShapeModel.learn(high).components) == 1
+
+
+def test_the_order_of_models_hardly_matters() -> None:
+    models = tables(40)
+    first = ShapeModel.learn(models, components=1, modes=5)
+    second = ShapeModel.learn(models[::-1], components=1, modes=5)
+    assert first.mean == pytest.approx(second.mean, abs=0.02)
+
+
+@given(st.floats(1e-3, 1e3))
+@settings(max_examples=5, deadline=None)
+def test_learning_does_not_depend_on_the_unit(factor: float) -> None:
+    models = tables(30)
+    scaled = [
+        Example(each.model_id, each.ids, each.points_3d * factor, each.bounds * factor)
+        for each in models
+        if each.bounds is not None
+    ]
+    plain, other = ShapeModel.learn(models), ShapeModel.learn(scaled)
+    assert len(plain.components) == len(other.components)
+    assert other.mean == pytest.approx(plain.mean * factor, rel=1e-5, abs=1e-5 * factor)
+
+
+def test_without_bounds_the_boxes_are_those_of_the_keypoints() -> None:
+    bare = [replace(each, bounds=None) for each in tables(30)]
+    model = ShapeModel.learn(bare, components=1)
+    extents = np.array([[e.points_3d.min(axis=0), e.points_3d.max(axis=0)] for e in bare])
+    offset = model.mean[-2:] - extents.mean(axis=0)
+    assert np.abs(offset).max() < 0.1
+
+
+def test_progress_ends_at_all_steps() -> None:
+    steps: list[tuple[int, int]] = []
+    ShapeModel.learn(tables(20), on_progress=lambda done, total: steps.append((done, total)))
+    done = [each[0] for each in steps]
+    assert done == sorted(done)
+    assert steps[-1][0] == steps[-1][1]
+
+
+@pytest.mark.parametrize("count", [4, 5, 11])
+def test_few_models_still_give_a_model(count: int) -> None:
+    model = ShapeModel.learn(tables(count, missing=0.3))
+    assert np.isfinite(model.components[0].covariance).all()
+    assert (np.linalg.eigvalsh(model.components[0].covariance) > 0).all()
+
+
+def test_from_basis_scales_with_the_size() -> None:
+    model = ShapeModel.from_basis(TABLE, np.zeros((1, 7, 3)), [0.0], size_sigma=0.1, ids=IDS)
+    component = model.components[0]
+    assert component.modes.shape == (1, 9, 3)
+    along = np.abs(component.modes[0] / 0.1)
+    assert along == pytest.approx(np.abs(component.mean), abs=1e-12)
+    assert not model.has_box
+
+
+def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
+    rng = np.random.default_rng(0)
+    modes, sigmas = rng.normal(size=(3, 7, 3)), np.array([0.3, 0.0, 0.1])
+    model = ShapeModel.from_basis(TABLE, modes.reshape(3, -1), sigmas, residual_sigma=0.05)
+    flat = sigmas[:, None] * modes.reshape(3, -1)
+    expected = flat.T @ flat + 0.05**2 * np.eye(21)
+    assert model.components[0].covariance[:21, :21] == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12))
+def test_from_covariance_keeps_it(seed: int, rank: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(27, rank))
+    model = ShapeModel.from_covariance(np.vstack([TABLE, [[0] * 3, [1] * 3]]), root @ root.T)
+    assert model.components[0].covariance == pytest.approx(root @ root.T, abs=1e-9)
+    assert len(model.components[0].modes) == rank
+
+
+def test_the_nearest_model_is_itself(learned: ShapeModel) -> None:
+    assert learned.training is not None
+    for row in (0, 17, 119):
+        points = learned.training.points_3d[row]
+        seen = np.isfinite(points[:, 0])
+        ids = [label for label, there in zip(learned.ids, seen, strict=True) if there]
+        nearest = learned.nearest(points[seen], ids)
+        assert nearest.model_id == f"table {row}"
+        assert nearest.distance < 1e-6
+
+
+def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
+    learned.save(tmp_path / "table.shape")
+    opened = cadalign.ShapeModel.open(tmp_path / "table.shape")
+    for name in ("category", "ids", "has_box", "up_axis", "reflection", "unit"):
+        assert getattr(opened, name) == getattr(learned, name)
+    for mine, other in zip(learned.components, opened.components, strict=True):
+        assert mine.weight == other.weight
+        assert mine.residual_sigma == other.residual_sigma
+        assert (mine.mean == other.mean).all()
+        assert (mine.modes == other.modes).all()
+    assert opened.training is not None
+    assert learned.training is not None
+    assert opened.training.model_ids == learned.training.model_ids
+    assert opened.training.points_3d.tobytes() == learned.training.points_3d.tobytes()
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("shapes") / "small.shape"
+    ShapeModel.learn(tables(6), category="table").save(path)
+    return path.read_bytes()
+
+
+@given(data=st.data())
+def test_a_damaged_file_is_refused(
+    content: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.shape"
+    place = data.draw(st.integers(0, len(content) - 1))
+    flipped = bytearray(content)
+    flipped[place] ^= data.draw(st.integers(1, 255))
+    cut = content[:place]
+    for damaged in (bytes(flipped), cut):
+        path.write_bytes(damaged)
+        if damaged[20:24] != content[20:24] and damaged[24:] == content[24:]:
+            continue  # bytes that are reserved
+        with pytest.raises(DataError, match=r"damaged\.shape: "):
+            ShapeModel.open(path)
+
+
+@given(data=st.data())
+@settings(deadline=None)
+def test_forged_content_is_refused_or_valid(
+    content: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Bytes changed below a valid checksum never give anything but a model or our error."""
+    path = tmp_path_factory.getbasetemp() / "forged.shape"
+    payload = bytearray(content[64:])
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    SEAL.write(path, bytes(payload))
+    try:
+        model = ShapeModel.open(path)
+    except DataError:
+        return
+    assert all(np.isfinite(each.mean).all() for each in model.components)
+
+
+def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.shape"
+    assert refusal_text(lambda: ShapeModel.open(path)) == f"{path}: no such file"
+    path.write_bytes(b"hello")
+    again = "learn it with: cadalign shape learn"
+    assert refusal_text(lambda: ShapeModel.open(path)) == f"{path}: not a shape file; {again}"
+    Seal(SEAL.magic, 9, SEAL.noun, SEAL.fix).write(path, content[64:])
+    assert refusal_text(lambda: ShapeModel.open(path)) == (
+        f"{path}: a shape file of version 9, but this cadalign reads version 1; {again}"
+    )
+    path.write_bytes(content[:-1])
+    assert "is truncated" in refusal_text(lambda: ShapeModel.open(path))
+
+
+def test_refusals(learned: ShapeModel) -> None:
+    def learn(*models: Example) -> str:
+        return refusal_text(lambda: ShapeModel.learn(models))
+
+    some = tables(4)
+    named = Example("named", ["a", "b"], TABLE[:2])
+    assert learn(*some[:3]) == (
+        "models: 3 models are too few to learn a shape from; give at least 4"
+    )
+    assert learn(*some, named) == (
+        "model named: its keypoints have names as ids, those of model table 0 have numbers; "
+        "use one kind in all models"
+    )
+    assert learn(*some, some[0]) == "model 'table 0': occurs twice"
+    assert refusal_text(lambda: Example("m", [1, 1], TABLE[:2])) == "model m, ids: 1 occurs twice"
+    assert refusal_text(lambda: Example("m", [1, "a"], TABLE[:2])) == (
+        "model m, ids: some are numbers and some are names; use one kind"
+    )
+    assert "NaN or infinite" in refusal_text(lambda: Example("m", [1], np.full((1, 3), np.nan)))
+    assert refusal_text(lambda: learned.rows([1, 99, 98])) == (
+        "ids: table has no keypoint 99, 98; known are [0, 1, 2, 3, 4, 5, 6]"
+    )
+    assert refusal_text(lambda: ShapeModel.learn(some, components=0)) == (
+        "components: 0 is not a whole number >= 1"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"deviations": [-1.0]}, "deviations: deviations[0] is negative (-1)"),
+        ({"deviations": [np.nan]}, "deviations: NaN or infinite values in row 0"),
+        ({"modes": np.zeros((1, 6, 3))}, "modes: shape (1, 6, 3), expected (n, 7, 3)"),
+        ({"names": ["a"]}, "names: 1 for 7 keypoints"),
+        ({"names": ["a"] * 7}, "names: 'a' occurs twice"),
+        ({"ids": IDS, "names": IDS}, "names: both ids and names are given; give one of them"),
+        ({"size_sigma": -0.1}, "size_sigma: -0.1 is negative"),
+        ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
+        ({"up_axis": "w"}, "up_axis: 'w' is not one of 'x', 'y', 'z'"),
+        ({"residual_sigma": -1}, "residual_sigma: -1 is not a standard deviation"),
+    ],
+)
+def test_a_wrong_basis_is_refused(change: dict[str, object], message: str) -> None:
+    given: dict[str, object] = {"modes": np.ones((1, 7, 3)), "deviations": [1.0]}
+    text = refusal_text(lambda: ShapeModel.from_basis(TABLE, **(given | change)))  # type: ignore[arg-type]
+    assert text.startswith(message)
+
+
+def test_a_wrong_covariance_is_refused() -> None:
+    mean = np.vstack([TABLE, TABLE[:2]])
+
+    def text(covariance: FloatArray) -> str:
+        return refusal_text(lambda: ShapeModel.from_covariance(mean, covariance))
+
+    assert text(np.eye(4)) == "covariance: shape (4, 4), expected (27, 27)"
+    assert text(-np.eye(27)).startswith("covariance: not positive semi-definite: its least eigen")
+    assert text(np.triu(np.ones((27, 27)))) == "covariance: not symmetric"
+
+
+def test_components_must_agree() -> None:
+    component = ShapeComponent(1.0, np.vstack([TABLE, TABLE[:2]]), np.zeros((0, 9, 3)), 0.1)
+    half = replace(component, weight=0.5)
+    with pytest.raises(InputError, match=r"weights sum to 0\.5, not to 1"):
+        ShapeModel("table", tuple(IDS), (half,))
+    with pytest.raises(InputError, match="9 rows, expected 5"):
+        ShapeModel("table", (1, 2, 3), (component,))
+
+
+def test_real_linear_models_are_read(real_data: Path) -> None:
+    folder = real_data / "real" / "kitti_cars"
+    mean, modes = np.loadtxt(folder / "meanShape_2.txt"), np.loadtxt(folder / "vectors2.txt")
+    model = ShapeModel.from_basis(mean, modes, np.full(5, 0.5), size_sigma=0.07, up_axis="z")
+    assert len(model.ids) == 14
+    assert model.components[0].covariance.shape == (48, 48)
+
+
+@pytest.mark.parametrize("category", ["chair", "airplane", "mug"])
+def test_real_models_that_were_held_out_are_likely(real_data: Path, category: str) -> None:
+    """A keypoint follows from the others: its error is far below its deviation in the category."""
+    dataset = KeypointNet(real_data / "keypointnet")
+    model = ShapeModel.from_dataset(dataset, category, split="train", components=1)
+    assert model.reflection is not None
+    assert model.reflection.axis == "x"
+    component = model.components[0]
+    mean, covariance = component.mean.ravel(), component.covariance
+    errors, spreads, whitened = [], [], []
+    for each in dataset.subset(categories=[category], split="val")[category]:
+        known = [row for row, label in enumerate(each.keypoints.semantic_ids) if label in model.ids]
+        rows = model.rows(each.keypoints.semantic_ids[known])
+        left, others = rows[0], rows[1:]
+        a, b = (3 * np.atleast_1d(part)[:, None] + np.arange(3) for part in (left, others))
+        a, b = a.ravel(), b.ravel()
+        gain = np.linalg.solve(covariance[np.ix_(b, b)], covariance[np.ix_(b, a)])
+        expected = mean[a] + (each.keypoints.xyz[known[1:]].ravel() - mean[b]) @ gain
+        errors.append(each.keypoints.xyz[known[0]] - expected)
+        spreads.append(each.keypoints.xyz[known[0]] - mean[a])
+        rest = covariance[np.ix_(a, a)] - covariance[np.ix_(a, b)] @ gain
+        whitened.append(errors[-1] / np.sqrt(np.diag(rest)))
+    assert np.median(np.abs(errors)) < 0.6 * np.median(np.abs(spreads))
+    assert 0.6 < (np.abs(whitened) < 1).mean() < 0.95
+    assert (np.abs(whitened) < 2).mean() > 0.88

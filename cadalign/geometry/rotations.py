@@ -22,12 +22,12 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """The rotation vector (3,) of a rotation matrix (3, 3): axis times angle, 0 to pi [rad].
+    """The rotation vector (3,), axis times angle [rad], of a rotation matrix (3, 3).
 
     Examples
     --------
-    >>> vector_from_rotation(rotation_from_vector(np.array([0.1, -0.2, 0.3]))).round(12).tolist()
-    [0.1, -0.2, 0.3]
+    >>> vector_from_rotation(rotation_from_vector(np.array([0.0, 0.5, 0.0]))).round(12).tolist()
+    [0.0, 0.5, 0.0]
     """
     from scipy.spatial.transform import Rotation
 

@@ -14,6 +14,9 @@ from cadalign.errors import InputError, quote
 from cadalign.fitting.options import FitOptions
 from cadalign.geometry.mesh import Mesh
 
+SIMILAR_SCALE_SIGMA = 0.2
+"""Default deviation of the log scales of an object that is only similar to its model."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
@@ -33,8 +36,11 @@ class Model:
         Standard deviation of the keypoints' positions on the object about those on the stretched
         model, along each axis [model units]: for an object that is only similar. None for the
         exact, stretched model.
-    stretch, scale_prior_sigma, known_axis
+    stretch, known_axis
         As for `cadalign.fit`.
+    scale_prior_sigma : float, optional
+        As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
+        similar has similar proportions, and its keypoints alone would say otherwise.
 
     Raises
     ------
@@ -78,10 +84,13 @@ class Model:
 
     def fit_options(self, sigma: float) -> FitOptions:
         """The options of the plain fit to this model."""
+        prior = self.scale_prior_sigma
+        if prior is None and self.shape_sigma is not None:
+            prior = SIMILAR_SCALE_SIGMA
         return FitOptions(
             sigma=sigma,
             stretch=self.stretch,
-            scale_prior_sigma=self.scale_prior_sigma,
+            scale_prior_sigma=prior,
             known_axis=self.known_axis,
         )
 

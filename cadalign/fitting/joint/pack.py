@@ -18,7 +18,6 @@ from cadalign.solvers.joint.evidence import (
     Lengths,
     Rig,
     ScalePriors,
-    Shape,
     Sightings,
 )
 
@@ -29,13 +28,12 @@ _SAME_SCALE_SIGMA = 1e-4
 
 def evidence_of(
     prior: ShapePrior,
-    shape: Shape,
     views: Sequence[View],
     *,
     loss: int,
     loss_scale: float,
 ) -> Evidence:
-    """All that the views and one component of the prior tell.
+    """All that the views and the first component of the prior tell.
 
     Raises
     ------
@@ -43,7 +41,7 @@ def evidence_of(
         If a view names a keypoint that the model lacks, or only some views have a known pose.
     """
     return Evidence(
-        shape,
+        prior.components[0],
         _sightings(prior, views, loss, loss_scale),
         _rig(views),
         _directions(prior, views),

@@ -29,6 +29,12 @@ class ShapePrior:
     scales: ScalePriors
     up: FloatArray | None
 
+    @property
+    def lengths(self) -> FloatArray:
+        """Lengths (3,) of the mean's box."""
+        pairs = zip(self.weights, self.components, strict=True)
+        return np.asarray(sum(weight * (each.mean[-1] - each.mean[-2]) for weight, each in pairs))
+
     def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
         """Row numbers of keypoints.
 

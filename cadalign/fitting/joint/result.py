@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,8 @@ class AlignResult:
     covariance : (9, 9) float
         Of the rotation vector in the first camera's frame [rad], the translation [model units], and
         the logarithms of the object's lengths along x, y, z relative to the mean's; zero for what
-        is held. The inverse of the information of all evidence and priors.
+        is held. The second moment of the posterior about the estimate: the inverse information of
+        all evidence and priors and, where other estimates are likely too, their distance.
     points_covariance : (m, 3, 3) float
         Of each keypoint in the model's frame, stretch included [model units squared].
     stretch : (3,) float
@@ -79,8 +81,8 @@ class AlignResult:
         mean's.
     component : int
         Number of the mixture's component that the object belongs to.
-    model : Model or ShapeModel
-        The model, as given.
+    model : Model or ShapeModel, optional
+        The model, as given; None for a result that was read from a file.
     alternatives : tuple of AlignAlternative
         Other estimates whose probability is at least 1/1000 of the best one's.
     warnings : tuple of str
@@ -99,7 +101,7 @@ class AlignResult:
     points_covariance: FloatArray
     stretch: FloatArray
     component: int
-    model: Model | ShapeModel
+    model: Model | ShapeModel | None
     alternatives: tuple[AlignAlternative, ...]
     warnings: tuple[str, ...]
     stats: FitStats
@@ -148,13 +150,13 @@ class AlignResult:
                 raise InputError("the model has no mesh", where="mesh", fix="give one")
             if self.model.shape_sigma is None:
                 return given
-            return warp_mesh(given, np.asarray(self.model.points_3d), self.points_3d)
+            return warp_mesh(given, self.model.points_3d, self.points_3d, bounds=self.bounds)
         if mesh is None:
             fix = "give that of the training model `nearest`, read from its mesh_path"
             raise InputError("a learned shape has no mesh of its own", where="mesh", fix=fix)
         source = self.nearest.points_3d
         known = np.isfinite(source).all(axis=1)
-        return warp_mesh(mesh, source[known], self.points_3d[known])
+        return warp_mesh(mesh, source[known], self.points_3d[known], bounds=self.bounds)
 
     @property
     def nearest(self) -> NearestShape:
@@ -168,6 +170,25 @@ class AlignResult:
         if not isinstance(self.model, ShapeModel):
             raise InputError("only a learned shape has training models", where="model")
         return self.model.nearest(self.points_3d)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the result as plain lists and numbers, for JSON; its model is not part of it."""
+        from cadalign.fitting.joint.document import write_result
+
+        return write_result(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> AlignResult:
+        """Read what `to_dict` wrote.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        from cadalign.fitting.joint.document import read_result
+
+        return read_result(data)
 
     def __str__(self) -> str:
         count = sum(int(inliers.sum()) for inliers in self.inliers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +21,9 @@ _LEAST_DEPTH = 1e-9
 def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
     """Poses (S, P, 12) and log scales (S, 3); none where every view has too few keypoints.
 
-    The shape's uncertainty, seen from the distance at which the mean has the size of the image of
-    it, widens the keypoints' own.
+    Where every view has a pose of its own, the likeliest ones are taken together, and then one of
+    them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
+    the size of its image, widens the keypoints' own.
     """
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
@@ -33,8 +33,16 @@ def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
         camera = rig.cam_from_rig[view]
         moved = [(in_rig(pose, camera), scales) for pose, scales in found]
         per_pose[rig.pose[view]].extend(moved)
-    combinations = list(product(*(range(len(each)) for each in per_pose)))
-    combinations = sorted(combinations, key=sum)[:_MOST]
+    if not all(per_pose):
+        return np.empty((0, poses, 12)), np.empty((0, 3))
+    first = [0] * poses
+    others = [
+        [*first[:p], rank, *first[p + 1 :]]
+        for rank in range(1, _MOST_PER_VIEW)
+        for p in range(poses)
+        if rank < len(per_pose[p])
+    ]
+    combinations = [first, *others][:_MOST]
     chosen = [[per_pose[p][k] for p, k in enumerate(ranks)] for ranks in combinations]
     stacked = np.array([[pose for pose, _ in each] for each in chosen]).reshape(-1, poses, 12)
     scales = np.array([each[0][1] for each in chosen]).reshape(-1, 3)

@@ -85,23 +85,24 @@ def move_state(
         moved.log_scales[a] = state.log_scales[a] + log_step
     for k in range(state.coefficients.shape[0]):
         moved.coefficients[k] = state.coefficients[k] + step[6 * poses + 3 + k]
-    last = -1
-    right = np.empty(3)
-    for n in range(evidence.sightings.point.shape[0]):
-        i = evidence.sightings.point[n]
-        if i == last or not evidence.shape.spread[i] > 0:
+    sightings, rows, first = evidence.sightings, system.rows, system.first
+    unknowns = step.shape[0]
+    n = 0
+    while n < sightings.point.shape[0]:
+        i = sightings.point[n]
+        start = first[n]
+        while n < sightings.point.shape[0] and sightings.point[n] == i:
+            n += 1
+        if not evidence.shape.spread[i] > 0:
             continue
-        last = i
-        own, coupling = system.own[i], system.coupling[i]
-        for a in range(3):
-            right[a] = -own[a, 3]
-            for k in range(step.shape[0]):
-                right[a] -= coupling[a, k] * step[k]
-        for a in range(2, -1, -1):
-            for b in range(a + 1, 3):
-                right[a] -= own[b, a] * right[b]
-            right[a] /= own[a, a]
-            moved.displacements[i, a] = state.displacements[i, a] + right[a]
+        moved.displacements[i] = 0.0
+        for c in range(start, first[n]):
+            residual = rows[unknowns, c]
+            for k in range(unknowns):
+                residual += rows[k, c] * step[k]
+            residual *= -(evidence.shape.spread[i] ** 2)
+            for a in range(3):
+                moved.displacements[i, a] += residual * rows[unknowns + 1 + a, c]
 
 
 @kernel

@@ -129,14 +129,8 @@ def score_of(evidence: Evidence, state: State, system: System) -> float:
     score = cost
     for k in range(unknowns):
         score += 2.0 * np.log(factor[k, k])
-    last = -1
-    for n in range(evidence.sightings.point.shape[0]):
-        i = evidence.sightings.point[n]
-        if i != last and evidence.shape.spread[i] > 0:
-            for a in range(3):
-                score += 2.0 * np.log(system.own[i, a, a] * evidence.shape.spread[i])
-        last = i
-    return score
+    score += system.log_determinant[0]
+    return float(score)
 
 
 @kernel
@@ -167,39 +161,33 @@ def joint_covariance(evidence: Evidence, state: State) -> tuple[FloatArray, Floa
         column[k] = 1.0
         solve_cholesky(factor, unknowns, column)
         covariance[:, k] = column
-    seen = np.zeros(points, dtype=np.bool_)
-    for n in range(evidence.sightings.point.shape[0]):
-        seen[evidence.sightings.point[n]] = True
     scale = np.exp(state.log_scales)
+    starts = np.zeros(points, dtype=np.int64)
+    ends = np.zeros(points, dtype=np.int64)
+    for n in range(evidence.sightings.point.shape[0]):
+        i = evidence.sightings.point[n]
+        if ends[i] == 0:
+            starts[i] = system.first[n]
+        ends[i] = system.first[n + 1]
     for i in range(points):
         rows = np.zeros((3, unknowns))
+        own = np.zeros((3, 3))
         for a in range(3):
             value = evidence.shape.mean[i, a]
             for k in range(modes):
                 value += state.coefficients[k] * evidence.shape.modes[k, i, a]
                 rows[a, first + 3 + k] = scale[a] * evidence.shape.modes[k, i, a]
             rows[a, first + a] = scale[a] * value
-        spread = evidence.shape.spread[i]
-        own = np.zeros((3, 3))
-        if spread > 0 and seen[i]:
-            inverse = _inverse_factor(system.own[i])
-            own = inverse.T @ inverse
-            rows -= inverse.T @ system.coupling[i]
-        elif spread > 0:
+        square = evidence.shape.spread[i] ** 2
+        for a in range(3):
+            own[a, a] = square
+        for c in range(starts[i], ends[i]):
+            by_own = system.rows[unknowns + 1 :, c]
+            by_others = system.rows[:unknowns, c]
             for a in range(3):
-                own[a, a] = spread * spread
+                for b in range(3):
+                    own[a, b] -= square * square * by_own[a] * by_own[b]
+                for k in range(unknowns):
+                    rows[a, k] -= square * by_own[a] * by_others[k]
         of_points[i] = rows @ covariance @ rows.T + own
     return covariance, of_points
-
-
-@kernel
-def _inverse_factor(own: FloatArray) -> FloatArray:
-    """The inverse (3, 3) of a lower Cholesky factor."""
-    inverse = np.zeros((3, 3))
-    for c in range(3):
-        for a in range(c, 3):
-            total = 1.0 if a == c else 0.0
-            for b in range(c, a):
-                total -= own[a, b] * inverse[b, c]
-            inverse[a, c] = total / own[a, a]
-    return inverse

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -238,6 +239,29 @@ def test_residuals_beyond_their_sigma_are_reported() -> None:
     model, rng = spreads(0.01), np.random.default_rng(0)
     view = seen(keypoints(), truth_of((1, 1, 1)), np.eye(4), noise=rng.normal(0, 20, (10, 2)))
     assert any("times as large as sigma" in text for text in align(model, view).warnings)
+
+
+def test_a_result_survives_json() -> None:
+    model, rng = spreads(0.05), np.random.default_rng(0)
+    noise = rng.normal(0, 3, (10, 2))
+    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(a), noise=noise) for a in (0, 20)]
+    result = align(model, views)
+    text = json.dumps(result.to_dict(), allow_nan=False)
+    again = AlignResult.from_dict(json.loads(text))
+    assert json.dumps(again.to_dict()) == text
+    assert str(again) == str(result)
+
+
+def test_a_damaged_result_is_refused_by_field() -> None:
+    data = align(spreads(0.05), seen(keypoints(), truth_of((1, 1, 1)), np.eye(4))).to_dict()
+    for name, value, message in (
+        ("covariance", [[1.0]], "alignment result: covariance: shape (1, 1), expected (9, 9)"),
+        ("views", [], "alignment result: views: there are none"),
+        ("ids", [1], "alignment result: ids: 1 entries, but points_3d has 10"),
+    ):
+        with pytest.raises(InputError) as caught:
+            AlignResult.from_dict({**data, name: value})
+        assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,185 @@
+"""From minima of the joint estimate to its result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.prior import ShapePrior
+from cadalign.fitting.joint.result import AlignAlternative, AlignResult
+from cadalign.fitting.joint.view import View
+from cadalign.fitting.joint.warnings import warnings_of
+from cadalign.fitting.result import FitStats
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.search import joint_covariance
+
+_LEAST_LIKELIHOOD = 1e-3
+_SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
+
+
+class Minimum(NamedTuple):
+    """An estimate under one component of the prior; ``score`` is -2 log of its probability."""
+
+    component: int
+    inliers: BoolArray
+    evidence: Evidence
+    state: State
+    cost: float
+    score: float
+
+
+class _Estimate(NamedTuple):
+    """A minimum in the terms of the result, points and ``lengths`` of the box with its corners."""
+
+    points: FloatArray
+    scale: FloatArray
+    poses: tuple[Alignment, ...]
+    lengths: FloatArray
+    covariance: FloatArray
+    of_points: FloatArray
+    likelihood: float
+
+
+def assemble(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    minima: Sequence[Minimum],
+    stats: FitStats,
+) -> AlignResult:
+    """The result of minima, the likeliest first.
+
+    Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
+    the likely minima are.
+    """
+    likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
+    likely = [
+        _estimate(each, likelihood)
+        for each, likelihood in zip(minima, likelihoods, strict=True)
+        if likelihood >= _LEAST_LIKELIHOOD
+    ]
+    best, minimum = likely[0], minima[0]
+    covariance, of_points = _moments(likely)
+    residuals = []
+    for view, pose in zip(views, best.poses, strict=True):
+        rows = prior.rows_of(view.keypoint_ids, "ids")
+        seen = view.camera.project(pose.apply(best.points[rows]))
+        residuals.append(seen - cast(FloatArray, view.points_2d))
+    stretch = best.lengths / np.where(prior.lengths > 0, prior.lengths, 1.0)
+    stretch = np.where(prior.lengths > 0, stretch, 1.0)
+    alternatives = tuple(
+        AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
+        for each in likely[1:]
+        if _differs(each, best)
+    )
+    return AlignResult(
+        alignment=best.poses[0],
+        ids=prior.ids,
+        points_3d=best.points[:-2],
+        bounds=best.points[-2:],
+        poses=best.poses,
+        residuals=tuple(residuals),
+        inliers=_inliers(prior, views, minimum),
+        covariance=covariance,
+        points_covariance=of_points[:-2],
+        stretch=stretch,
+        component=minimum.component,
+        model=model,
+        alternatives=alternatives,
+        warnings=warnings_of(minimum.evidence, minimum.cost, best.poses, stretch, covariance),
+        stats=stats,
+    )
+
+
+def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
+    scale = np.exp(minimum.state.log_scales)
+    stretched = points_of(minimum.evidence.shape, minimum.state)
+    unknowns, of_points = joint_covariance(minimum.evidence, minimum.state)
+    return _Estimate(
+        stretched / scale,
+        scale,
+        _poses(minimum, scale),
+        stretched[-1] - stretched[-2],
+        _pose_and_lengths(minimum, unknowns),
+        of_points,
+        likelihood,
+    )
+
+
+def _moments(likely: Sequence[_Estimate]) -> tuple[FloatArray, FloatArray]:
+    """Second moments (9, 9) and (m + 2, 3, 3) of a mixture of estimates about the first."""
+    total = sum(each.likelihood for each in likely)
+    best = likely[0]
+    covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
+    for each in likely:
+        weight = each.likelihood / total
+        step = _step(best, each)
+        covariance += weight * (each.covariance + np.outer(step, step))
+        moved = each.points * each.scale - best.points * best.scale
+        of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
+    return covariance, of_points
+
+
+def _step(best: _Estimate, other: _Estimate) -> FloatArray:
+    """Rotation vector, translation and log lengths (9,) that lead from one estimate to another."""
+    first, second = best.poses[0], other.poses[0]
+    logs = np.zeros(3)
+    safe = (best.lengths > 0) & (other.lengths > 0)
+    logs[safe] = np.log(other.lengths[safe] / best.lengths[safe])
+    turn = vector_from_rotation(second.rotation @ first.rotation.T)
+    return np.concatenate([turn, second.translation - first.translation, logs])
+
+
+def _differs(other: _Estimate, best: _Estimate) -> bool:
+    """True for a pose that is not within the deviations of the best one."""
+    step = _step(best, other)[:3]
+    return bool(step @ np.linalg.pinv(best.covariance[:3, :3]) @ step > _SAME)
+
+
+def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
+    """The inliers of every view, in its own order of keypoints."""
+    names = np.concatenate([prior.rows_of(view.keypoint_ids, "ids") for view in views])
+    kept = np.empty(len(names), dtype=bool)
+    kept[np.argsort(names, kind="stable")] = minimum.inliers
+    ends = np.cumsum([len(view.keypoint_ids) for view in views])
+    return tuple(np.split(kept, ends[:-1]))
+
+
+def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
+    """Alignments in every view's camera."""
+    rig = minimum.evidence.rig
+    poses = []
+    for camera, p in zip(rig.cam_from_rig, rig.pose, strict=True):
+        pose = minimum.state.poses[p]
+        rotation = camera[:9].reshape(3, 3)
+        turned = rotation @ pose[:9].reshape(3, 3)
+        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
+    return tuple(poses)
+
+
+def _pose_and_lengths(minimum: Minimum, unknowns: FloatArray) -> FloatArray:
+    """Covariance (9, 9) of the first camera's pose and the log lengths of the box."""
+    shape, state = minimum.evidence.shape, minimum.state
+    rig = minimum.evidence.rig
+    rotation = rig.cam_from_rig[0][:9].reshape(3, 3)
+    first = 6 * int(rig.pose.max() + 1)
+    rows = np.zeros((9, len(unknowns)))
+    pose = 6 * int(rig.pose[0])
+    rows[:3, pose : pose + 3] = rotation
+    rows[3:6, pose + 3 : pose + 6] = rotation
+    modes = shape.modes[:, -1] - shape.modes[:, -2]
+    extent = shape.mean[-1] - shape.mean[-2] + state.coefficients @ modes
+    safe = np.where(extent > 0, extent, np.inf)
+    own = np.zeros(9)
+    for axis in range(3):
+        rows[6 + axis, first + axis] = 1.0
+        rows[6 + axis, first + 3 :] = modes[:, axis] / safe[axis]
+        own[6 + axis] = (shape.spread[-2:] ** 2).sum() / safe[axis] ** 2
+    return np.asarray(rows @ unknowns @ rows.T + np.diag(own))

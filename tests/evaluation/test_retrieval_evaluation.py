@@ -25,7 +25,7 @@ from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, re
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.geometry.metrics import box_iou
+from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.shape import distances
 
@@ -167,6 +167,9 @@ class TestRows:
         assert row["rms_px"] == pytest.approx(best.rms)
         truth = Box.from_model(model.bounds, query.gt)
         assert row["box_iou"] == pytest.approx(box_iou(est=best.box, gt=truth))
+        up_to_scale = box_iou_up_to_scale(est=best.box, gt=truth)
+        assert row["box_iou_up_to_scale"] == pytest.approx(up_to_scale)
+        assert up_to_scale >= row["box_iou"]
 
     def test_without_a_view_there_was_nothing_to_ask(self, tmp_path: Path) -> None:
         """Keypoints inside the hull are never all visible."""
@@ -313,6 +316,7 @@ class TestSummaries:
             assert (summary["queries"], summary["failed"]) == (30, 0)
             ious = [row["box_iou"] for row in rows]
             assert summary["box_iou"] == pytest.approx(np.median(ious))
+            assert summary["box_iou_up_to_scale"] >= summary["box_iou"]
             assert summary["mean_box_iou"] == pytest.approx(np.mean(ious))
             assert summary["score"] == pytest.approx(np.mean([row["score"] for row in rows]))
             ranks = [row["rank"] for row in rows]

@@ -29,6 +29,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, rendere
 	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
 	$(BIN)/python -m pytest tests/fitting/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/benchmark_focal.py
+	$(BIN)/python scripts/benchmark_calibration.py
 	$(BIN)/python scripts/benchmark_render.py
 ifneq ($(CADALIGN_DATA),)
 	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet

@@ -17,7 +17,9 @@ BoolArray = npt.NDArray[np.bool_]
 _NUMBERS = (float, int, np.integer, np.floating)
 
 
-def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+def as_floats(
+    value: Any, *, name: str, shape: tuple[int | None, ...], finite: bool = True
+) -> FloatArray:
     """Convert to a float array of the given shape and refuse NaN and infinity.
 
     Parameters
@@ -28,6 +30,8 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
         The argument's name, for the message.
     shape : tuple of int or None
         The required shape; ``None`` for any length.
+    finite : bool
+        Refuse NaN and infinity.
 
     Returns
     -------
@@ -40,11 +44,16 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
         If it is not numeric, has another shape, or holds NaN or infinite values.
     """
     try:
-        if np.asarray(value).dtype.kind in "cmM":  # complex numbers and times
-            raise TypeError(f"they are {np.asarray(value).dtype}")
+        found = np.asarray(value)
+        if found.dtype.kind in "cmM":  # complex numbers and times
+            raise TypeError(f"they are {found.dtype}")
         if np.ma.is_masked(value):
             raise TypeError("some are masked")
         array = np.ascontiguousarray(value, dtype=np.float64)
+        if found.dtype.kind in "SU" or (
+            found.dtype.kind == "O" and any(isinstance(each, str | bytes) for each in found.flat)
+        ):
+            raise TypeError("they are texts")
     except (TypeError, ValueError, OverflowError) as error:
         what = f"not an array of numbers ({str(error)[:200]})"
         raise InputError(what, where=name) from None
@@ -56,7 +65,7 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     ):
         wanted_text = ", ".join("n" if length is None else str(length) for length in shape)
         raise InputError(f"shape {array.shape}, expected ({wanted_text})", where=name)
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         raise InputError(describe_non_finite(array), where=name, fix="remove or repair these")
     return array
 

@@ -231,7 +231,7 @@ def _type_at(kind: Any, path: str | None) -> Any:
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer((path or "$")[1:]):
         kind = _without_none(kind)
-        if isinstance(kind, msgspec.inspect.StructType):
+        if isinstance(kind, msgspec.inspect.StructType | msgspec.inspect.DataclassType):
             types = {each.encode_name: each.type for each in kind.fields}
             kind = types.get(step["name"])
         else:

@@ -217,6 +217,9 @@ def learn_components(
     on_progress: Callable[[int, int], object],
 ) -> Learned:
     """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing."""
+    if (options.components or 1) > len(rows):
+        what = f"{options.components} are more than the {len(rows)} models"
+        raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
     # Threads of the linear algebra library make products of such small matrices 30 times slower.

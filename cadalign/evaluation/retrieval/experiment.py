@@ -79,6 +79,10 @@ COLUMNS: Columns = (
     *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
+REQUIRED_COLUMNS: Columns = tuple(
+    column for column in COLUMNS if column[0] != "box_iou_up_to_scale"
+)
+"""Those that all runs have; earlier ones lack the others."""
 
 
 @dataclass(frozen=True)

@@ -125,6 +125,12 @@ BOX_IOU_UP_TO_SCALE = replace(
     head="box IoU, up to scale",
     symbol="IoU~",
 )
+STATED_BOX_IOU_UP_TO_SCALE = replace(
+    BOX_IOU_UP_TO_SCALE,
+    key="stated_box_iou_up_to_scale",
+    label="IoU of the stated box, up to scale",
+    head="stated box IoU, up to scale",
+)
 RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
 
 # From the nearest truth that looks the same.

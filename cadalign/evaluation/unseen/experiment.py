@@ -14,8 +14,10 @@ translation_error, translation_error_up_to_scale
     object's bounding box]; the second after the estimate was scaled about the camera centre, since
     one image does not tell an object's size.
 box_iou, box_iou_up_to_scale
-    Of the box of the object's keypoints with the estimated one, the second likewise; empty for an
-    object without volume.
+    Of the boxes that the object's keypoints span, in truth and as estimated, the second likewise;
+    empty for an object without volume.
+stated_box_iou_up_to_scale
+    The same of the estimate's own box, which also holds keypoints that the object may lack.
 keypoint_error
     Root mean square distance of all keypoints of the object that the method estimates, also of
     those not given, from the true ones, after the estimate was scaled about the camera centre for
@@ -69,7 +71,8 @@ COLUMNS: Columns = (
     *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
     *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
-    *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
+    *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
+    ("keypoint_error", float),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
@@ -130,17 +133,18 @@ class UnseenExperiment:
 
 def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
     est, gt = found.alignment, sighting.gt
-    box, gt_box = Box.from_model(found.bounds, est), Box.from_model(sighting.bounds, gt)
+    ids = sighting.all_ids.tolist()
+    row_of = {name: row for row, name in enumerate(found.ids.tolist())}
+    known = np.flatnonzero([name in row_of for name in ids])
+    rows = np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
+    own = found.points_3d[rows]
+    box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
+    gt_box = Box.from_model(sighting.bounds, gt)
     boxes = {"est": box, "gt": gt_box}
     centres = {
         "est": Alignment(est.rotation, box.center, np.ones(3)),
         "gt": Alignment(gt.rotation, gt_box.center, np.ones(3)),
     }
-    ids = sighting.all_ids.tolist()
-    row_of = {name: row for row, name in enumerate(found.ids.tolist())}
-    known = np.flatnonzero([name in row_of for name in ids])
-    rows = np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
-    points, truth = found.points_3d[rows] @ est.linear.T + est.translation, gt.apply(sighting.xyz)
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
         "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in found.poses),
@@ -148,7 +152,10 @@ def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
         "translation_error_up_to_scale": translation_error_up_to_scale(**centres),
         "box_iou": overlap(**boxes),
         "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-        "keypoint_error": _distance_up_to_scale(points, truth[known]),
+        "stated_box_iou_up_to_scale": overlap_up_to_scale(
+            est=Box.from_model(found.bounds, est), gt=gt_box
+        ),
+        "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(sighting.xyz[known])),
     }
     if found.result is not None:
         values |= _coverage(found.result, sighting, known, rows)

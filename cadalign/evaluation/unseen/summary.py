@@ -32,7 +32,8 @@ from cadalign.evaluation.summary import (
 _MEDIANS = (
     *(metrics.ROTATION, metrics.BEST_ROTATION),
     *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
-    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
+    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.STATED_BOX_IOU_UP_TO_SCALE),
+    metrics.KEYPOINT_ERROR,
 )
 _COVERAGE = (
     *(metrics.ROTATION_IN_68, metrics.ROTATION_IN_95),
@@ -62,7 +63,6 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     shown = (
         *(metrics.INSTANCES, metrics.FAILED),
         *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
-        replace(metrics.BEST_ROTATION, digits=2),
         *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
         *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
     )

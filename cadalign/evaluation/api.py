@@ -48,7 +48,7 @@ def evaluate(
         ``--noise-px 2``. Those of ``keypointnet`` are the fields of
         `cadalign.evaluation.keypointnet.options.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
-        ``visibility``, ``render``, ``seed``.
+        ``shape``, ``visibility``, ``render``, ``seed``.
 
     Returns
     -------

@@ -9,13 +9,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.registry import spec_of
 from cadalign.io.files import dense_json, write_text, writing
 from cadalign.report.headline import headline_of
 from cadalign.report.instances import instance_table
 from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
 from cadalign.report.payload import payload_of
-from cadalign.report.runs import all_methods, read_runs
+from cadalign.report.runs import all_methods, read_runs, shown_metrics
 from cadalign.report.text import title_of
 from cadalign.web import asset, fill
 
@@ -63,7 +62,7 @@ def write_report(
         page.parent.mkdir(parents=True, exist_ok=True)
     table, media = None, {}
     folder = None
-    metrics = spec_of(found[0]).metrics
+    metrics = shown_metrics(found)
     if metrics:
         table = instance_table(found, all_methods(found), metrics)
         if assets or inline_bytes(found) > INLINE_LIMIT:

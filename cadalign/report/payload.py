@@ -55,7 +55,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.report.headline import Headline
 from cadalign.report.instances import InstanceTable
 from cadalign.report.looks import method_dict
-from cadalign.report.runs import all_methods
+from cadalign.report.runs import all_methods, shown_metrics
 from cadalign.report.text import settings_of, summary_of
 
 _FORMAT = 1
@@ -91,7 +91,7 @@ def payload_of(
             for run in runs
         ],
         "methods": [method_dict(name) for name in all_methods(runs)],
-        "metrics": [metric.page() for metric in spec.metrics],
+        "metrics": [metric.page() for metric in shown_metrics(runs)],
         "headline": headline.to_dict(),
         "tables": None if table is None else table.to_dict(),
         "plots": [plot.to_dict() for plot in spec.plots(runs)],

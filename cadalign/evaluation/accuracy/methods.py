@@ -13,6 +13,9 @@ from cadalign.fitting.options import METHODS, RansacOptions
 LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cramer_rao.limit_estimate`."""
 
+SHAPE = "shape"
+"""The alignment of a category's learned shape, in runs that are given one."""
+
 # Names for a method together with options of `cadalign.fit`.
 _VARIANTS: dict[str, dict[str, Any]] = {
     "optimal-huber": {"method": "optimal", "loss": "huber"},

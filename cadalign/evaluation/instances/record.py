@@ -19,7 +19,9 @@ A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON 
     }
 
 ``bounds`` and ``points_3d`` are those of the model that the methods were given, which is the
-dataset's times ``stretch``. ``std`` and ``sigma`` are null for methods that have none.
+dataset's times ``stretch``. The estimate of the method ``shape``, which is not given that model,
+takes the model's box to the estimated one; its ``std`` is that of lengths relative to the mean
+shape. ``std`` and ``sigma`` are null for methods that have none.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
+from cadalign.evaluation.instances.aligned import AlignedShape
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -53,13 +56,14 @@ _LONGEST_NAME = 200  # bytes
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
 
-Estimate = FitResult | Alignment | CadalignError
-"""A fit, an alignment of a method that tells no more, or the reason why there is none."""
+Estimate = FitResult | AlignedShape | Alignment | CadalignError
+"""A fit, the estimate of the object's own shape, the alignment of a method that tells no more, or
+the reason why there is none."""
 
 
-def pose_of(estimate: FitResult | Alignment) -> Alignment:
+def pose_of(estimate: FitResult | AlignedShape | Alignment) -> Alignment:
     """The alignment of an estimate."""
-    return estimate.alignment if isinstance(estimate, FitResult) else estimate
+    return estimate if isinstance(estimate, Alignment) else estimate.alignment
 
 
 def record_row(
@@ -107,7 +111,7 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     method = outcome.names["method"]
     if not outcome.is_ok or isinstance(estimate, CadalignError):
         return {"method": method, "reason": outcome.reason}
-    fit = estimate if isinstance(estimate, FitResult) else None
+    fit = None if isinstance(estimate, Alignment) else estimate
     return {
         "method": method,
         **_pose(pose_of(estimate)),

@@ -24,6 +24,8 @@ symmetry
 sym_rotation_error_deg, sym_translation_error, sym_box_iou
     The same errors from the nearest truth that looks the same; see
     `cadalign.evaluation.instances.symmetry`. Errors of the scale do not depend on it.
+translation_error_up_to_scale, box_iou_up_to_scale
+    Of runs with learned shapes: after the estimate was scaled about the camera centre.
 
 The metrics of failed rows are empty.
 """
@@ -39,7 +41,8 @@ import numpy as np
 
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, fit_options, has_statistics
+from cadalign.evaluation.accuracy.methods import LIMIT, SHAPE, fit_options, has_statistics
+from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
@@ -50,14 +53,27 @@ from cadalign.evaluation.instances.instance import (
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
 from cadalign.evaluation.instances.symmetry import SymmetryGroup
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
-from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reason_of
+from cadalign.evaluation.metrics import (
+    BOX_IOU_UP_TO_SCALE,
+    TRANSLATION_UP_TO_SCALE,
+    UP_TO_SCALE,
+)
+from cadalign.evaluation.outcome import (
+    Outcome,
+    alignment_errors,
+    overlap,
+    overlap_up_to_scale,
+    reason_of,
+)
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import translation_error_up_to_scale
 from cadalign.geometry.projection import perspective
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
@@ -70,6 +86,7 @@ COLUMNS: Columns = (
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
     *((f"sym_{name}", float) for name in _POSE_ERRORS),
 )
+"""Columns of every run."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +97,24 @@ class KeypointNetExperiment:
     if one is given; its folders for pictures must exist.
     """
 
-    columns = COLUMNS
     # A method's share of the seconds that its chunk took.
     timing_columns = (*_NAMES, ("seconds", float))
     record_columns = RECORD_COLUMNS
 
     options: KeypointNetOptions
     drawn_in: RunFolder | None
+    shapes: ShapeFiles = NO_SHAPES
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of the result table."""
+        more = UP_TO_SCALE if self.shapes.paths else ()
+        return (*COLUMNS, *((metric.key, float) for metric in more))
+
+    def methods_for(self, category: str) -> tuple[str, ...]:
+        """The methods for the models of a category, that of its learned shape the last."""
+        known = category in dict(self.shapes.paths)
+        return (*self.options.methods, SHAPE) if known else self.options.methods
 
     def warm_up(self) -> None:
         """Compile solvers and metrics."""
@@ -113,11 +141,16 @@ class KeypointNetExperiment:
             except Exception as error:
                 instances.append(reason_of(error))
             extra.append(time.perf_counter() - start)
-        methods = self.options.methods
-        per_method = [self._evaluate_method(method, tasks, instances) for method in methods]
+        answers_of: list[list[tuple[Outcome, Estimate]]] = [[] for _ in tasks]
+        for method in (*self.options.methods, SHAPE):
+            places = [
+                k for k, task in enumerate(tasks) if method in self.methods_for(task.category)
+            ]
+            chosen = [tasks[k] for k in places], [instances[k] for k in places]
+            for k, answer in zip(places, self._evaluate_method(method, *chosen), strict=True):
+                answers_of[k].append(answer)
         outcomes, records = [], []
-        for k, instance in enumerate(instances):
-            answers = [answers[k] for answers in per_method]
+        for k, (instance, answers) in enumerate(zip(instances, answers_of, strict=True)):
             found = [outcome for outcome, _ in answers]
             # The first method's row bears the time of making the instance.
             outcomes += [found[0].after(extra[k]), *found[1:]]
@@ -127,7 +160,8 @@ class KeypointNetExperiment:
 
     def failure(self, task: KeypointTask, reason: str) -> Rows:
         """A failed row for every method."""
-        return Rows.of(_failure(task, method, reason) for method in self.options.methods)
+        methods = self.methods_for(task.category)
+        return Rows.of(_failure(task, method, reason) for method in methods)
 
     def _instance(self, task: KeypointTask) -> Instance:
         if task.problem:
@@ -143,9 +177,13 @@ class KeypointNetExperiment:
         self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | str]
     ) -> list[tuple[Outcome, Estimate]]:
         """One method's outcome, and the estimate it is of, for every task."""
-        usable = [instance for instance in instances if isinstance(instance, Instance)]
+        pairs = zip(tasks, instances, strict=True)
+        usable = [(task, each) for task, each in pairs if isinstance(each, Instance)]
         start = time.perf_counter()
-        estimates = iter(self._estimates(method, usable))
+        if method == SHAPE:
+            estimates = iter([self._aligned(task, instance) for task, instance in usable])
+        else:
+            estimates = iter(self._estimates(method, [instance for _, instance in usable]))
         share = (time.perf_counter() - start) / max(len(usable), 1)
         answers: list[tuple[Outcome, Estimate]] = []
         for task, instance in zip(tasks, instances, strict=True):
@@ -189,6 +227,16 @@ class KeypointNetExperiment:
         except CadalignError as error:
             return error
 
+    def _aligned(self, task: KeypointTask, instance: Instance) -> Estimate:
+        """The estimate from the learned shape of the model's category."""
+        shape = self.shapes.shape(task.category)
+        assert shape is not None
+        sigma = self.options.noise_px or 1.0
+        try:
+            return align_instance(shape, instance, task.semantic_ids, sigma=sigma)
+        except CadalignError as error:
+            return error
+
     def _outcome(
         self, task: KeypointTask, instance: Instance, method: str, estimate: Estimate
     ) -> Outcome:
@@ -208,8 +256,11 @@ class KeypointNetExperiment:
             {
                 **_facts(task, instance),
                 **metrics,
-                "rms_px": _rms(instance, alignment),
+                "rms_px": estimate.rms
+                if isinstance(estimate, AlignedShape)
+                else _rms(instance, alignment),
                 **{f"sym_{name}": aware[name] for name in _POSE_ERRORS},
+                **(_errors_up_to_scale(alignment, instance) if self.shapes.paths else {}),
             },
         )
 
@@ -226,6 +277,16 @@ def _errors(
     return {
         **alignment_errors(est=est, gt=gt, length=instance.diagonal),
         "box_iou": overlap(est=box, gt=gt_box),
+    }
+
+
+def _errors_up_to_scale(est: Alignment, instance: Instance) -> dict[str, float | None]:
+    """Errors by column after the estimate was scaled about the camera centre."""
+    box = Box.from_model(instance.bounds, est)
+    shift = translation_error_up_to_scale(est=est, gt=instance.gt)
+    return {
+        TRANSLATION_UP_TO_SCALE.key: shift / instance.diagonal,
+        BOX_IOU_UP_TO_SCALE.key: overlap_up_to_scale(est=box, gt=instance.gt_box),
     }
 
 

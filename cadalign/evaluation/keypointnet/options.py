@@ -35,6 +35,10 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
     ransac-aepnp, and limit: the Cramer-Rao bound."""
+    shape: Path | None = None
+    """File of `cadalign shape learn`, or a folder of such files: adds the method shape, which
+    aligns the learned shape of the category and knows nothing of the model; and errors up to scale,
+    since one image does not tell the object's size."""
     visibility: Literal["auto", "rays", "hull"] = "auto"
     """Keypoints are seen that rays cast at the mesh reach, or by a rule on the hull of the
     keypoints; auto takes rays where there is a mesh."""

@@ -11,9 +11,10 @@ from cadalign.datasets import KeypointNet
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.figures import draw_figures
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
-from cadalign.evaluation.metrics import INSTANCE_METRICS
+from cadalign.evaluation.metrics import INSTANCE_METRICS, UP_TO_SCALE
 from cadalign.evaluation.paper.table import PERCENT_NOTE, paper_lines
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -28,9 +29,17 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     dataset = KeypointNet(options.root).subset(categories=options.categories, split=options.split)
     tasks = KeypointTasks(dataset, options)
     drawn = options.render == "overlay"
-    experiment = KeypointNetExperiment(options, folder.made_for_pictures() if drawn else None)
+    shapes = NO_SHAPES
+    of_shapes: dict[str, Any] = {}
+    if options.shape is not None:
+        shapes = ShapeFiles.find(options.shape, dataset.categories)
+        of_shapes = {"shape": str(options.shape.absolute()), "shapes": shapes.fingerprint()}
+    pictures = folder.made_for_pictures() if drawn else None
+    experiment = KeypointNetExperiment(options, pictures, shapes)
+    given = {name: value for name, value in asdict(options).items() if name != "shape"}
     config = {
-        **asdict(options),
+        **given,
+        **of_shapes,
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),
@@ -63,7 +72,7 @@ ON_INSTANCES: dict[str, Any] = {
     "summarize": summarize,
     "lines": lines,
     "table": console_table,
-    "metrics": INSTANCE_METRICS,
+    "metrics": (*INSTANCE_METRICS, *UP_TO_SCALE),
     "kind": lambda run: "views of models",
     "title": partial(on_datasets, "alignment"),
     "describe": describe,

@@ -1,10 +1,11 @@
 """Medians and success rates of methods on the models of a category.
 
 Cells of a summary: ``instances`` and ``failed``; ``keypoints``, the mean number of those that did
-not fail; medians of the result table's errors over these, NaN where all failed;
-``success_5deg_5pct`` and ``success_10deg_10pct``, the share of all instances, failed ones too, with
-symmetry-aware rotation error, translation error in diagonals of the model and both relative scale
-errors at most this; ``over_limit``, the median rotation error over that of the Cramer-Rao bound.
+not fail; medians of the result table's errors over these, NaN where all failed; those up to scale
+only in runs that have them; ``success_5deg_5pct`` and ``success_10deg_10pct``, the share of all
+instances, failed ones too, with symmetry-aware rotation error, translation error in diagonals of
+the model and both relative scale errors at most this; ``over_limit``, the median rotation error
+over that of the Cramer-Rao bound.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of, where
 
 MEDIANS = tuple(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS)
+_UP_TO_SCALE = tuple(metric.key for metric in metrics.UP_TO_SCALE)
 TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
 )
 """Columns of the plain medians."""
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, *TABLE, metrics.SYM_ROTATION),
+    *(metrics.INSTANCES, metrics.FAILED, *TABLE, *metrics.UP_TO_SCALE, metrics.SYM_ROTATION),
     *(metrics.SUCCESS_5, metrics.SUCCESS_10, metrics.OVER_BOUND),
 )
 
@@ -66,7 +68,10 @@ def texts(summary: Summary) -> list[str]:
 
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """The summaries for the console."""
-    shown = (metrics.INSTANCES, metrics.FAILED, *TABLE, metrics.SYM_ROTATION, metrics.SUCCESS_5)
+    rest = (metrics.SYM_ROTATION, metrics.SUCCESS_5)
+    if any(name in run.cells for name in _UP_TO_SCALE):  # the table must not be wider
+        rest = metrics.UP_TO_SCALE
+    shown = (metrics.INSTANCES, metrics.FAILED, *TABLE, *rest)
     return ConsoleTable(
         title="Medians per category and method; success over all instances",
         labels=("category", "method"),
@@ -75,7 +80,9 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
             (s.group, s.method, *(column.text(s[column.key]) for column in shown))
             for s in summaries
         ],
-        note="t in model diagonals; * rotations that map a model onto itself are no errors",
+        note="t in model diagonals; * rotations that map a model onto itself are no errors"
+        if rest is not metrics.UP_TO_SCALE
+        else "t in model diagonals; ~ up to scale: one image does not tell the size",
     )
 
 
@@ -83,7 +90,8 @@ def _summarize_method(category: str, method: str, cells: Cells, bound: float) ->
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
     count = int(chosen.sum())
-    medians = {name: median_of(solved[name]) for name in MEDIANS}
+    known = [name for name in _UP_TO_SCALE if name in solved]
+    medians = {name: median_of(solved[name]) for name in (*MEDIANS, *known)}
     values = {
         "instances": count,
         "failed": count - len(solved["method"]),

@@ -1,0 +1,132 @@
+"""An aligned shape in the terms of an instance: as if its box were the given model's, stretched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray
+from cadalign.evaluation.instances.instance import Instance
+from cadalign.fitting.joint.align import align
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.view import View
+from cadalign.fitting.uncertainty import Uncertainty
+from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
+
+_LEAST_SCALE = 1e-6
+
+
+@dataclass(frozen=True)
+class AlignedAlternative:
+    """Another likely estimate; see `AlignedShape`."""
+
+    alignment: Alignment
+    relative_likelihood: float
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedShape:
+    """The estimate of an object's own shape, for an instance's record.
+
+    Parameters
+    ----------
+    alignment : Alignment
+        Takes the box of the model that other methods are given to the estimated one.
+    std : Uncertainty
+    rms : float
+        Of the residuals [px].
+    sigma : float
+        Standard deviation of the keypoints [px].
+    warnings : tuple of str
+    alternatives : tuple of AlignedAlternative
+    """
+
+    alignment: Alignment
+    std: Uncertainty
+    rms: float
+    sigma: float
+    warnings: tuple[str, ...]
+    alternatives: tuple[AlignedAlternative, ...]
+
+
+def align_instance(
+    shape: ShapeModel, instance: Instance, own_ids: npt.ArrayLike, *, sigma: float
+) -> AlignedShape:
+    """Align a category's shape with an instance's keypoints, of which the shape knows.
+
+    Parameters
+    ----------
+    shape : ShapeModel
+    instance : Instance
+    own_ids : (k,) int
+        Semantic ids of all keypoints of the instance's model, whose extent is its box where it has
+        no mesh.
+    sigma : float
+        Standard deviation of the keypoints [px].
+
+    Raises
+    ------
+    DegenerateError
+        As `cadalign.align`.
+    """
+    known = np.isin(instance.semantic_ids, shape.ids)
+    view = View(
+        instance.camera,
+        instance.points_2d[known],
+        ids=instance.semantic_ids[known].tolist(),
+        sigma=sigma,
+    )
+    result = align(shape, view)
+    rows = np.isin(shape.ids, own_ids)
+
+    def in_terms_of_the_model(
+        alignment: Alignment, points: FloatArray, bounds: FloatArray
+    ) -> Alignment:
+        if instance.scene is None and rows.any():
+            bounds = np.stack([points[rows].min(axis=0), points[rows].max(axis=0)])
+        return box_alignment(alignment, bounds, model_bounds=instance.bounds)
+
+    return AlignedShape(
+        in_terms_of_the_model(result.alignment, result.points_3d, result.bounds),
+        result.std,
+        _rms(result),
+        sigma,
+        result.warnings,
+        tuple(
+            AlignedAlternative(
+                in_terms_of_the_model(each.alignment, each.points_3d, each.bounds),
+                each.relative_likelihood,
+            )
+            for each in result.alternatives
+        ),
+    )
+
+
+def box_alignment(
+    alignment: Alignment, bounds: FloatArray, *, model_bounds: FloatArray
+) -> Alignment:
+    """The alignment that takes a model's box to where another one takes given bounds (2, 3).
+
+    Examples
+    --------
+    >>> found = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
+    >>> other = box_alignment(found, np.array([[0, 0, 0], [1, 2, 3]]),
+    ...                       model_bounds=np.array([[-1, -1, -1], [1, 1, 1]]))
+    >>> other.scale.tolist(), other.translation.tolist()
+    ([0.5, 1.0, 1.5], [0.5, 1.0, 5.5])
+    """
+    lengths, given = np.ptp(bounds, axis=0) * alignment.scale, np.ptp(model_bounds, axis=0)
+    scale = np.maximum(lengths, _LEAST_SCALE) / np.where(given > 0, given, 1.0)
+    scale = np.where(given > 0, scale, 1.0)
+    center = alignment.apply(bounds.mean(axis=0)[None])[0]
+    shift = alignment.rotation @ (scale * model_bounds.mean(axis=0))
+    return Alignment(alignment.rotation, center - shift, scale)
+
+
+def _rms(result: AlignResult) -> float:
+    """Root mean square residual [px], outliers included, as of the other methods."""
+    (residuals,) = result.residuals
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

@@ -61,6 +61,8 @@ class ShapeComponent:
             raise InputError(what, where="residual_sigma", fix="give a number, 0 or more")
         if not is_number(self.weight) or not 0 < self.weight <= 1:
             raise InputError(f"{self.weight!r} is not in (0, 1]", where="weight")
+        object.__setattr__(self, "weight", float(self.weight))
+        object.__setattr__(self, "residual_sigma", float(self.residual_sigma))
         object.__setattr__(self, "mean", read_only(mean))
         object.__setattr__(self, "modes", read_only(modes))
 

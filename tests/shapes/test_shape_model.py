@@ -180,6 +180,14 @@ def test_the_nearest_model_is_itself(learned: ShapeModel) -> None:
         assert nearest.distance < 1e-6
 
 
+def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
+    mean = np.array([[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 1]], float)
+    made = ShapeModel.from_basis(mean, [np.ones((4, 3))], [0.5], residual_sigma=np.float64(0.1))
+    made.save(tmp_path / "made.shape")
+    opened = ShapeModel.open(tmp_path / "made.shape")
+    assert opened.components[0].residual_sigma == 0.1
+
+
 def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     learned.save(tmp_path / "table.shape")
     opened = cadalign.ShapeModel.open(tmp_path / "table.shape")

@@ -3,17 +3,21 @@
 from cadalign.geometry.metrics import (
     alignment_box_iou,
     box_iou,
+    box_iou_up_to_scale,
     reprojection_error,
     rotation_error,
     scale_error,
     translation_error,
+    translation_error_up_to_scale,
 )
 
 __all__ = [
     "alignment_box_iou",
     "box_iou",
+    "box_iou_up_to_scale",
     "reprojection_error",
     "rotation_error",
     "scale_error",
     "translation_error",
+    "translation_error_up_to_scale",
 ]

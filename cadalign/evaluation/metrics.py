@@ -110,6 +110,21 @@ SCALE_Z = replace(
     SCALE_Y, key="scale_z_error", label="error of s_z", head="s_z error", symbol="s_z %"
 )
 BOX_IOU = Metric("box_iou", "box IoU", digits=3, better=HIGH, symbol="IoU", log=False)
+TRANSLATION_UP_TO_SCALE = replace(
+    TRANSLATION,
+    key="translation_error_up_to_scale",
+    label="translation error, up to scale",
+    head="t error, up to scale",
+    symbol="t~",
+)
+"""After the estimate was scaled about the camera centre: one image does not tell the size."""
+BOX_IOU_UP_TO_SCALE = replace(
+    BOX_IOU,
+    key="box_iou_up_to_scale",
+    label="box IoU, up to scale",
+    head="box IoU, up to scale",
+    symbol="IoU~",
+)
 RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
 
 # From the nearest truth that looks the same.
@@ -167,6 +182,36 @@ QUERY_MILLISECONDS = replace(
     MILLISECONDS, label="time of a query", head="time of a query", digits=1
 )
 MICROSECONDS = Metric("microseconds", "time of one call", "µs", digits=1)
+
+ROTATION_90 = replace(
+    ROTATION,
+    key="rotation_error_deg_90",
+    label="90th percentile of the rotation error",
+    head="R error, 90 %",
+    symbol="R90",
+)
+KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
+"""Root mean square, in the model's frame, of a method's estimate of all keypoints."""
+# Shares of the truths within regions of a stated probability.
+_COVERED = replace(_RATE, digits=0, better=None)
+ROTATION_IN_68 = replace(
+    _COVERED, key="rotation_in_68", label="rotations within 68 %", symbol="R in 68%"
+)
+ROTATION_IN_95 = replace(
+    _COVERED, key="rotation_in_95", label="rotations within 95 %", symbol="95%"
+)
+STRETCH_IN_68 = replace(
+    _COVERED, key="stretch_in_68", label="stretches within 68 %", symbol="s in 68%"
+)
+STRETCH_IN_95 = replace(_COVERED, key="stretch_in_95", label="stretches within 95 %", symbol="95%")
+KEYPOINTS_IN_68 = replace(
+    _COVERED, key="keypoints_within_68", label="keypoints within 68 %", symbol="kp in 68%"
+)
+KEYPOINTS_IN_95 = replace(
+    _COVERED, key="keypoints_within_95", label="keypoints within 95 %", symbol="95%"
+)
+COVERED = replace(_COVERED, key="covered", label="truths within the region")
+NOMINAL = replace(_COVERED, key="nominal", label="stated probability of a region")
 
 # What tasks are grouped by.
 CATEGORY = Metric("category", "category", better=None)

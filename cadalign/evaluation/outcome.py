@@ -9,7 +9,13 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-from cadalign.geometry.metrics import box_iou, rotation_error, scale_error, translation_error
+from cadalign.geometry.metrics import (
+    box_iou,
+    box_iou_up_to_scale,
+    rotation_error,
+    scale_error,
+    translation_error,
+)
 
 OK = "ok"
 FAILED = "failed"
@@ -69,6 +75,14 @@ def overlap(*, est: Box, gt: Box) -> float | None:
     """Intersection over union of two boxes; None where one has no volume."""
     try:
         return box_iou(est=est, gt=gt)
+    except InputError:
+        return None
+
+
+def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
+    """Like `overlap`, after the estimate was scaled about the camera centre."""
+    try:
+        return box_iou_up_to_scale(est=est, gt=gt)
     except InputError:
         return None
 

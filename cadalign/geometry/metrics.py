@@ -36,6 +36,25 @@ def translation_error(*, est: Alignment, gt: Alignment) -> float:
     return float(np.linalg.norm(est.translation - gt.translation))
 
 
+def translation_error_up_to_scale(*, est: Alignment, gt: Alignment) -> float:
+    """Distance of the true translation from the ray through the estimated one [model units].
+
+    One image does not tell a large object far away from a small one nearby: the estimate may be
+    scaled about the camera centre by any factor from 0 up. This is the error that remains for the
+    best factor, the norm of the true translation times the sine of the angle between the two; all
+    of the norm beyond 90 degrees.
+
+    Examples
+    --------
+    >>> est = Alignment(np.eye(3), [0, 0, 8], np.ones(3))
+    >>> translation_error_up_to_scale(est=est, gt=Alignment(np.eye(3), [0, 3, 4], np.ones(3)))
+    3.0
+    """
+    square = float(est.translation @ est.translation)
+    factor = max(float(est.translation @ gt.translation) / square, 0.0) if square > 0 else 0.0
+    return float(np.linalg.norm(factor * est.translation - gt.translation))
+
+
 def scale_error(*, est: Alignment, gt: Alignment) -> FloatArray:
     """Relative error of the scale along each axis, |s_est - s_gt| / s_gt; (3,) float, fractions.
 
@@ -94,13 +113,7 @@ def box_iou(*, est: Box, gt: Box) -> float:
     >>> round(box_iou(est=Box([1, 0, 0], np.eye(3), [2, 2, 2]), gt=gt), 12)
     0.333333333333
     """
-    for name, box in (("est", est), ("gt", gt)):
-        if not (box.extents > 1e-9 * box.extents.max()).all():
-            raise InputError(
-                f"the box {box.extents.tolist()} has no volume",
-                where=name,
-                fix="leave flat models out of volume metrics",
-            )
+    _check_volumes(est, gt)
     # A unit of about the boxes' own size keeps Qhull's tolerances meaningful.
     unit = max(float(est.extents.max()), float(gt.extents.max()))
     intersection = _intersection_volume(est, gt, unit)
@@ -108,10 +121,99 @@ def box_iou(*, est: Box, gt: Box) -> float:
     return float(np.clip(intersection / (volumes - intersection), 0.0, 1.0))
 
 
+def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
+    """Largest box IoU over all factors by which the estimate is scaled about the origin, 0 to 1.
+
+    The origin is the camera centre, of which one image does not tell an object's distance. Unlike
+    the IoU at equal distances of the two centres, this one does not change if estimate and truth
+    are exchanged, and a wrong length along the line of sight costs no more than it must.
+
+    Global, to 1e-6. Where the boxes s E and G intersect, the cube root of the intersection's volume
+    is a concave function of s (Brunn-Minkowski; the pairs of s and a point of s E form a convex
+    cone), and that of the sum of their volumes is convex. The IoU increases with the ratio of the
+    two, which therefore has no local maximum but the global one: a bounded scalar search finds it.
+    A linear program gives the range of s.
+
+    Raises
+    ------
+    InputError
+        If a box has no volume: the ratio means nothing then.
+
+    Examples
+    --------
+    >>> gt = Box([0, 0, 4], np.eye(3), [2, 2, 2])
+    >>> half = Box([0, 0, 2], np.eye(3), [1, 1, 1])
+    >>> box_iou(est=half, gt=gt) < 0.01, round(box_iou_up_to_scale(est=half, gt=gt), 9)
+    (True, 1.0)
+    """
+    from scipy.optimize import minimize_scalar
+
+    _check_volumes(est, gt)
+    found = _common_factors(est, gt)
+    if found is None:
+        return 0.0
+    low, high = found
+
+    def loss(logarithm: float) -> float:
+        factor = np.exp(logarithm)
+        return -box_iou(est=Box(factor * est.center, est.rotation, factor * est.extents), gt=gt)
+
+    # A perfect estimate has its maximum in a kink, which the search only comes close to.
+    likely = [np.cbrt(gt.volume / est.volume)]
+    if est.center.any() and gt.center.any():
+        likely.append(np.linalg.norm(gt.center) / np.linalg.norm(est.center))
+    losses = [loss(float(np.log(factor))) for factor in likely]
+    bounds = float(np.log(low)), float(np.log(high))
+    search = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-7})
+    return -min(float(search.fun), *losses)
+
+
 def alignment_box_iou(*, est: Alignment, gt: Alignment, bounds: npt.ArrayLike) -> float:
     """Box IoU of one model, with bounds (2, 3), under two alignments; see `box_iou`."""
     bounds = as_floats(bounds, name="bounds", shape=(2, 3))
     return box_iou(est=Box.from_model(bounds, est), gt=Box.from_model(bounds, gt))
+
+
+def _check_volumes(est: Box, gt: Box) -> None:
+    for name, box in (("est", est), ("gt", gt)):
+        if not (box.extents > 1e-9 * box.extents.max()).all():
+            raise InputError(
+                f"the box {box.extents.tolist()} has no volume",
+                where=name,
+                fix="leave flat models out of volume metrics",
+            )
+
+
+def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
+    """Range of the factors at which the scaled estimate meets the truth; None if there are none.
+
+    Factors at which one volume is over 1e9 times the other are left out.
+    """
+    from scipy.optimize import linprog
+
+    equal = float(np.cbrt(gt.volume / est.volume))
+    unit = float(gt.extents.max())
+    # Points x [units], factors s [of equal volumes]: |E' (x - s c)| <= s h, |G' (x - d)| <= k.
+    scaled = equal / unit
+    offset, half = scaled * (est.rotation.T @ est.center), scaled * est.extents / 2
+    fixed, reach = gt.rotation.T @ gt.center / unit, gt.extents / (2 * unit)
+    rows = np.vstack(
+        [
+            np.column_stack([-offset - half, est.rotation.T]),
+            np.column_stack([offset - half, -est.rotation.T]),
+            np.column_stack([np.zeros(3), gt.rotation.T]),
+            np.column_stack([np.zeros(3), -gt.rotation.T]),
+        ]
+    )
+    limits = np.concatenate([np.zeros(6), reach + fixed, reach - fixed])
+    bounds = [(1e-3, 1e3), (None, None), (None, None), (None, None)]
+    ends = []
+    for sign in (1.0, -1.0):
+        found = linprog([sign, 0.0, 0.0, 0.0], A_ub=rows, b_ub=limits, bounds=bounds)
+        if not found.success:
+            return None
+        ends.append(equal * float(found.x[0]))
+    return (ends[0], ends[1]) if ends[0] < ends[1] else None
 
 
 def _intersection_volume(first: Box, second: Box, unit: float) -> float:

@@ -28,7 +28,8 @@ _COMMANDS: dict[str, list[str]] = {
     "render": ["--out", "--width", "--height", "--view", "--style", "--background", "--keypoints"],
     "report": ["--out", "--format", "--assets"],
     "library": ["build", "show", "--out", "--categories"],
-    "evaluate": ["keypointnet", "show", "correspondences", "retrieval", "--methods", "--noise-px"],
+    "evaluate": ["keypointnet", "show", "correspondences", "retrieval", "unseen", "--methods",
+                 "--noise-px"],
 }  # fmt: skip
 
 

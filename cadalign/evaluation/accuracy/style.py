@@ -47,6 +47,13 @@ _LABELS = {
     "ransac-ap4p": "RANSAC, 4 points",
     "ransac-aepnp": "RANSAC, 6 points (AEPnP)",
     "ransac-aepnp-refined": "RANSAC, 6 points + refinement",
+    "shape": "shape model of the category (ours)",
+    "random-rigid": "another model, rigid",
+    "random-stretched": "another model, stretched",
+    "nearest": "nearest of the library",
+    "mean-rigid": "mean shape, rigid",
+    "mean-stretched": "mean shape, stretched",
+    "exact": "the object's own model",
     LIMIT: "Cramer-Rao bound",
 }
 
@@ -66,7 +73,8 @@ def look_of(method: str) -> Look:
     label = _LABELS.get(method, method)
     if method == LIMIT:
         return Look(label, "black", "", "--")
-    names = [name for name in method_names() if name != LIMIT]
+    # Those of `cadalign.fit` first.
+    names = [name for name in dict.fromkeys([*method_names(), *_LABELS]) if name != LIMIT]
     place = names.index(method) if method in names else len(names)
     return Look(label, _COLORS[place % len(_COLORS)], _MARKERS[place % len(_MARKERS)], "-")
 

@@ -1,0 +1,1 @@
+"""The experiment on objects that are no stretched copy of any model."""

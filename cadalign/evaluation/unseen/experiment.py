@@ -1,0 +1,181 @@
+"""Errors of methods on objects that are no stretched copy of any model.
+
+Columns of the result table, one row per view and method: what names the row (``category``,
+``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
+
+keypoints
+    Number of keypoints that were given.
+rotation_error_deg
+    [degrees]
+translation_error, translation_error_up_to_scale
+    [diagonals of the object's bounding box]; the second after the estimate was scaled about the
+    camera centre, since one image does not tell an object's size.
+box_iou, box_iou_up_to_scale
+    Of the box of the object's keypoints with the estimated one, the second likewise; empty for an
+    object without volume.
+keypoint_error
+    Root mean square distance, in the model's frame, of all keypoints of the object that the method
+    estimates, also of those not given, from the true ones [diagonals].
+rotation_level, stretch_level
+    Probability that the method gives the smallest region that holds the truth, about its estimate:
+    of a chi-square of 3 for the rotation, and of 2 for the ratios of the box's lengths, which are
+    free of the object's size. Uniform over [0, 1] where deviations are right; empty where the
+    method states none.
+keypoints_within_68, keypoints_within_95
+    Share of the object's keypoints that lie within the ellipsoids of these probabilities about
+    their estimates in the model's frame, whose unit is the diagonal of every model.
+
+The metrics of failed rows are empty.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cadalign.arrays import IntArray
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale, reason_of
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Rows
+from cadalign.evaluation.unseen.calibration import probability_level
+from cadalign.evaluation.unseen.learned import Learned
+from cadalign.evaluation.unseen.methods import ShapeEstimate, estimate_shape
+from cadalign.evaluation.unseen.options import UnseenOptions
+from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask, observe_object
+from cadalign.fitting.joint.align import align
+from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import (
+    rotation_error,
+    translation_error,
+    translation_error_up_to_scale,
+)
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.shapes.model import ShapeModel
+
+_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
+COLUMNS: Columns = (
+    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    *(("rotation_error_deg", float), ("translation_error", float)),
+    *(("translation_error_up_to_scale", float), ("box_iou", float)),
+    *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
+    *(("rotation_level", float), ("stretch_level", float)),
+    *(("keypoints_within_68", float), ("keypoints_within_95", float)),
+)
+# Free of the size: log(y / x) and log(z / x).
+_RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class UnseenExperiment:
+    """Evaluates methods on objects with what was learned from others."""
+
+    columns = COLUMNS
+    timing_columns = (*_NAMES, ("seconds", float))
+
+    learned: Learned
+    options: UnseenOptions
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        rng = np.random.default_rng(0)
+        points = rng.uniform(-0.3, 0.3, (9, 3))
+        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
+        pixels, ids = KEYPOINT_CAMERA.project(pose.apply(points)), np.arange(9)
+        sighting = Sighting(pixels, ids, ids, np.zeros(9, dtype=bool), pose, points, ids)
+        view = View(KEYPOINT_CAMERA, pixels)
+        for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
+            _coverage(align(model, view), sighting, ids, ids)
+        box = Box.from_model(sighting.bounds, pose)
+        overlap_up_to_scale(est=box, gt=box)
+
+    def evaluate(self, tasks: Sequence[UnseenTask]) -> Rows:
+        """A row for every task and method."""
+        return Rows.of(outcome for task in tasks for outcome in self._outcomes(task))
+
+    def failure(self, task: UnseenTask, reason: str) -> Rows:
+        """A failed row for every method."""
+        return Rows.of(Outcome.failure(reason, task.names(name)) for name in self.options.methods)
+
+    def _outcomes(self, task: UnseenTask) -> list[Outcome]:
+        try:
+            sighting = observe_object(task, self.options)
+        except Exception as error:
+            reason = reason_of(error)
+            return [Outcome.failure(reason, task.names(name)) for name in self.options.methods]
+        return [self._outcome(task, sighting, method) for method in self.options.methods]
+
+    def _outcome(self, task: UnseenTask, sighting: Sighting, method: str) -> Outcome:
+        names, facts = task.names(method), {"keypoints": len(sighting.points_2d)}
+        start = time.perf_counter()
+        try:
+            found = estimate_shape(method, task, sighting, self.learned, self.options)
+            seconds = time.perf_counter() - start
+            values = facts | _errors(found, sighting)
+        except Exception as error:
+            return Outcome.failure(reason_of(error), names, **facts)
+        return Outcome(names, values, seconds=seconds)
+
+
+def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
+    est, gt = found.alignment, sighting.gt
+    boxes = {
+        "est": Box.from_model(found.bounds, est),
+        "gt": Box.from_model(sighting.bounds, gt),
+    }
+    ids = sighting.all_ids.tolist()
+    row_of = {name: row for row, name in enumerate(found.ids.tolist())}
+    known = np.flatnonzero([name in row_of for name in ids])
+    rows = np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
+    gaps = found.points_3d[rows] * est.scale - sighting.xyz[known]
+    values: Row = {
+        "rotation_error_deg": rotation_error(est=est, gt=gt),
+        "translation_error": translation_error(est=est, gt=gt),
+        "translation_error_up_to_scale": translation_error_up_to_scale(est=est, gt=gt),
+        "box_iou": overlap(**boxes),
+        "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+        "keypoint_error": float(np.sqrt((gaps**2).sum(axis=1).mean())),
+    }
+    if found.result is not None:
+        values |= _coverage(found.result, sighting, known, rows)
+    return values
+
+
+def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:
+    """Where the truth lies in what the result states as probable; metrics by column.
+
+    ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the
+    model's keypoints that they are.
+    """
+    est = result.alignment
+    turn = vector_from_rotation(est.rotation @ sighting.gt.rotation.T)
+    lengths = np.ptp(result.bounds, axis=0) * est.scale
+    true_lengths = np.ptp(sighting.bounds, axis=0)
+    level = None
+    if (lengths > 0).all() and (true_lengths > 0).all():
+        ratios = _RATIOS @ np.log(lengths / true_lengths)
+        level = probability_level(ratios, _RATIOS @ result.covariance[6:, 6:] @ _RATIOS.T)
+    gaps = result.points_3d[rows] * est.scale - sighting.xyz[known]
+    levels = [
+        found
+        for gap, covariance in zip(gaps, result.points_covariance[rows], strict=True)
+        if (found := probability_level(gap, covariance)) is not None
+    ]
+    return {
+        "rotation_level": probability_level(turn, result.covariance[:3, :3]),
+        "stretch_level": level,
+        "keypoints_within_68": _share(levels, 0.68),
+        "keypoints_within_95": _share(levels, 0.95),
+    }
+
+
+def _share(levels: Sequence[float], nominal: float) -> float | None:
+    """Share of the levels that are at most the nominal one; None of none."""
+    return float((np.array(levels) <= nominal).mean()) if levels else None

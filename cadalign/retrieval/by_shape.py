@@ -13,8 +13,10 @@ object that it stands for:
 
 Keypoints that a model lacks are filled in with those that the category leads to expect. With
 several categories, each has the probability that its shape model gives to the image's keypoints.
-All models are ranked; none is searched for a pose. Matches have the pose of the estimated shape and
-the stretch that brings the model's keypoints and box closest to the estimated ones.
+All models are ranked, but those that would reach behind the camera; none is searched for a pose.
+Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
+box closest to the estimated ones. Of the options, ``scale_prior_sigma`` and ``exhaustive`` have no
+effect.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from functools import lru_cache
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.errors import DegenerateError, InputError
 from cadalign.fitting.joint.align import align
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.shape_posterior import ShapePosterior, gaussians_of, shape_posterior
@@ -124,7 +126,8 @@ def rank_by_shape(
     InputError
         If no shape model has 3 of the image's keypoints.
     DegenerateError
-        If a shape model cannot be aligned with the keypoints.
+        If a shape model cannot be aligned with the keypoints, or no model lies in front of the
+        camera.
     """
     parts = []
     for category, shape in sorted(shapes.items()):
@@ -142,6 +145,12 @@ def rank_by_shape(
             fix="check them, or rank without shape",
         )
     logs = np.concatenate([part.logs for part in parts])
+    if not len(logs):
+        raise DegenerateError(
+            "no model has all keypoints in front of the camera",
+            where="points_2d",
+            fix="check the keypoints, their semantic ids and the camera",
+        )
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
     return Ranking(
@@ -164,7 +173,7 @@ def _rank_category(
     in_image = np.isin(observed.query.ids, shape.ids)
     view = _view(observed, in_image, options)
     result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
-    posterior = shape_posterior(result, view)
+    posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
     estimate = np.concatenate([result.points_3d, result.bounds])
     deviation = known.deviation
     if options.shape_sigma > 0:
@@ -181,9 +190,11 @@ def _rank_category(
     evidence = posterior.log_evidence + float(observed.query.gains[in_image].sum())
     axes = options.fitting.stretched_axes
     stretched = _place(known.stacked[models], estimate, axes)
+    poses = _poses(result, stretched, axes, options.max_stretch)
     # Models share the probability of their category.
     logs += evidence - np.logaddexp.reduce(logs)
-    return _Ranked(rows, logs, _poses(result, stretched, axes, options.max_stretch))
+    kept = _least_depths(poses, known.stacked[models]) > 0
+    return _Ranked(rows[kept], logs[kept], poses[kept])
 
 
 def _view(observed: Observed, in_image: BoolArray, options: RetrievalOptions) -> View:
@@ -251,6 +262,13 @@ def _poses(result: AlignResult, placed: _Placed, free: str, max_stretch: float) 
     translation = (pose.translation + (placed.shift * pose.scale) @ pose.rotation.T) / size
     turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))
     return np.concatenate([turned, translation, stretch * pose.scale], axis=1)
+
+
+def _least_depths(poses: FloatArray, stacked: FloatArray) -> FloatArray:
+    """Depth of the keypoint of each model that is nearest to the camera."""
+    across = poses[:, 6:9] * poses[:, 12:]
+    depths = np.einsum("nka,na->nk", stacked[:, :-2], across) + poses[:, 11:12]
+    return np.asarray(depths.min(axis=1))
 
 
 @lru_cache(maxsize=32)

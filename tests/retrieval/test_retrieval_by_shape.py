@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.refusals import refusal_line
 
 from cadalign import Alignment, Box, Camera, Library, ShapeModel, View, align
+from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.io.observation import Observation
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.shape import shape_distance
 from cadalign.shapes.examples import Example
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
@@ -71,17 +75,20 @@ def test_first_match_of_unseen_objects_overlaps_more_than_by_fits() -> None:
     assert np.median(by_shape) > 0.85
 
 
-def test_unstretched_first_match_is_among_the_most_similar() -> None:
-    def gap(model: LibraryModel, other: LibraryModel) -> float:
-        return float(np.linalg.norm(model.xyz - other.xyz))
+def gap(model: LibraryModel, other: LibraryModel) -> float:
+    """Distance of the keypoints, up to size and place."""
+    one, two = model.xyz - model.xyz.mean(axis=0), other.xyz - other.xyz.mean(axis=0)
+    return float(np.linalg.norm(one - two * (one * two).sum() / (two * two).sum()))
 
+
+def test_unstretched_first_match_is_among_the_most_similar() -> None:
     places = []
     for model in OBJECTS:
         best = first(model, stretch="none")
         assert best.alignment.scale.tolist() == [1, 1, 1]
         own = gap(model, LIBRARY[best.category, best.model_id])
         places.append(sum(gap(model, other) < own for other in MODELS))
-    assert np.median(places) <= 3
+    assert np.median(places) <= len(MODELS) / 30
 
 
 @pytest.mark.parametrize("count", [5, 10])
@@ -163,15 +170,10 @@ def test_outliers_do_not_count_with_a_robust_loss() -> None:
     model = OBJECTS[5]
     pixels = seen(model)
     pixels[8] += 150
-    clean = first(model)
     robust = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE, loss="cauchy")
     plain = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE)
-
-    def gap(match: Any) -> float:
-        return shape_distance(LIBRARY["table", match.model_id], model)
-
     assert iou(robust[0], model) > iou(plain[0], model)
-    assert gap(robust[0]) < 2 * gap(clean) + 0.02
+    assert iou(robust[0], model) > iou(first(model), model) - 0.1
 
 
 def test_categories_share_the_probability() -> None:
@@ -187,9 +189,9 @@ def test_categories_share_the_probability() -> None:
     shapes = {"table": SHAPE, "mast": learn(tall)}
     for model in (OBJECTS[0], make_table(2000)):
         matches = rank_all(library, model, shape=shapes)
-        share = sum(match.score for match in matches if match.category == "table")
-        assert len(matches) == len(library)
-        assert share > 0.99
+        tables = [match for match in matches if match.category == "table"]
+        assert len(tables) == len(MODELS)
+        assert sum(match.score for match in tables) > 0.99
     only = rank_all(library, OBJECTS[0], shape=shapes, category="mast")
     assert {match.category for match in only} == {"mast"}
     assert {match.category for match in rank_all(library, OBJECTS[0])} == {"table"}
@@ -209,22 +211,21 @@ NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], names=list(
         ({"shape": {"table": 3}}, "shape['table']: expected a cadalign.ShapeModel, got int"),
         (
             {"shape": {"mug": SHAPE}},
-            "shape: unknown category 'mug'. To fix it: known are table",
+            "shape: unknown category 'mug'; known are table",
         ),
         (
             {"shape": {"table": NAMED}},
-            "shape['table']: its keypoints have names. "
-            "To fix it: learn it from models with semantic ids",
+            "shape['table']: its keypoints have names; learn it from models with semantic ids",
         ),
         (
             {"symmetries": True},
-            "symmetries: True does not apply to a ranking by shape. "
-            "To fix it: leave it at False, or rank without shape",
+            "symmetries: True does not apply to a ranking by shape; "
+            "leave it at False, or rank without shape",
         ),
         (
             {"method": "epnp"},
-            "method: 'epnp' does not apply to a ranking by shape. "
-            "To fix it: leave it at 'optimal', or rank without shape",
+            "method: 'epnp' does not apply to a ranking by shape; "
+            "leave it at 'optimal', or rank without shape",
         ),
     ],
 )
@@ -238,3 +239,48 @@ def test_keypoints_that_the_shape_lacks_are_refused_if_too_few_are_left() -> Non
     few = ShapeModel.from_basis(MODELS[0].xyz[:2], [MODELS[0].xyz[:2]], [0.1])
     with pytest.raises(InputError, match="no shape model has 3 of the keypoints"):
         first(OBJECTS[0], shape=few, category="table")
+
+
+class TestCommand:
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        folder = tmp_path_factory.mktemp("by_shape")
+        LIBRARY.save(folder / "tables.cadalign")
+        SHAPE.save(folder / "table.shape")
+        Observation(
+            points_3d=np.zeros((10, 3)),
+            points_2d=seen(OBJECTS[0], 1.0),
+            camera=CAMERA,
+            semantic_ids=np.arange(10),
+        ).save(folder / "seen.json")
+        return folder
+
+    def test_ranks_as_the_call(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        arguments = ["retrieve", "seen.json", "--library", "tables.cadalign", "--json"]
+        arguments[1], arguments[3] = str(folder / "seen.json"), str(folder / "tables.cadalign")
+        assert main([*arguments, "--shape", str(folder / "table.shape")]) == 0
+        found = [match["model_id"] for match in json.loads(capsys.readouterr().out)]
+        called = LIBRARY.retrieve(seen(OBJECTS[0], 1.0), np.arange(10), CAMERA, shape=SHAPE)
+        assert found == [match.model_id for match in called]
+
+    def test_two_files_of_a_category_are_refused(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        line = refusal_line(
+            capsys,
+            *("retrieve", folder / "seen.json", "--library", folder / "tables.cadalign"),
+            *("--shape", folder / "table.shape", folder / "table.shape"),
+        )
+        assert line == "--shape: two files of the category 'table'"
+
+    def test_an_unknown_category_is_named(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        replace(SHAPE, category="mug").save(folder / "mug.shape")
+        line = refusal_line(
+            capsys,
+            *("retrieve", folder / "seen.json", "--library", folder / "tables.cadalign"),
+            *("--shape", folder / "mug.shape"),
+        )
+        assert line == "--shape: unknown category 'mug'; known are table"

@@ -19,8 +19,10 @@ from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.options import LOSSES
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.evidence import loss_and_root
 
 _POSE = 6
 
@@ -43,7 +45,9 @@ class ShapePosterior:
     log_evidence: float
 
 
-def shape_posterior(result: AlignResult, view: View) -> ShapePosterior:
+def shape_posterior(
+    result: AlignResult, view: View, *, loss: str = "linear", loss_scale: float = 2.0
+) -> ShapePosterior:
     """Posterior of the shape whose alignment with one view's keypoints is ``result``.
 
     Parameters
@@ -52,6 +56,8 @@ def shape_posterior(result: AlignResult, view: View) -> ShapePosterior:
         `align` of a `ShapeModel` with ``view`` alone. Its outliers are left out.
     view : View
         The keypoints; depths and directions are not used.
+    loss, loss_scale
+        Those of the alignment: they weight the keypoints by their residuals.
 
     Raises
     ------
@@ -75,7 +81,7 @@ def shape_posterior(result: AlignResult, view: View) -> ShapePosterior:
     if not isinstance(result.model, ShapeModel) or len(result.poses) != 1:
         what = "expected the alignment of a shape model with one view"
         raise InputError(what, where="result")
-    by_shape, by_pose, residuals = _linearised(result, view)
+    by_shape, by_pose, residuals = _linearised(result, view, LOSSES[loss], loss_scale)
     full, triangle = np.linalg.qr(by_pose, mode="complete")
     rest = full[:, _POSE:].T
     estimate = np.concatenate([result.points_3d, result.bounds]).ravel()
@@ -96,8 +102,10 @@ def gaussians_of(model: ShapeModel) -> Gaussians:
     )
 
 
-def _linearised(result: AlignResult, view: View) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whitened derivatives by shape (2 n, d) and pose (2 n, 6), and residuals (2 n,)."""
+def _linearised(
+    result: AlignResult, view: View, loss: int, loss_scale: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whitened and weighted: derivatives by shape (2 n, d) and pose (2 n, 6), residuals (2 n,)."""
     kept = result.inliers[0]
     ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
     names = prior_of(result.model).rows_of(ids, "view.ids")
@@ -112,14 +120,17 @@ def _linearised(result: AlignResult, view: View) -> tuple[FloatArray, FloatArray
     of_rays = np.zeros((len(names), 2, 3))
     of_rays[:, 0, 0] = of_rays[:, 1, 1] = 1 / z
     of_rays[:, 0, 2], of_rays[:, 1, 2] = -x / z**2, -y / z**2
-    by_point = whitening @ of_rays
+    errors = np.stack([x / z, y / z], axis=1) - rays[kept]
+    residuals = np.einsum("nij,nj->ni", whitening, errors)
+    squares = (residuals**2).sum(axis=1).tolist()
+    roots = np.array([loss_and_root(loss, loss_scale, square)[1] for square in squares])
+    by_point = roots[:, None, None] * (whitening @ of_rays)
     by_pose = np.concatenate([np.cross(turned[:, None], by_point), by_point], axis=2)
     by_shape = np.zeros((len(names), 2, len(result.points_3d) + len(result.bounds), 3))
     by_shape[np.arange(len(names)), :, names] = by_point @ (pose.rotation * pose.scale)
-    errors = np.stack([x / z, y / z], axis=1) - rays[kept]
-    residuals = np.einsum("nij,nj->ni", whitening, errors)
     count = 2 * len(names)
-    return by_shape.reshape(count, -1), by_pose.reshape(count, -1), residuals.ravel()
+    weighted = roots[:, None] * residuals
+    return by_shape.reshape(count, -1), by_pose.reshape(count, -1), weighted.ravel()
 
 
 def _conditioned(prior: Gaussians, rows: FloatArray, right: FloatArray) -> ShapePosterior:

@@ -39,11 +39,14 @@ from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import Ranking
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import BOX_ROWS
 
 _LEAST_KEYPOINTS = 3
 _FREE_SIZE = 1.0  # deviations of what the image does not tell: of the log size,
 _FREE_PLACE = 0.5  # and of the place, in extents of the shape
+_NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
 _FLOOR = 1e-4  # least deviation of a coordinate, in extents of the shape
+_FLAT = 1e-9  # share of a model's variance along an axis without extent
 _MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
 _INAPPLICABLE = {"method": "optimal", "symmetries": False}
 
@@ -52,11 +55,15 @@ _INAPPLICABLE = {"method": "optimal", "symmetries": False}
 class _Shapes:
     """Models of a category in the terms of its shape model.
 
-    ``stacked`` (n, m + 2, 3) holds their keypoints and boxes, completed; ``has`` (n, m) says which
-    keypoints they have; ``deviation`` is their distance from their nearest ones per coordinate.
+    ``centred`` (n, m + 2, 3) holds their keypoints and boxes, completed, about their ``centres``
+    (n, 3), and ``squares`` (n, 3) their variances, all weighted by `_weights`; ``has`` (n, m) says
+    which keypoints they have; ``deviation`` is their distance from their nearest ones per
+    coordinate.
     """
 
-    stacked: FloatArray
+    centred: FloatArray
+    centres: FloatArray
+    squares: FloatArray
     has: BoolArray
     deviation: float
 
@@ -175,12 +182,16 @@ def _rank_category(
     result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
     posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
     estimate = np.concatenate([result.points_3d, result.bounds])
+    weights = _weights(len(estimate))
+    aim = weights @ estimate
+    centred, squares = known.centred[models], known.squares[models]
+    products = np.einsum("nka,ka->na", centred, weights[:, None] * (estimate - aim))
+    placed = centred * _scales(squares, products, "")[:, None] + aim
     deviation = known.deviation
     if options.shape_sigma > 0:
         deviation = options.shape_sigma * _extent(shape)
-    placed = _place(known.stacked[models], estimate, "")
     logs = log_likelihoods(
-        placed.stacked.reshape(len(models), -1), _widened(posterior, estimate, deviation)
+        placed.reshape(len(models), -1), _widened(posterior, estimate, deviation)
     )
     seen = np.isin(shape.ids, observed.query.ids)
     has = known.has[models]
@@ -188,12 +199,12 @@ def _rank_category(
     logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)
     logs += has[:, seen].sum(axis=1) * np.log1p(-options.missing_prob)
     evidence = posterior.log_evidence + float(observed.query.gains[in_image].sum())
-    axes = options.fitting.stretched_axes
-    stretched = _place(known.stacked[models], estimate, axes)
-    poses = _poses(result, stretched, axes, options.max_stretch)
+    axes, centres = options.fitting.stretched_axes, known.centres[models]
+    scales = _scales(squares, products, axes)
+    poses = _poses(result, scales, aim - scales * centres, axes, options.max_stretch)
     # Models share the probability of their category.
     logs += evidence - np.logaddexp.reduce(logs)
-    kept = _least_depths(poses, known.stacked[models]) > 0
+    kept = _least_depths(poses, centred[:, :-BOX_ROWS], centres) > 0
     return _Ranked(rows[kept], logs[kept], poses[kept])
 
 
@@ -215,60 +226,54 @@ def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) 
     place = _FREE_PLACE * extent * np.tile(np.eye(3), len(estimate))
     widening = np.outer(size, size) + place.T @ place + deviation**2 * np.eye(len(size))
     shapes = posterior.shapes
-    return Gaussians(shapes.weights, shapes.means, shapes.covariances + widening)
+    kept = shapes.weights > _NEGLIGIBLE
+    return Gaussians(shapes.weights[kept], shapes.means[kept], shapes.covariances[kept] + widening)
 
 
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """Models (n, m + 2, 3) after the scales (n, 3) and the shift (n, 3)."""
-
-    stacked: FloatArray
-    scale: FloatArray
-    shift: FloatArray
+def _weights(count: int) -> FloatArray:
+    """Weights (count,) of the keypoints and, as much together, of the box."""
+    weights = np.full(count, 1 / (2 * (count - BOX_ROWS)))
+    weights[-BOX_ROWS:] = 1 / (2 * BOX_ROWS)
+    return weights
 
 
-def _place(stacked: FloatArray, target: FloatArray, free: str) -> _Placed:
-    """Scale and shift models (n, m + 2, 3) to a shape (m + 2, 3), by least squares.
+def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
+    """Scales (n, 3) that bring models closest to a shape, from their moments (n, 3).
 
-    The ``free`` axes have a scale each, the others share one. Keypoints and box count equally.
+    The ``free`` axes have a scale each, the others share one.
     """
-    boxes = np.arange(len(target)) >= len(target) - 2
-    weights = np.where(boxes, 1 / 4, 1 / (2 * (len(target) - 2)))[:, None]
-    centre, aim = (weights * stacked).sum(axis=1), (weights * target).sum(axis=0)
-    moved = stacked - centre[:, None]
-    squares = (weights * moved**2).sum(axis=1)
-    products = (weights * moved * (target - aim)).sum(axis=1)
     total = np.maximum(squares.sum(axis=1), np.finfo(float).tiny)
     common = np.maximum(products.sum(axis=1) / total, np.finfo(float).eps)
-    scale = np.empty_like(squares)
+    scales = np.empty_like(squares)
     held = [axis for axis, name in enumerate("xyz") if name not in free]
     for axes in (held, *([axis] for axis in range(3) if axis not in held)):
         square, product = squares[:, axes].sum(axis=1), products[:, axes].sum(axis=1)
         # A flat or mirrored model tells nothing of the scale along this axis.
-        known = (square > 1e-9 * total) & (product > 0)
+        known = (square > _FLAT * total) & (product > 0)
         found = np.where(known, product / np.where(known, square, 1.0), common)
-        scale[:, axes] = found[:, None]
-    shift = aim - scale * centre
-    return _Placed(stacked * scale[:, None] + shift[:, None], scale, shift)
+        scales[:, axes] = found[:, None]
+    return scales
 
 
-def _poses(result: AlignResult, placed: _Placed, free: str, max_stretch: float) -> FloatArray:
-    """Packed poses (n, 15) that show the placed models, the scale of an axis not free being 1."""
+def _poses(
+    result: AlignResult, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
+) -> FloatArray:
+    """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
     pose = result.alignment
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
-    size = placed.scale[:, [held]]
-    stretch = np.clip(placed.scale / size, 1 / max_stretch, max_stretch)
+    size = scales[:, [held]]
+    stretch = np.clip(scales / size, 1 / max_stretch, max_stretch)
     # The image stays the same if everything is scaled about the camera centre.
-    translation = (pose.translation + (placed.shift * pose.scale) @ pose.rotation.T) / size
+    translation = (pose.translation + (shifts * pose.scale) @ pose.rotation.T) / size
     turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))
     return np.concatenate([turned, translation, stretch * pose.scale], axis=1)
 
 
-def _least_depths(poses: FloatArray, stacked: FloatArray) -> FloatArray:
+def _least_depths(poses: FloatArray, centred: FloatArray, centres: FloatArray) -> FloatArray:
     """Depth of the keypoint of each model that is nearest to the camera."""
     across = poses[:, 6:9] * poses[:, 12:]
-    depths = np.einsum("nka,na->nk", stacked[:, :-2], across) + poses[:, 11:12]
-    return np.asarray(depths.min(axis=1))
+    depths = np.einsum("nka,na->nk", centred, across)
+    return np.asarray(depths.min(axis=1) + (centres * across).sum(axis=1) + poses[:, 11])
 
 
 @lru_cache(maxsize=32)
@@ -281,13 +286,16 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     ids, number = np.unique(table.semantic_ids[own], return_inverse=True)
     row = np.array([row_of.get(label, -1) for label in ids.tolist()], dtype=np.int64)[number]
     model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    stacked = np.full((len(offsets) - 1, len(shape.ids) + 2, 3), np.nan)
+    stacked = np.full((len(offsets) - 1, len(shape.ids) + BOX_ROWS, 3), np.nan)
     stacked[model[row >= 0], row[row >= 0]] = table.xyz[own][row >= 0]
-    stacked[:, -2:] = table.bounds[rows]
-    has = ~np.isnan(stacked[:, :-2, 0])
+    stacked[:, -BOX_ROWS:] = table.bounds[rows]
+    has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
     prior = gaussians_of(shape).widened(_FLOOR * _extent(shape))
     flat = _completed(stacked.reshape(len(stacked), -1), prior)
-    return _Shapes(flat.reshape(stacked.shape), has, _deviation(flat, prior))
+    weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
+    centres = weights @ full
+    centred = full - centres[:, None]
+    return _Shapes(centred, centres, weights @ centred**2, has, _deviation(flat, prior))
 
 
 def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:

@@ -8,16 +8,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+_LEAST, _MOST = 1e-100, 1e100  # squares of what lies between do not overflow
 _NUMBERS = (float, int, np.integer, np.floating)
 
 
-def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+def as_floats(
+    value: Any, *, name: str, shape: tuple[int | None, ...], finite: bool = True
+) -> FloatArray:
     """Convert to a float array of the given shape and refuse NaN and infinity.
 
     Parameters
@@ -28,6 +31,8 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
         The argument's name, for the message.
     shape : tuple of int or None
         The required shape; ``None`` for any length.
+    finite : bool
+        Refuse NaN and infinity.
 
     Returns
     -------
@@ -40,11 +45,16 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
         If it is not numeric, has another shape, or holds NaN or infinite values.
     """
     try:
-        if np.asarray(value).dtype.kind in "cmM":  # complex numbers and times
-            raise TypeError(f"they are {np.asarray(value).dtype}")
+        found = np.asarray(value)
+        if found.dtype.kind in "cmM":  # complex numbers and times
+            raise TypeError(f"they are {found.dtype}")
         if np.ma.is_masked(value):
             raise TypeError("some are masked")
         array = np.ascontiguousarray(value, dtype=np.float64)
+        if found.dtype.kind in "SU" or (
+            found.dtype.kind == "O" and any(isinstance(each, str | bytes) for each in found.flat)
+        ):
+            raise TypeError("they are texts")
     except (TypeError, ValueError, OverflowError) as error:
         what = f"not an array of numbers ({str(error)[:200]})"
         raise InputError(what, where=name) from None
@@ -56,19 +66,40 @@ def as_floats(value: Any, *, name: str, shape: tuple[int | None, ...]) -> FloatA
     ):
         wanted_text = ", ".join("n" if length is None else str(length) for length in shape)
         raise InputError(f"shape {array.shape}, expected ({wanted_text})", where=name)
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         raise InputError(describe_non_finite(array), where=name, fix="remove or repair these")
     return array
 
 
 def is_number(value: Any) -> bool:
     """True for a finite real number, of NumPy or not."""
-    if not isinstance(value, _NUMBERS) or isinstance(value, bool):
+    if not isinstance(value, _NUMBERS) or isinstance(value, bool | np.timedelta64):
         return False
     try:
         return math.isfinite(value)
     except OverflowError:  # a whole number beyond all floats
         return False
+
+
+def is_whole(value: Any) -> bool:
+    """True for an integer, of NumPy or not."""
+    return is_number(value) and isinstance(value, int | np.integer)
+
+
+def as_positive(value: Any, *, name: str) -> float:
+    """Convert a positive number of any type to a float: kernels take no other.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive number, or its square is out of range.
+    """
+    if not is_number(value) or not value > 0:
+        raise InputError(f"{quote(value)} is not positive", where=name)
+    number = float(value)
+    if not _LEAST <= number <= _MOST:
+        raise InputError(f"{number} is not between {_LEAST:g} and {_MOST:g}", where=name)
+    return number
 
 
 def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:

@@ -49,7 +49,6 @@ class RunCommand(JsonOption, RunOptions):
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.registry import spec_named
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.opened import Run
         from cadalign.evaluation.runs.run import execute, workers_of
 
         kind = self.options_type
@@ -62,7 +61,7 @@ class RunCommand(JsonOption, RunOptions):
             plan = spec.plan(options, RunFolder(out))
         with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
             execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
-        return spec, Run.open(out)
+        return spec, spec.open(out)
 
 
 def command_of(
@@ -104,7 +103,6 @@ class EvaluateShow(JsonOption):
         """Show the run; returns the exit code, that of the run."""
         from cadalign.evaluation.registry import spec_of_config
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.opened import Run
 
         folder = RunFolder(self.run_folder)
         config = folder.read_config()
@@ -117,7 +115,7 @@ class EvaluateShow(JsonOption):
                 where=str(self.run_folder),
                 fix="start the command that made it again: it goes on",
             )
-        return conclude(spec, Run.open(self.run_folder), json=self.json)
+        return conclude(spec, spec.open(self.run_folder), json=self.json)
 
 
 def _commands() -> Any:

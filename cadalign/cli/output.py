@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from cadalign.errors import DataError
+from cadalign.io.files import printable
 
 _PIPE_WIDTH = 120
 
@@ -26,9 +27,9 @@ def make_folder(path: Path) -> None:
     """Create an output folder; raises DataError on failure."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise DataError(
-            f"the folder cannot be created ({error.strerror})",
-            where=str(path),
+            f"the folder cannot be created ({getattr(error, 'strerror', None) or error})",
+            where=printable(path),
             fix="choose another --out",
         ) from None

@@ -47,7 +47,7 @@ class ShapeLearn:
 
         console = new_console()
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        with Progress(console=console, transient=True) as bar:
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task(f"learning {self.category}", total=None)
             model = ShapeModel.from_dataset(
                 dataset,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cadalign.evaluation.options import ExperimentOptions, tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 
 if TYPE_CHECKING:
@@ -128,7 +129,6 @@ def run(
 
 def _frame(folder: RunFolder) -> pd.DataFrame:
     """The results, with the seconds that they took."""
-    import pandas as pd
-
-    seconds = pd.read_parquet(folder.timings, columns=["seconds"])
-    return pd.concat([pd.read_parquet(folder.results), seconds], axis=1)
+    run = Run.open(folder.path)
+    frame: pd.DataFrame = run.results.to_pandas()
+    return frame.assign(seconds=run.cells["seconds"])

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.options import ExperimentOptions
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def spec_named(name: str) -> Spec:
             spec: Spec = import_module(f"{__package__}.{folder}.spec").SPEC
             return spec
     names = [options.experiment for options in known_options()]
-    what, fix = f"unknown experiment {name!r}", f"known are {', '.join(names)}"
+    what, fix = f"unknown experiment {quote(name)}", f"known are {', '.join(names)}"
     raise InputError(what, where="experiment", fix=fix)
 
 
@@ -66,5 +66,5 @@ def spec_of_config(config: dict[str, Any], path: Path) -> Spec:
         return spec_named(str(name))
     except InputError as error:
         raise DataError(
-            f"there is no report on a run of {name!r}", where=str(path), fix=error.fix
+            f"there is no report on a run of {quote(name)}", where=str(path), fix=error.fix
         ) from None

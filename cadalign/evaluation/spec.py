@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.metrics import CATEGORY, Metric
@@ -11,7 +12,8 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.outcome import FAILED
 from cadalign.evaluation.plots import Plot, draw_plots
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.opened import COLUMNS, Run
+from cadalign.evaluation.runs.tables import Columns
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
@@ -47,6 +49,8 @@ class Spec:
         Columns of the headline table; those are left out that no line has a value of.
     summarize : callable
         Makes summaries of a run, finished or not; see `cadalign.evaluation.summary.medians`.
+    results : Columns
+        Columns that the result table of a run must have to be summarized.
     lines : callable
         Makes lines of the headline table from summaries; by default a line of each.
     table : callable, optional
@@ -79,6 +83,7 @@ class Spec:
     plan: Callable[[Any, RunFolder], Plan[Any]]
     columns: tuple[Metric, ...]
     summarize: Callable[[Run], Summaries]
+    results: Columns = COLUMNS
     lines: Callable[[Summaries], Summaries] = list
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
     group: Callable[[Run], Metric] = lambda run: CATEGORY
@@ -97,6 +102,10 @@ class Spec:
     def name(self) -> str:
         """Name of the experiment."""
         return self.options.experiment
+
+    def open(self, path: Path, name: str | None = None) -> Run:
+        """Read a run of the experiment, ``name`` being its name beside others."""
+        return Run.open(path, name, columns=self.results)
 
     def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
         """The table for the console."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -25,6 +26,8 @@ from cadalign.io.documents import (
     convert,
     within,
 )
+
+_BEHIND = (math.inf, math.inf)
 
 
 class _Alternative(ForeignDocument):
@@ -53,7 +56,7 @@ class _Result(ForeignDocument):
     alignment: Any
     camera: Any
     points_3d: list[Point3]
-    residuals: list[tuple[float, float]]
+    residuals: list[tuple[float, float] | None]
     inliers: list[bool]
     method: str
     sigma: NotNegative | None
@@ -72,6 +75,9 @@ class _Result(ForeignDocument):
             if count != len(self.points_3d):
                 what = f"{count} entries, but points_3d has {len(self.points_3d)}"
                 raise InputError(what, where=name)
+        for row, (residual, kept) in enumerate(zip(self.residuals, self.inliers, strict=True)):
+            if kept and not (residual and math.isfinite(sum(residual))):
+                raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
 
 
 def read_result(data: Mapping[str, Any]) -> FitResult:
@@ -99,7 +105,7 @@ def _result(read: _Result) -> FitResult:
     return FitResult(
         alignment=Alignment.from_dict(read.alignment),
         points_3d=np.array(read.points_3d).reshape(-1, 3),
-        residuals=np.array(read.residuals).reshape(-1, 2),
+        residuals=np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
         inliers=np.array(read.inliers, dtype=bool),
         method=read.method,
         camera=Camera.from_dict(read.camera),

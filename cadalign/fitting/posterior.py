@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.problems import distinct_rows
 from cadalign.geometry.alignment import Alignment
@@ -37,6 +37,7 @@ _MOST_LOG_RATIO = (
     3.0  # of distance, scales and focal length to the estimates: flat priors end there
 )
 _COVERAGE = 0.95
+_NOISE_OF_DRAWS = 1.25  # ratio of variances that the draws cannot tell from 1
 _SEED = 0
 # Of an estimated sigma: that from an order statistic varies more than that from a sum of squares.
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
@@ -51,10 +52,10 @@ def posterior_covariance(result: FitResult, options: FitOptions) -> FloatArray:
         pairs = distinct_rows(np.concatenate([points, result.residuals[result.inliers]], axis=1))
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
-    first = result.covariance * widening
+    first = _with_noise_times(widening, result.covariance, options)
     if len(points) > MOST_POINTS:
         return first
-    sampled = _sample(result, Likelihood.of(result, options), widening)
+    sampled = _sample(result, first, Likelihood.of(result, options), widening)
     return first if sampled is None else sampled
 
 
@@ -133,23 +134,44 @@ class _Chart:
         return pixels, deviations, log_scales, np.log(self.camera.fx) + steps[:, 8]
 
 
+def _prior_information(options: FitOptions, size: int) -> FloatArray:
+    """Inverse variances (8,) or (9,) of the priors; 0 for none."""
+    information = np.zeros(size)
+    information[6:8] = options.prior_weight
+    if options.focal_prior is not None:
+        information[8] = options.focal_prior.relative_sigma**-2
+    return information
+
+
+def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptions) -> FloatArray:
+    """The covariance at a larger variance of the keypoints, which leaves priors as they are."""
+    priors = _prior_information(options, len(covariance))
+    if widening == 1.0 or not priors.any():
+        return covariance * widening
+    free = np.ix_(options.estimated_unknowns, options.estimated_unknowns)
+    prior = np.diag(priors)[free]
+    widened = np.zeros_like(covariance)
+    widened[free] = np.linalg.inv((np.linalg.inv(covariance[free]) - prior) / widening + prior)
+    return widened
+
+
 @np.errstate(all="ignore")  # draws that overflow have no weight
-def _sample(result: FitResult, likelihood: Likelihood, widening: float) -> FloatArray | None:
+def _sample(
+    result: FitResult, first: FloatArray, likelihood: Likelihood, widening: float
+) -> FloatArray | None:
     """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
 
-    Its form is that of the second moments. Its size is such that its 95 % ellipsoid holds all draws
-    that the likelihood ratio does not reject at 5 %: that region covers the truth as often as
-    stated with few keypoints too, where the moments do not.
+    It is the inverse Fisher information, widened where the posterior is wider, and where the region
+    that the likelihood ratio does not reject at 5 % reaches farther: that region covers the truth
+    as often as stated with few keypoints too.
     """
     from scipy.special import chdtri  # takes longer to import than a fit
 
-    assert result.covariance is not None
     chart = _Chart.of(result)
     free = likelihood.options.estimated_unknowns
-    size = len(result.covariance)
+    size = len(first)
     jacobian = chart.jacobian()[:size, :size]
-    proposal = (jacobian @ result.covariance @ jacobian.T)[np.ix_(free, free)]
-    proposal *= widening * _FIRST_INFLATION
+    proposal = (jacobian @ first @ jacobian.T)[np.ix_(free, free)] * _FIRST_INFLATION
     mean = np.zeros(len(free))
     kept = result.inliers
     projected = chart.camera.project(result.alignment.apply(result.points_3d[kept]))
@@ -190,21 +212,49 @@ def _sample(result: FitResult, likelihood: Likelihood, widening: float) -> Float
     at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 9)))[2:])[0]
     limit = chdtri(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
-    moved = deviations[:, :size]
-    used = weights > 0
-    moments = (moved[used] * weights[used, None]).T @ moved[used]
-    try:
-        squares = _squared_distances(moved[likely][:, free], moments[np.ix_(free, free)])
-    except np.linalg.LinAlgError:
-        return None
-    scaled = moments * (squares.max(initial=0.0) / limit)
-    return np.asarray(scaled) if np.isfinite(scaled).all() and likely.any() else None
+    moved = deviations[:, free]
+    covariance = np.zeros_like(first)
+    among = np.ix_(free, free)
+    prior = _prior_information(likelihood.options, size)[free]
+    covariance[among] = _widened(first[among], prior, moved, weights, likely, limit)
+    return covariance if np.isfinite(covariance).all() else None
 
 
-def _squared_distances(deviations: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared Mahalanobis distances (k,) of deviations (k, m)."""
-    solved = np.linalg.solve(covariance, deviations.T)
-    return np.asarray((deviations * solved.T).sum(axis=1))
+def _widened(
+    variance: FloatArray,
+    prior: FloatArray,
+    moved: FloatArray,
+    weights: FloatArray,
+    likely: BoolArray,
+    limit: float,
+) -> FloatArray:
+    """The covariance (m, m), widened along the directions in which the draws (k, m) reach farther.
+
+    The directions are the principal axes of the second moments relative to the covariance. Along
+    each the variance is that of the draws, or that whose ellipsoid reaches as far as the ``likely``
+    ones; it stays where both agree within the noise of the draws. ``prior`` (m,) is the information
+    of the priors.
+    """
+    factor = np.linalg.cholesky(variance)
+    used = (weights > 0) | likely
+    moved, weights, likely = moved[used], weights[used], likely[used]
+    white = np.linalg.solve(factor, moved.T)
+    moments = (white * weights) @ white.T
+    if not np.isfinite(moments).all():
+        return np.full_like(variance, np.nan)
+    spread, axes = np.linalg.eigh(moments)
+    squares = (axes.T @ white[:, likely]) ** 2 / limit
+    factors = np.maximum(spread, squares.max(axis=1, initial=0.0))
+    wide = factors > _NOISE_OF_DRAWS
+    factors[~wide] = 1.0
+    # The ellipsoid through the ends of the axes still cuts corners of the region off.
+    factors[wide] *= (squares[wide] / factors[wide, None]).sum(axis=0).max(initial=1.0)
+    widened = factor @ axes * np.sqrt(factors)
+    covariance = widened @ widened.T
+    # Curved regions tilt the axes, which must not spread to unknowns that a prior determines.
+    known = variance.diagonal()
+    shrunk = np.where(known * prior > 0.5, np.sqrt(known / covariance.diagonal()), 1.0)
+    return np.asarray(covariance * shrunk * shrunk[:, None])
 
 
 def _log_haar_density(vectors: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -76,7 +77,8 @@ class FitResult:
     points_3d : (n, 3) float
         The model's keypoints, as given.
     residuals : (n, 2) float
-        Projected minus observed keypoint [px].
+        Projected minus observed keypoint [px]; infinite, and null in JSON, for one that was
+        rejected and lies behind the camera.
     inliers : (n,) bool
         The keypoints that the alignment was fitted to.
     method : str
@@ -156,7 +158,7 @@ class FitResult:
 
     @cached_property
     def misfit(self) -> Misfit | None:
-        """What a chi-square test says of residuals that the given sigma does not explain.
+        """Result of a chi-square test of residuals that the given sigma does not explain.
 
         None if they pass (of right data, 99.5 % or more do), for an estimated sigma, for methods
         that are not statistical, and for results without ``options``.
@@ -237,7 +239,9 @@ class FitResult:
             "alignment": self.alignment.to_dict(),
             "rms": self.rms,
             "points_3d": self.points_3d.tolist(),
-            "residuals": self.residuals.tolist(),
+            "residuals": [
+                row if math.isfinite(row[0] + row[1]) else None for row in self.residuals.tolist()
+            ],
             "inliers": self.inliers.tolist(),
             "sigma": self.sigma,
             "covariance": None if self.covariance is None else self.covariance.tolist(),

@@ -62,8 +62,9 @@ class Alignment:
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         translation = as_floats(self.translation, name="translation", shape=(3,))
         scale = as_floats(self.scale, name="scale", shape=(3,))
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not error <= _ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
             raise InputError(
                 "not a rotation matrix",
                 where="rotation",

@@ -89,9 +89,15 @@ class Camera:
                     where=f"camera.{name}",
                     fix="give the calibrated focal length in pixels",
                 )
+        known: object = self.focal_known
+        if not isinstance(known, bool | np.bool_):
+            what = f"{quote(known)} is neither True nor False"
+            raise InputError(what, where="camera.focal_known")
         try:
+            if np.iscomplexobj(self.distortion) or np.ma.is_masked(self.distortion):
+                raise TypeError
             coefficients = tuple(float(value) for value in self.distortion)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
             raise InputError("not a sequence of numbers", where="camera.distortion") from None
         if len(coefficients) not in (0, 4, 5, 8) or not np.isfinite(coefficients).all():
             raise InputError(
@@ -119,7 +125,12 @@ class Camera:
         """
         if not is_number(fov_x) or not 0 < fov_x < 180:
             raise InputError(f"{quote(fov_x)} is not between 0 and 180 degrees", where="fov_x")
-        focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
+        for name, size in (("width", width), ("height", height)):
+            if not is_number(size):
+                what = f"{quote(size)} is not a size"
+                raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
+        with np.errstate(over="ignore"):
+            focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     @classmethod
@@ -177,6 +188,8 @@ class Camera:
 
         The shape of its pixels stays: ``fy`` changes in proportion.
         """
+        if not is_number(focal):
+            raise InputError(f"{quote(focal)} is not a finite number", where="focal")
         return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
 
     @property
@@ -230,6 +243,13 @@ class Camera:
             )
         return self.pixels_from_normalized(perspective(points))
 
+    def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
+        """Project points (n, 3) of the camera frame; pixels (n, 2), infinite behind the camera."""
+        pixels = np.full((len(points_cam), 2), np.inf)
+        ahead = points_cam[:, 2] > 0
+        pixels[ahead] = self.pixels_from_normalized(perspective(points_cam[ahead]))
+        return pixels
+
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Turn pixels into normalised image coordinates, the lens distortion removed.
 
@@ -278,16 +298,18 @@ class Camera:
         valid : (n,) bool
         """
         points = as_points(points_2d, name="points_2d", dimension=2)
-        distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
-        if not self.distortion:
-            return distorted, np.ones(len(points), dtype=bool)
-        return undistort(distorted, self.distortion)
+        with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
+            distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+            if not self.distortion:
+                return distorted, np.ones(len(points), dtype=bool)
+            return undistort(distorted, self.distortion)
 
     def pixels_from_normalized(self, normalized: FloatArray) -> FloatArray:
         """Apply lens and calibration matrix to (n, 2) normalised coordinates; gives pixels."""
-        if self.distortion:
-            normalized, _ = distort(normalized, self.distortion)
-        return normalized * (self.fx, self.fy) + (self.cx, self.cy)
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
+            if self.distortion:
+                normalized, _ = distort(normalized, self.distortion)
+            return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
     def distortion_jacobian(self, normalized: FloatArray) -> FloatArray:
         """Derivatives (n, 2, 2) of distorted by normalised image coordinates (n, 2)."""
@@ -371,7 +393,8 @@ class Camera:
             )
         names = COLMAP_PARAMS[model]
         params = data["params"]
-        if not isinstance(params, list | tuple | np.ndarray) or len(params) != len(names):
+        params = params.tolist() if isinstance(params, np.ndarray) else params
+        if not isinstance(params, list | tuple) or len(params) != len(names):
             raise InputError(
                 f"{quote(params)} are not the parameters of {model}",
                 where="camera.params",

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 
@@ -67,7 +67,7 @@ def damaged(what: str, where: object) -> DataError:
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Convert errors of the file system, and of text that is not UTF-8, to `DataError`."""
-    _refuse_nul(path)
+    refuse_nul(path)
     try:
         yield
     except FileNotFoundError:
@@ -80,7 +80,7 @@ def reading(path: Path) -> Iterator[None]:
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Convert errors of the file system to `DataError`."""
-    _refuse_nul(path)
+    refuse_nul(path)
     try:
         yield
     except OSError as error:
@@ -91,7 +91,13 @@ def writing(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _refuse_nul(path: Path) -> None:
-    # The file system's functions raise a ValueError, which says nothing of a path.
+def printable(path: Path | str) -> str:
+    """A path for a message, quoted where it holds what a terminal does not show."""
+    text = str(path)
+    return text if text.isprintable() else quote(text)
+
+
+def refuse_nul(path: Path) -> None:
+    """Raise a DataError for a path with a NUL: the file system's ValueError does not name it."""
     if "\0" in str(path):
-        raise DataError("the path holds a NUL character", where=repr(str(path))[:200])
+        raise DataError("the path holds a NUL character", where=printable(path))

@@ -102,12 +102,9 @@ def _append(columns: dict[str, list[Any]], **cells: Any) -> None:
 
 
 def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
-    """The columns of a run's results as lists; None where an older run has none."""
+    """The columns of a run's results as lists."""
     table = run.results
     wanted = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
     numbers = ("stretch_y", "stretch_z", *(metric.key for metric in metrics))
     cells = {name: table[name].to_pylist() for name in (*wanted, "visibility", "symmetry")}
-    for name in numbers:
-        known = name in table.column_names
-        cells[name] = compact(run.column(name)) if known else [None] * len(table)
-    return cells
+    return cells | {name: compact(run.column(name)) for name in numbers}

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote as url_quote
 
-from cadalign.errors import DataError
-from cadalign.evaluation.instances.record import record_stem
+from cadalign.errors import DataError, quote
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.runs.opened import Run
-from cadalign.io.files import dense_json, write_text, write_whole, writing
+from cadalign.io.files import dense_json, reading, write_text, write_whole, writing
 from cadalign.report.instances import InstanceName, InstanceTable
 
 INLINE_LIMIT = 60_000_000
@@ -32,6 +32,7 @@ def inline_bytes(runs: Sequence[Run]) -> int:
         for folder in (run.folder.pictures, run.folder.thumbs, run.folder.previews)
         if folder.is_dir()
         for path in folder.iterdir()
+        if path.is_file()
     ]
     pictures = sum(path.stat().st_size for path in files)
     return sum(run.record_bytes() for run in runs) + pictures * 4 // 3
@@ -58,7 +59,7 @@ class AssetStore:
                     for old in self.assets.glob(pattern):
                         old.unlink()
         for index, run in enumerate(runs):
-            for row in run.records():
+            for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
                 if place is None:
@@ -70,8 +71,9 @@ class AssetStore:
                 thumb = self._image(run.folder.thumbs, name, self.thumbs)
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
-                # As text: there may be many. Both are objects, joined to one.
-                self.records[str(place)] = f"{dense_json(keys)[:-1]},{row['exhibit'][1:]}"
+                # As text: there may be many.
+                record = _object(row["exhibit"], run.folder.records)
+                self.records[str(place)] = dense_json({**keys, **record})
 
     def to_dict(self) -> dict[str, Any]:
         """The page's part of it; writes the files that are beside the page."""
@@ -110,7 +112,7 @@ class AssetStore:
         digest = ("mesh", hashlib.sha256(data).digest())
         if digest not in self._known:
             key = f"m{len(self.meshes)}"
-            self.meshes[key] = json.loads(data)
+            self.meshes[key] = _object(data, run.folder.previews)
             self._known[digest] = key
         return self._known[digest]
 
@@ -141,14 +143,24 @@ class AssetStore:
         """A file's address, relative to the page."""
         assert self.assets is not None
         folder = os.path.relpath(self.assets, self.page.parent)
-        return quote(f"{Path(folder).as_posix()}/{name}")
+        return url_quote(f"{Path(folder).as_posix()}/{name}")
 
 
 def _read(path: Path) -> bytes | None:
     """A file's bytes; None where there is none."""
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
+    if not path.is_file():
         return None
-    except OSError as error:
-        raise DataError(f"cannot be read ({error.strerror or error})", where=str(path)) from None
+    with reading(path):
+        return path.read_bytes()
+
+
+def _object(text: str | bytes, path: Path) -> dict[str, Any]:
+    """The JSON object that a text of a file is."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        what = f"{quote(text)} is not an object of JSON"
+        raise DataError(what, where=str(path), fix="remove it: the run is shown without it")
+    return found

@@ -10,6 +10,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.registry import spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
+from cadalign.io.files import refuse_nul
 
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
@@ -23,6 +24,7 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
         )
     seen: set[Path] = set()
     for path in paths:
+        refuse_nul(path)
         if path.resolve() in seen:
             raise InputError("the run is given twice", where=str(path))
         seen.add(path.resolve())
@@ -45,9 +47,9 @@ def all_methods(runs: Sequence[Run]) -> list[str]:
 
 def _read(path: Path, name: str) -> Run:
     config = RunFolder(path).read_config() if path.is_dir() else None
-    if config is not None:
-        spec_of_config(config, path)  # refuse what is unknown, however far it is
-    return Run.open(path, name)
+    if config is None:
+        return Run.open(path, name)  # says what is wrong with the folder
+    return spec_of_config(config, path).open(path, name)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

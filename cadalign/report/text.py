@@ -39,7 +39,8 @@ def summary_of(runs: Sequence[Run]) -> str:
 
 def settings_of(run: Run) -> list[tuple[str, str]]:
     """A run's settings by name."""
-    config = {**run.config, **run.config.get("sweep", {})}
+    sweep = run.config.get("sweep")
+    config = {**run.config, **(sweep if isinstance(sweep, dict) else {})}
     # Data first, methods and seed last.
     names = [field.name for field in fields(spec_of(run).options)]
     names.sort(key=lambda name: {"root": -1, "path": -1, "methods": 1, "seed": 2}.get(name, 0))

@@ -32,6 +32,9 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory and check it."""
     where = str(path)
     try:
+        # Opening a pipe would wait for its other end.
+        if Path(path).exists() and not Path(path).is_file():
+            raise OSError("not a regular file")
         with pa.memory_map(where) as source:
             content = source.read_buffer()
     except FileNotFoundError:

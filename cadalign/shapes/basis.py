@@ -33,8 +33,8 @@ def component_of_basis(
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
     extended += _size_modes(rows, size_sigma)
-    covariance_free = np.array(extended).reshape(len(extended), -1)
-    return ShapeComponent(1.0, rows, _orthogonal(covariance_free, len(rows)), residual_sigma)
+    flat = np.array(extended).reshape(len(extended), rows.size)
+    return ShapeComponent(1.0, rows, _orthogonal(flat, len(rows)), residual_sigma)
 
 
 def component_of_covariance(
@@ -87,7 +87,8 @@ def component_of_covariance(
 def _directions(modes: npt.ArrayLike, count: int) -> FloatArray:
     """Modes as (K, m, 3), also from (K, 3 m): x, y, z of the first keypoint, and so on."""
     if np.ndim(modes) == 2:
-        modes = as_floats(modes, name="modes", shape=(None, 3 * count)).reshape(-1, count, 3)
+        flat = as_floats(modes, name="modes", shape=(None, 3 * count))
+        return flat.reshape(len(flat), count, 3)
     return as_floats(modes, name="modes", shape=(None, count, 3))
 
 

@@ -217,6 +217,9 @@ def learn_components(
     on_progress: Callable[[int, int], object],
 ) -> Learned:
     """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing."""
+    if (options.components or 1) > len(rows):
+        what = f"{options.components} are more than the {len(rows)} models"
+        raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
     # Threads of the linear algebra library make products of such small matrices 30 times slower.
@@ -288,6 +291,6 @@ def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
 
 
 def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
-    """Whether models are less likely by no more than a tolerance or the standard error."""
+    """True if models are less likely by no more than a tolerance or the standard error."""
     losses = best - scores
     return float(losses.mean()) <= max(tolerance, float(losses.std()) / math.sqrt(len(losses)))

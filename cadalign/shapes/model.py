@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats
 from cadalign.errors import InputError, quote
+from cadalign.io.documents import in_file
 from cadalign.shapes.basis import component_of_basis, component_of_covariance
 from cadalign.shapes.examples import Dataset, Example, Table, examples_of
 from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
@@ -343,7 +344,9 @@ class ShapeModel:
         DataError
             If the file is missing, truncated, damaged, of another version, or of another format.
         """
-        return cls(**read_shape(path)._asdict())
+        fields = read_shape(path)
+        with in_file(os.fspath(path)):
+            return cls(**fields._asdict())
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file atomically; raises DataError on failure."""

@@ -67,7 +67,7 @@ class ShapeComponent:
     @property
     def covariance(self) -> FloatArray:
         """Covariance of the stacked rows, (3 (m + 2), 3 (m + 2)) float [model units squared]."""
-        flat = self.modes.reshape(len(self.modes), -1)
+        flat = self.modes.reshape(len(self.modes), self.mean.size)
         return np.asarray(flat.T @ flat + self.residual_sigma**2 * np.eye(flat.shape[1]))
 
     @property

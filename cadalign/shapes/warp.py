@@ -15,13 +15,14 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import RBFInterpolator
+from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
 
 # Lengths relative to the diagonal of mesh and keypoints.
-_ROUNDING = 0.02  # of the kernel's tip
+_ROUNDING = 0.02  # of the kernel's tip, at most
 _MARGIN = 0.25  # from the mesh to the corners around it, which follow the stretch alone
 _COINCIDENT = 1e-6
 _PRIOR_SPREAD = 0.1  # keypoints that spread less along an axis barely tell its stretch
@@ -86,10 +87,16 @@ def warp_mesh(
         np.vstack([places, corners]),
         np.vstack([targets - stretch(places), np.zeros_like(corners)]),
         kernel="multiquadric",
-        epsilon=1 / (_ROUNDING * diagonal),
+        epsilon=1 / _rounding(places, diagonal),
         degree=0,
     )
     return replace(mesh, vertices=stretch(mesh.vertices) + leaves(mesh.vertices))
+
+
+def _rounding(places: FloatArray, diagonal: float) -> float:
+    """Radius within which the kernel's tip is rounded: less where keypoints are near each other."""
+    least = float(pdist(places).min()) if len(places) > 1 else diagonal
+    return min(_ROUNDING * diagonal, least)
 
 
 def _merged(

@@ -12,7 +12,7 @@ from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.frame import LIGHT_GREY
+from cadalign.render.frame import LIGHT_GREY, check_image_size
 
 
 def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
@@ -21,6 +21,7 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
     The box is the model's; without a model it is the box of the keypoints.
     """
     camera = result.camera
+    check_image_size(camera)
     if observation.image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
     else:
@@ -30,7 +31,7 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
         camera,
         est_box=Box.from_model(_bounds(observation), result.alignment),
         observed=observation.points_2d,
-        reprojected=camera.project(result.alignment.apply(observation.points_3d)),
+        reprojected=camera.project_where_ahead(result.alignment.apply(observation.points_3d)),
     )
 
 

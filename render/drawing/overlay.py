@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_points
+from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
@@ -81,7 +81,8 @@ def draw_overlay(
     model_style : str
         How to show it: ``translucent``, with its edges, or ``lines`` for the edges alone.
     observed, reprojected : (k, 2) float, optional
-        Keypoints [px]; if both are given they belong together, row by row.
+        Keypoints [px]; if both are given they belong together, row by row. Reprojected ones that
+        are not finite, behind the camera, are left out.
     axes, legend : bool
         Whether to draw these.
 
@@ -114,11 +115,15 @@ def draw_overlay(
     if est_frame is not None:
         draw_lines(canvas, est_frame, EST_COLOR)
     seen = None if observed is None else as_points(observed, name="observed", dimension=2)
-    back = None if reprojected is None else as_points(reprojected, name="reprojected", dimension=2)
+    back = None
+    if reprojected is not None:
+        back = as_floats(reprojected, name="reprojected", shape=(None, 2), finite=False)
     if seen is not None and back is not None and len(seen) != len(back):
         raise InputError(
             f"{len(back)} keypoints, but {len(seen)} observed ones", where="reprojected"
         )
+    pairs = None if seen is None or back is None else _finite(np.hstack([seen, back]))
+    back = None if back is None else _finite(back)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
@@ -129,12 +134,20 @@ def draw_overlay(
     strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
     seen, back = (None if points is None else canvas.place(points) for points in (seen, back))
     _draw_strokes(canvas, strokes)
+    if pairs is not None:
+        for pair in pairs.reshape(-1, 2, 2):
+            canvas.line(canvas.place(pair), REPROJECTED_COLOR, width=1.0)
     _draw_keypoints(canvas, seen, back)
     predicted = est_box is not None or est_frame is not None
     entries = _legend_entries(gt_box, predicted, seen, back, axes=axes and main_box is not None)
     if legend and entries:
         canvas.legend(entries, keep_clear=_drawn_pixels(strokes, seen, back))
     return canvas.finished()
+
+
+def _finite(rows: FloatArray) -> FloatArray:
+    """The rows that are finite."""
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
 def _as_rgb(image: Any, camera: Camera) -> ByteImage:
@@ -262,10 +275,7 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
 
 
 def _draw_keypoints(canvas: Canvas, seen: FloatArray | None, back: FloatArray | None) -> None:
-    """Rings, crosses and the residuals between them."""
-    if seen is not None and back is not None:
-        for pair in np.stack([seen, back], axis=1):
-            canvas.line(pair, REPROJECTED_COLOR, width=1.0)
+    """Rings and crosses."""
     for point in [] if seen is None else seen:
         canvas.ring(point, OBSERVED_COLOR, radius=5)
     for point in [] if back is None else back:

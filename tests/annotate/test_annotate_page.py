@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 from support.annotating import Case, place_all, place_twenty, served
 
 from cadalign.annotate.guard import Access
@@ -136,13 +137,12 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
         assert state["alignment"]["status"] == ("done" if number >= 4 else "none")
         error = np.array(state["pairs"][-1]["uv"]) - uv
         assert np.abs(error).max() < 0.75 / page.evaluate("annotator.photo.scale")
-    text = page.inner_text("main")
-    assert "Stretch along y" in text
-    assert "Pairs agree to" in text
+    for text in ("Stretch along y", "Pairs agree to"):
+        expect(page.locator("main")).to_contain_text(text, use_inner_text=True)
 
     # The alignment is drawn: red box, blue edges.
     for color in ([255, 90, 99], [53, 208, 255]):
-        assert page.evaluate(COUNT_COLOR, color) > 150
+        driver.wait(f"({COUNT_COLOR})({color}) > 150")
 
     # Drag a point, see the alignment follow, and undo that in one step.
     before = driver.wait_for_state(lambda _: True)
@@ -179,7 +179,8 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
     assert json.loads(json.dumps(restarted["pairs"])) == undone["pairs"]
 
     # It is saved, and the file gives the alignment that the page shows.
-    assert page.inner_text("[role=status]").startswith("Saved to photo.json at ")
+    saved = re.compile("^Saved to photo.json at ")
+    expect(page.locator("[role=status]")).to_have_text(saved, use_inner_text=True)
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["alignment"] == undone["alignment"]["alignment"]
@@ -274,9 +275,9 @@ def test_keys_nudge_select_suggest_and_delete(opened: tuple[Driver, Case, Access
     page.evaluate("annotator.api.refresh()")
     driver.wait_for_state(lambda state: len(state["pairs"]) == 6)
     page.keyboard.press("]")
-    assert page.evaluate("annotator.selected") == 1
+    driver.wait("annotator.selected === 1")
     page.keyboard.press("[")
-    assert page.evaluate("annotator.selected") == 6
+    driver.wait("annotator.selected === 6")
     u, v = case.clicks[5][1]
     for key in ("ArrowRight", "ArrowRight", "ArrowDown", "Shift+ArrowLeft"):
         page.keyboard.press(key)
@@ -292,9 +293,9 @@ def test_keys_nudge_select_suggest_and_delete(opened: tuple[Driver, Case, Access
     page.keyboard.press("Delete")
     driver.wait_for_state(lambda state: len(state["pairs"]) == 6)
     page.keyboard.press("?")
-    assert page.locator("dialog").is_visible()
+    expect(page.locator("dialog")).to_be_visible()
     page.keyboard.press("Escape")
-    assert not page.locator("dialog").is_visible()
+    expect(page.locator("dialog")).not_to_be_visible()
 
 
 def test_both_views_can_be_used_by_the_keyboard_alone(
@@ -309,11 +310,11 @@ def test_both_views_can_be_used_by_the_keyboard_alone(
     middle = page.evaluate("annotator.photo.toPixel(annotator.photo.middle)")
     np.testing.assert_allclose(state["pairs"][0]["uv"], middle)
     page.locator("section[aria-label=Model] canvas").focus()
-    before = driver.eye()
+    eye = "annotator.model.stage.camera.position.toArray()"
+    before = page.evaluate(eye)
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("ArrowUp")
-    page.wait_for_timeout(50)
-    assert not np.allclose(driver.eye(), before)
+    driver.wait(f"{eye}.some((value, i) => Math.abs(value - {before}[i]) > 1e-5)")
     page.locator("summary").press("Enter")
     page.locator(".keypoints button").first.press("Enter")
     driver.wait_for_state(lambda state: state["pairs"][0]["keypoint"] is not None)
@@ -365,9 +366,9 @@ def test_outliers_save_errors_and_misses_are_shown(opened: tuple[Driver, Case, A
     page.evaluate("annotator.api.refresh()")
     driver.wait_for_state(lambda state: len(state["pairs"]) == 10)
     row = page.locator("tr.wrong")
-    assert row.count() == 1
-    assert row.inner_text().startswith("Pair 5 contradicts the others: ")
-    assert row.inner_text().endswith(" px off")
+    expect(row).to_have_count(1)
+    named = re.compile("^Pair 5 contradicts the others: .* px off$", re.DOTALL)
+    expect(row).to_have_text(named, use_inner_text=True)
     box = page.locator("section[aria-label=Model] canvas").bounding_box()
     assert box is not None
     page.mouse.click(box["x"] + 8, box["y"] + box["height"] - 8)
@@ -396,8 +397,8 @@ def test_photos_of_a_folder_come_in_turn(browser: Browser, case: Case) -> None:
         driver = Driver(context.new_page(), session)
         driver.open(access)
         page = driver.page
-        assert page.inner_text("h1") == "photo.png"
-        assert page.get_by_role("button", name="Previous").is_disabled()
+        expect(page.locator("h1")).to_have_text("photo.png")
+        expect(page.get_by_role("button", name="Previous")).to_be_disabled()
         page.get_by_role("button", name="Next").click()
         driver.wait_for_state(lambda state: state["image"]["name"] == "second.png")
         driver.wait(READY)
@@ -405,7 +406,7 @@ def test_photos_of_a_folder_come_in_turn(browser: Browser, case: Case) -> None:
         driver.wait_for_state(lambda state: len(state["pairs"]) == 1)
         page.reload()
         driver.wait(READY)
-        assert page.inner_text("h1") == "second.png"
+        expect(page.locator("h1")).to_have_text("second.png")
         page.keyboard.press("PageUp")
         state = driver.wait_for_state(lambda state: state["image"]["name"] == "photo.png")
         assert state["pairs"] == []

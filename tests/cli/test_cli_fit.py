@@ -21,6 +21,7 @@ from cadalign import FitResult, RansacOptions, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
+from cadalign.render.drawing.overlay import REPROJECTED_COLOR
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
 
@@ -151,6 +152,26 @@ def test_options_of_ransac_need_no_prefix(
     ransac = RansacOptions(max_reproj_error=6.0, seed=3, refine=False)
     expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, ransac=ransac)
     assert capsys.readouterr().out == f"{expected}\n"
+
+
+def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    behind = np.array([[0.0, 0.0, -100.0]])
+    points_3d = np.vstack([behind @ PROBLEM.alignment.linear, PROBLEM.points_3d])
+    points_2d = np.vstack([[[100.0, 100.0]], PROBLEM.points_2d])
+    problem = Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
+    path = write_observation(tmp_path / "chair.json", problem)
+    assert main(["fit", str(path), "--robust"]) == 0
+    text = (tmp_path / "chair_fit" / "fit.json").read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    read = FitResult.from_json(text)
+    assert read.inliers.tolist() == [False] + [True] * 10
+    assert np.isposinf(read.residuals[0]).all()
+    assert np.isfinite(read.residuals[1:]).all()
+    assert capsys.readouterr().out == f"{read}\n"
+    overlay = tmp_path / "chair_fit" / "overlay.png"
+    assert has_color(overlay, REPROJECTED_COLOR)
 
 
 def test_full_disk_is_reported_and_leaves_earlier_results(
@@ -328,6 +349,67 @@ def test_model_that_cannot_be_used(
     assert line.startswith(str(model))
     if text is not None:
         assert line == f"{model}: {text}"
+
+
+@pytest.mark.parametrize("size", [200_000, 10**9, 10**30])
+def test_photo_sizes_that_cannot_be_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: int
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    edit(path, lambda data: data["camera"].update(width=size))
+    assert refusal_line(capsys, "fit", str(path)) == (
+        f"camera: {size} x 480 px is too large to be drawn; the limits are 16384 px a side and "
+        "100 megapixels; scale the camera down"
+    )
+
+
+def test_pipes_in_the_place_of_photo_and_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "photo.png")
+    os.mkfifo(tmp_path / "model.obj")
+    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
+    assert refusal_line(capsys, "fit", path) == (
+        f"{tmp_path / 'photo.png'}: not an image that can be read (not a regular file)"
+    )
+    path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
+    assert refusal_line(capsys, "fit", path).startswith(f"{tmp_path / 'model.obj'}: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("fit", "a\0b.json"), r"'a\x00b.json': the path holds a NUL character"),
+        (
+            ("fit", "{file}", "--out", "a\0b"),
+            r"'a\x00b': the folder cannot be created (embedded null byte); choose another --out",
+        ),
+        (("report", "a\0b"), r"'a\x00b': the path holds a NUL character"),
+        (("report", "a\0b", "--format", "md"), r"'a\x00b': the path holds a NUL character"),
+        (("evaluate", "show", "a\0b"), r"'a\x00b/run.json': the path holds a NUL character"),
+    ],
+)
+def test_paths_with_a_nul(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], text: str
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    assert refusal_line(capsys, *(word.format(file=path) for word in arguments)) == text
+
+
+@pytest.mark.parametrize("field", ["image", "model"])
+def test_paths_with_a_nul_in_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], field: str
+) -> None:
+    path = write_observation(tmp_path / "chair.json")
+    edit(path, lambda data: data.update({field: "a\0b.png"}))
+    assert refusal_line(capsys, "fit", path) == f"{path}: {field}: 'a\\x00b.png' is not a path"
+
+
+def test_long_values_are_quoted_in_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for field, value in (("keypoints", "x" * 10**6), ("camera", {"model": "M" * 10**6})):
+        path = write_observation(tmp_path / "chair.json")
+        edit(path, lambda data, field=field, value=value: data.update({field: value}))  # type: ignore[misc]
+        assert len(refusal_line(capsys, "fit", path)) < 600 + len(str(path))
 
 
 def test_output_folder_that_cannot_be_made(

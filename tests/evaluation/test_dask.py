@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from cadalign.errors import DataError
+from cadalign.cli import main
+from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
@@ -63,6 +68,77 @@ def test_simulate_takes_the_address(cluster: Any) -> None:
         dask=cluster.scheduler_address,
     )
     assert table.status.tolist() == ["ok"] * 5
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("nonsense", "missing port number in address 'nonsense'"),
+        ("", "missing port number in address ''"),
+        ("tcp://localhost", "missing port number in address 'localhost'"),
+        ("nonsense://x", "unknown address scheme 'nonsense'"),
+        ("tcp://127.0.0.1:99999", "99999 is not a port"),
+        ("tcp://host.invalid:8786", "Name or service not known"),
+        ("tcp://" + "a" * 300 + ":1", "label"),
+        ("a\0b:1", repr("a\0b:1")),
+    ],
+)
+def test_what_is_no_address_is_refused_at_once(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], address: str, reason: str
+) -> None:
+    start = time.monotonic()
+    options = ["--runs", "2", "--methods", "aepnp", "--out", str(tmp_path / "run")]
+    assert main(["simulate", "points", *options, "--dask", address]) == 1
+    gc.collect()  # a client that was not closed would now wait for a minute
+    assert time.monotonic() - start < 20
+    text = capfd.readouterr().err
+    assert "no Dask scheduler answers (" in text
+    assert reason in text
+    assert "start one with `dask scheduler`" in text
+    assert "Traceback" not in text
+
+
+_CLUSTER = """
+import sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(processes=True, **options) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_a_lost_scheduler_is_told_of_and_the_run_goes_on(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    calm, hit = RunFolder(tmp_path / "calm"), RunFolder(tmp_path / "hit")
+    process = subprocess.Popen(
+        [sys.executable, "-c", _CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    address = process.stdout.readline().strip()
+    done: list[int] = []
+
+    def kill(progress: Progress) -> None:
+        done.append(progress.done)
+        if progress.done >= 128 and process.poll() is None:
+            process.kill()
+            process.wait()
+
+    with pytest.raises(CadalignError, match="the Dask cluster has gone away; start") as caught:
+        run(KIND, hit, workers=None, dask=address, on_progress=kill)
+    assert caught.value.where == address
+    assert "Traceback" not in capfd.readouterr().err
+    run(KIND, calm, workers=0, dask=None)
+    seen: list[int] = []
+    run(KIND, hit, workers=0, dask=None, on_progress=lambda progress: seen.append(progress.done))
+    assert seen[0] >= 128
+    assert hit.results.read_bytes() == calm.results.read_bytes()
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])

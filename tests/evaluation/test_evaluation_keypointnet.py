@@ -13,13 +13,17 @@ import cadalign
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.evaluation.instances.drawing import draw_instance
+from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 from cadalign.evaluation.outcome import FAILED, OK
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.summary import Summary, summary_csv
+from cadalign.geometry.alignment import Alignment
 
 METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
 
@@ -162,6 +166,17 @@ def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
         files = {path.name for path in (out / folder).iterdir()}
         assert files == {f"{name}{ending}" for name in wanted}
     assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}
+
+
+def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Path) -> None:
+    """As the Cramer-Rao bound may state one, at much noise."""
+    model = next(iter(KeypointNet(sample_root)))
+    scene = load_scene(model)
+    instance = make_instance(model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene)
+    behind = Alignment(instance.gt.rotation, -instance.gt.translation, instance.gt.scale)
+    folder = RunFolder(tmp_path / "run").made_for_pictures()
+    draw_instance(folder, instance, behind, category="chair", model_id="behind")
+    assert (folder.overlays / "chair_behind.png").is_file()
 
 
 def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,13 @@ from cadalign.evaluation.runs.parallel import (
     evaluate_chunk,
 )
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
-from cadalign.evaluation.runs.tables import ROW_GROUP, Columns, read_table, write_tables
+from cadalign.evaluation.runs.tables import (
+    ROW_GROUP,
+    Columns,
+    read_table,
+    write_rows,
+    write_tables,
+)
 from cadalign.evaluation.runs.work import AbortError, Plan, Rows
 from cadalign.io import files
 
@@ -167,6 +173,54 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
     run_squares(tmp_path / "whole", Squares())
     assert folder.results.read_bytes() == (tmp_path / "whole" / "results.parquet").read_bytes()
     assert not folder.parts.exists()
+
+
+def cut_short(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def of_another_schema(path: Path) -> None:
+    write_rows(path, (("task", str),), [{"task": "a"}])
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, cut_short, of_another_schema])
+@pytest.mark.parametrize("table", ["", ".timings"])
+def test_damaged_chunks_are_noticed_at_the_start_and_done_again(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    damage: Callable[[Path], None],
+    table: str,
+) -> None:
+    folder = RunFolder(tmp_path / "run")
+    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), InProcess()
+
+    def interrupt(progress: Progress) -> None:
+        if progress.done >= 35:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        execute(plan, folder, workers=workers, on_progress=interrupt)
+    part = folder.parts / f"0000002{table}.parquet"
+    damage(part)
+    seen: list[int] = []
+    execute(plan, folder, workers=workers, on_progress=lambda p: seen.append(p.done))
+    assert seen[0] == 28
+    if damage is not Path.unlink or table:
+        assert caplog.messages == [f"{part}: missing or damaged; its tasks are done again"]
+    run_squares(tmp_path / "whole", Squares())
+    assert folder.results.read_bytes() == (tmp_path / "whole" / "results.parquet").read_bytes()
+    assert len(read_table(folder.timings)) == 100
+
+
+def test_long_differences_are_cut(tmp_path: Path) -> None:
+    plans = [
+        Plan(Squares(), range(7), {f"value{k}": [k * sign] * 500 for k in range(1, 20)}, 7)
+        for sign in (1, -1)
+    ]
+    execute(plans[0], RunFolder(tmp_path), workers=InProcess())
+    with pytest.raises(DataError, match=r"\.\.\. now; and 13 more differences; give") as caught:
+        execute(plans[1], RunFolder(tmp_path), workers=InProcess())
+    assert len(str(caught.value)) < 2000
 
 
 def test_a_finished_run_is_not_done_again(tmp_path: Path) -> None:

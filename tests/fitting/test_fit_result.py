@@ -88,6 +88,17 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
 
+def test_residuals_behind_the_camera_are_null_in_json() -> None:
+    behind = replace(MADE, residuals=np.array([[np.inf, np.inf]] + [[0.0, 0.0]] * 5))
+    text = behind.to_json()
+    assert json.loads(text)["residuals"][0] is None
+    np.testing.assert_array_equal(FitResult.from_json(text).residuals, behind.residuals)
+    # As earlier versions wrote it.
+    older = text.replace("null", "[Infinity, Infinity]", 1)
+    assert '"residuals": [[Infinity' in older
+    np.testing.assert_array_equal(FitResult.from_json(older).residuals, behind.residuals)
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -101,6 +112,10 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
         (
             json.dumps(MADE.to_dict() | {"residuals": [[1, 2, 3]]}),
             "fit result: residuals[0]: [1, 2, 3] is not a list of 2",
+        ),
+        (
+            json.dumps(MADE.to_dict() | {"residuals": [None] * 6}),
+            "fit result: residuals[1]: an inlier's residual is not finite",
         ),
         (
             json.dumps(MADE.to_dict() | {"inliers": [True]}),

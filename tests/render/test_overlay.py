@@ -126,6 +126,18 @@ def test_keypoints_and_residuals_are_drawn(background):
         assert _has_color_near(image, point + np.array([0, 5.0]), OBSERVED_COLOR)
 
 
+def test_reprojections_behind_the_camera_are_left_out():
+    observed = np.array([[100.0, 100.0], [300.0, 200.0]])
+    for missing in (np.inf, np.nan):
+        reprojected = np.array([[missing, missing], [330.0, 200.0]])
+        image = draw_overlay(_blank(), CAMERA, observed=observed, reprojected=reprojected)
+        alone = draw_overlay(_blank(), CAMERA, observed=observed[1:], reprojected=reprojected[1:])
+        changed = (image != alone).any(axis=2)
+        assert changed[90:111, 90:111].any()  # the other ring
+        changed[90:111, 90:111] = False
+        assert not changed.any()
+
+
 def test_white_rings_show_on_white_by_their_casing():
     image = draw_overlay(_blank(value=255), CAMERA, observed=[[100.0, 100.0]], legend=False)
     assert image[90:111, 90:111].min() < 60

@@ -117,7 +117,7 @@ def test_keys_walk_through_and_close(opened: Opened, plain: str) -> None:
     focused = "document.activeElement.querySelector('.name').textContent"
     page.wait_for_function(f"(name) => {focused} === name", arg=order[1])
     page.keyboard.press("ArrowRight")
-    assert page.evaluate(focused) == order[2]
+    page.wait_for_function(f"(name) => {focused} === name", arg=order[2])
     page.keyboard.press("Enter")
     expect(page.locator("dialog[open] h2")).to_have_text(order[2])
     page.go_back()

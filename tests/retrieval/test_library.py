@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import struct
 import time
 from dataclasses import replace
@@ -199,6 +200,12 @@ def test_another_kind_of_file_is_refused(tmp_path: Path, content: bytes) -> None
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=f"{tmp_path}: cannot be read"):
         Library.open(tmp_path)
+
+
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DataError, match=r"cannot be read \(not a regular file\)"):
+        Library.open(tmp_path / "pipe")
 
 
 def test_another_version_is_refused_and_both_are_named(file: Path) -> None:

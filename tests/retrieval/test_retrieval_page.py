@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 from support.files import write_json
 from support.refusals import refusal_line
 
@@ -365,9 +365,9 @@ def test_a_page_shows_the_matches_side_by_side(
             page.on("pageerror", lambda error, to=problems: to.append(str(error)))
             page.goto((out / "index.html").as_uri())
             cards = page.locator("li.match")
-            assert cards.count() == 4
-            assert case.model_id in cards.first.inner_text()
-            assert "100.0 %" in cards.first.inner_text()
+            expect(cards).to_have_count(4)
+            expect(cards.first).to_contain_text(case.model_id, use_inner_text=True)
+            expect(cards.first).to_contain_text("100.0 %", use_inner_text=True)
             loaded = "image => image.decode().then(() => image.naturalWidth)"
             assert page.locator("img").first.evaluate(loaded) == 640
             overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"

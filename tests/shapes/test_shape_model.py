@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -249,6 +250,23 @@ def test_files_that_are_none_are_refused(content: bytes, tmp_path: Path) -> None
     )
     path.write_bytes(content[:-1])
     assert "is truncated" in refusal_text(lambda: ShapeModel.open(path))
+
+
+def test_parts_that_disagree_in_a_file_are_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.shape"
+    fields = msgspec.msgpack.decode(content[64:])
+    SEAL.write(path, msgspec.msgpack.encode(fields | {"ids": [1, 2]}))
+    assert refusal_text(lambda: ShapeModel.open(path)).startswith(
+        f"{path}: components[0]: 9 rows, expected 4"
+    )
+
+
+def test_more_components_than_models_are_refused() -> None:
+    assert refusal_text(lambda: ShapeModel.learn(tables(5), components=8)) == (
+        "components: 8 are more than the 5 models"
+    )
+    model = ShapeModel.learn(tables(5), components=3)
+    assert sum(each.weight for each in model.components) == pytest.approx(1)
 
 
 def test_refusals(learned: ShapeModel) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 from cadalign.datasets import open_correspondences
 from cadalign.evaluation import metrics
 from cadalign.evaluation.correspondences import summary
-from cadalign.evaluation.correspondences.experiment import CorrespondenceExperiment
+from cadalign.evaluation.correspondences.experiment import COLUMNS, CorrespondenceExperiment
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
 from cadalign.evaluation.runs.folder import RunFolder
@@ -46,6 +46,7 @@ SPEC = Spec(
     options=CorrespondenceOptions,
     plan=plan,
     columns=summary.HEADLINE,
+    results=COLUMNS,
     summarize=summary.summarize,
     table=summary.console_table,
     group=lambda run: metrics.OUTLIERS,

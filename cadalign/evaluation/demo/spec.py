@@ -99,7 +99,7 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
     """Write ``results.csv`` with all rows, the seed and the seconds."""
     names = [name for name, _ in COLUMNS]
-    seconds = run.timings["seconds"].to_pylist()
+    seconds = ["" if time != time else time for time in run.cells["seconds"].tolist()]
     rows = [
         [*(row[name] for name in names), run.config["seed"], time]
         for row, time in zip(run.results.to_pylist(), seconds, strict=True)

@@ -54,7 +54,7 @@ def draw_instance(
         gt_box=instance.gt_box,
         est_box=est_box,
         observed=instance.points_2d,
-        reprojected=instance.camera.project(estimate.apply(instance.points_3d)),
+        reprojected=instance.camera.project_where_ahead(estimate.apply(instance.points_3d)),
     )
     small, camera = _scaled(plain, instance.camera, width=_THUMB_WIDTH)
     thumb = draw_overlay(

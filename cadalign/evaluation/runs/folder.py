@@ -24,13 +24,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta, field
 
 from cadalign import __version__
 from cadalign.errors import DataError
-from cadalign.io.files import write_json, writing
+from cadalign.io.documents import Count, ForeignDocument, convert, in_file
+from cadalign.io.files import refuse_nul, write_json, writing
 
 _FORMAT = 2
+_LONGEST_VALUE = 80
+_MOST_DIFFERENCES = 6
 _FIX = "give another folder (--out), or remove this one"
 
 
@@ -96,9 +101,11 @@ class RunFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes out; a killed process holds no lock."""
-        with writing(self.path), (self.path / ".lock").open("a") as file:
+        with writing(self.path):
+            lock = (self.path / ".lock").open("a")
+        with lock:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise DataError(
                     "another process is working on this run",
@@ -109,16 +116,19 @@ class RunFolder:
 
     def read_config(self) -> dict[str, Any] | None:
         """Read ``run.json``; None where there is none."""
+        path = self.config_file
+        refuse_nul(path)
         try:
-            found = json.loads(self.config_file.read_text(encoding="utf-8"))
+            found = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as error:
-            raise DataError(
-                f"cannot be read ({error})", where=str(self.config_file), fix=_FIX
-            ) from None
+        except (OSError, ValueError, RecursionError) as error:
+            what = f"cannot be read ({str(error)[:200]})"
+            raise DataError(what, where=str(path), fix=_FIX) from None
         if not isinstance(found, dict):
-            raise DataError("not the file of a run", where=str(self.config_file), fix=_FIX)
+            raise DataError("not the file of a run", where=str(path), fix=_FIX)
+        with in_file(path):
+            convert(found, _Config)
         return found
 
     def claim(self, config: dict[str, Any]) -> None:
@@ -132,11 +142,22 @@ class RunFolder:
             return
         differences = _differences(found, wanted)
         if differences:
+            listed, rest = differences[:_MOST_DIFFERENCES], len(differences) - _MOST_DIFFERENCES
+            more = f"; and {rest} more differences" if rest > 0 else ""
             raise DataError(
-                "the folder holds a run with another configuration: " + "; ".join(differences),
+                f"the folder holds a run with another configuration: {'; '.join(listed)}{more}",
                 where=str(self.path),
                 fix=_FIX,
             )
+
+
+class _Config(ForeignDocument):
+    """Fields of ``run.json`` that all runs have, besides the experiment's own."""
+
+    experiment: str | None = None
+    tasks: Count = 0
+    chunk_size: Annotated[int, Meta(ge=1, le=2**63 - 1)] = 1
+    versions: dict[str, Any] = field(default_factory=dict)
 
 
 def _versions() -> dict[str, Any]:
@@ -164,4 +185,9 @@ def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
         ]
     if found == wanted:
         return []
-    return [f"{name} is {json.dumps(found)} there and {json.dumps(wanted)} now"]
+    return [f"{name} is {_shown(found)} there and {_shown(wanted)} now"]
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

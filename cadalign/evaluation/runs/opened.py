@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,14 +12,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from cadalign.arrays import is_number
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import read_table
+from cadalign.evaluation.runs.tables import (
+    DONE_ANEW,
+    Columns,
+    checked,
+    read_table,
+    uncompressed_bytes,
+)
+from cadalign.io.documents import read_json
 
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
+COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
+"""Columns of the result table of every experiment."""
+_SECONDS: Columns = (("seconds", float),)
+_NO_TIMINGS = pa.table({})
+_TIMINGS_FIX = "remove it: the run is shown without times"
+_RECORDS_FIX = "remove it: the run is shown without its instances"
 _FIX = "give a folder that cadalign demo, evaluate or simulate has written"
 
 
@@ -41,8 +53,8 @@ class Run:
     total: int
 
     @classmethod
-    def open(cls, path: Path, name: str | None = None) -> Run:
-        """Read a run."""
+    def open(cls, path: Path, name: str | None = None, *, columns: Columns = COLUMNS) -> Run:
+        """Read a run, whose result table must have these columns; see `checked`."""
         folder = RunFolder(path)
         if not path.is_dir():
             raise DataError("no such folder", where=str(path), fix=_FIX)
@@ -54,21 +66,21 @@ class Run:
         name = path.name if name is None else name
         total = int(config.get("tasks", 0))
         if folder.is_finished:
-            timings = [folder.timings] if folder.timings.is_file() else []
-            results = read_table(folder.results)
-            return cls(folder, name, config, results, _joined(timings), total, total)
-        parts = _parts(folder, folder.results)
+            results, timings = _finished(folder, columns)
+            return cls(folder, name, config, results, timings, total, total)
+        size = int(config.get("chunk_size", 1))
+        parts = [index for index in _parts(folder, folder.results) if index * size < total]
         if not parts:
             raise DataError(
                 "nothing of the run is finished yet",
                 where=str(path),
                 fix="wait, or start the command that made it again: it goes on",
             )
-        size = int(config.get("chunk_size", 1))
         done = sum(min(size, total - index * size) for index in parts)
-        timings = [folder.part(folder.timings, index) for index in parts]
-        results = _joined([folder.part(folder.results, index) for index in parts])
-        return cls(folder, name, config, results, _joined(timings), done, total)
+        results = _joined([folder.part(folder.results, index) for index in parts], columns)
+        files = [folder.part(folder.timings, index) for index in parts]
+        timings = _joined(files, _SECONDS) if all(map(Path.is_file, files)) else _NO_TIMINGS
+        return cls(folder, name, config, results, timings, done, total)
 
     @property
     def experiment(self) -> str:
@@ -88,8 +100,8 @@ class Run:
     @property
     def noise_px(self) -> float | None:
         """Standard deviation of the keypoints' noise [px], if it is one number."""
-        noise = self.config.get("noise_px")
-        return float(noise) if isinstance(noise, int | float) else None
+        noise: Any = self.config.get("noise_px")
+        return float(noise) if is_number(noise) else None
 
     @property
     def dataset(self) -> str:
@@ -101,8 +113,8 @@ class Run:
     def day(self) -> str:
         """Day of its start, such as 2026-03-01 (UTC)."""
         try:
-            return str(json.loads(self.folder.progress.read_text(encoding="utf-8"))["started"])[:10]
-        except (OSError, ValueError, KeyError, TypeError):
+            return str(read_json(self.folder.progress)["started"])[:10]
+        except (DataError, KeyError, TypeError):
             seconds = self.folder.config_file.stat().st_mtime
             return time.strftime("%Y-%m-%d", time.gmtime(seconds))
 
@@ -123,18 +135,18 @@ class Run:
         """Number of different values of some columns."""
         return len(self.results.select(names).group_by(list(names)).aggregate([]))
 
-    def records(self) -> Iterator[dict[str, Any]]:
+    def records(self, columns: Columns) -> Iterator[dict[str, Any]]:
         """Rows of the table of instance records; none of runs that keep none."""
         for path in self._record_files():
-            yield from read_table(path).to_pylist()
+            yield from checked(
+                read_table(path, fix=_RECORDS_FIX), columns, path=path, fix=_RECORDS_FIX
+            ).to_pylist()
 
     def record_bytes(self) -> int:
         """Rough size of the instance records."""
         count = 0
         for path in self._record_files():
-            metadata = pq.read_metadata(path)
-            groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
-            count += sum(group.total_byte_size for group in groups)
+            count += uncompressed_bytes(path, fix=_RECORDS_FIX)
         return count
 
     def _record_files(self) -> list[Path]:
@@ -151,6 +163,23 @@ def _parts(folder: RunFolder, table: Path) -> list[int]:
     return [index for index in indices if folder.part(table, index).is_file()]
 
 
-def _joined(paths: Sequence[Path]) -> pa.Table:
-    """One table of several; empty, without columns, of none."""
-    return pa.concat_tables([read_table(path) for path in paths]) if paths else pa.table({})
+def _finished(folder: RunFolder, columns: Columns) -> tuple[pa.Table, pa.Table]:
+    """The results and the timings of a finished run; the latter may have been removed."""
+    path = folder.results
+    results = checked(read_table(path), columns, path=path, fix=DONE_ANEW)
+    path = folder.timings
+    if not path.is_file():
+        return results, _NO_TIMINGS
+    return results, checked(
+        read_table(path, fix=_TIMINGS_FIX), _SECONDS, path=path, fix=_TIMINGS_FIX
+    )
+
+
+def _joined(paths: Sequence[Path], columns: Columns) -> pa.Table:
+    """One table of those of chunks."""
+    tables = [checked(read_table(path), columns, path=path, fix=DONE_ANEW) for path in paths]
+    for path, table in zip(paths, tables, strict=True):
+        if table.schema != tables[0].schema:
+            what = f"its columns are not those of {paths[0].name}"
+            raise DataError(what, where=str(path), fix=DONE_ANEW)
+    return pa.concat_tables(tables)

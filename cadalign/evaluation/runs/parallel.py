@@ -15,7 +15,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar, cast
@@ -150,7 +150,7 @@ def evaluate_on(
                     yield chunk, future.result()
                 except deadly:
                     suspects.append(chunk)
-                except CadalignError:
+                except (CadalignError, CancelledError):
                     raise
                 except Exception as error:
                     raise _cannot_work(reason_of(error)) from error

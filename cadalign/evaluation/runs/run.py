@@ -1,16 +1,17 @@
 """Runs: an experiment over many tasks in a folder, that can be killed and started again.
 
 A finished chunk is a file in ``parts`` of the run's folder (`cadalign.evaluation.runs.folder`),
-which appears whole or not at all. Started again, a run does the chunks that have none. Chunks are
-the same whatever the number of workers, and their rows follow from the run's seed and the tasks'
-names, so nothing in ``results.parquet`` tells how often the run was interrupted or who did the
-work.
+which appears whole or not at all. Started again, a run does the chunks that have none, or whose
+tables are damaged. Chunks are the same whatever the number of workers, and their rows follow from
+the run's seed and the tasks' names, so nothing in ``results.parquet`` tells how often the run was
+interrupted or who did the work.
 
 An experiment of one's own is a `Spec` (`cadalign.evaluation.registry`).
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import shutil
@@ -23,9 +24,11 @@ from typing import Any, TypeVar
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, InProcess, LocalProcesses, Workers
-from cadalign.evaluation.runs.tables import Columns, read_table, write_rows, write_tables
+from cadalign.evaluation.runs.tables import Columns, is_whole, read_table, write_rows, write_tables
 from cadalign.evaluation.runs.work import Experiment, Plan
 from cadalign.io.files import write_json, writing
+
+logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
 
@@ -85,7 +88,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
         _sweep(folder.parts)
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     starts = range(0, len(tasks), size)
-    missing = [k for k in range(len(starts)) if not folder.part(folder.results, k).is_file()]
+    missing = [k for k in range(len(starts)) if not _is_done(experiment, folder, k)]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
     progress_file = _ProgressFile(folder.progress, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
@@ -101,6 +104,18 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
         progress_file.note(done)
         on_progress(Progress(done, len(tasks)))
     progress_file.note(done, last=True)
+
+
+def _is_done(experiment: Experiment[Any], folder: RunFolder, index: int) -> bool:
+    """True if all tables of a chunk can be read; one that was done, but is damaged, is told of."""
+    if not folder.part(folder.results, index).is_file():
+        return False
+    for table, columns in _tables(experiment, folder).items():
+        part = folder.part(table, index)
+        if not is_whole(part, columns):
+            logger.warning("%s: missing or damaged; its tasks are done again", part)
+            return False
+    return True
 
 
 def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:

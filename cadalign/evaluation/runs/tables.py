@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, quote
 from cadalign.io.files import write_whole
 
 Row = dict[str, Any]
@@ -17,6 +18,7 @@ Row = dict[str, Any]
 Columns = tuple[tuple[str, type], ...]
 """Names of a table's columns and their types: str, int, float or bool."""
 
+DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 16
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
@@ -44,17 +46,63 @@ def write_tables(path: Path, columns: Columns, tables: Iterable[pa.Table]) -> No
     write_whole(path, write)
 
 
-def read_table(path: Path) -> pa.Table:
-    """Read a Parquet file."""
-    try:
+def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
+    """Read a Parquet file; ``fix`` is what errors advise."""
+    with _reading(path, fix):
         # Threads would gain nothing here and cost memory for each.
         return pq.read_table(path, use_threads=False)
+
+
+def uncompressed_bytes(path: Path, *, fix: str) -> int:
+    """Size of a Parquet file's content; errors are those of `read_table`."""
+    with _reading(path, fix):
+        metadata = pq.read_metadata(path)
+        groups = (metadata.row_group(index) for index in range(metadata.num_row_groups))
+        return sum(group.total_byte_size for group in groups)
+
+
+@contextmanager
+def _reading(path: Path, fix: str) -> Iterator[None]:
+    try:
+        yield
     except (OSError, pa.ArrowException) as error:
-        raise DataError(
-            f"not a table that can be read ({error})",
-            where=str(path),
-            fix="remove it and start the same run again",
-        ) from None
+        reason = " ".join(str(error).split())[:200]
+        what = f"not a table that can be read ({reason})"
+        raise DataError(what, where=str(path), fix=fix) from None
+
+
+def is_whole(path: Path, columns: Columns) -> bool:
+    """True if a file is a table of exactly these columns and can be read to its end."""
+    try:
+        return bool(read_table(path).schema.equals(schema_of(columns)))
+    except DataError:
+        return False
+
+
+def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:
+    """The table of a file, with empty columns for numbers that an older one does not have.
+
+    Raises
+    ------
+    DataError
+        If another column is missing, a type is another, or a text is missing.
+    """
+    for name, kind in columns:
+        what, wanted = "", _TYPES[kind]
+        if name not in table.column_names:
+            if kind is float:
+                empty = pa.nulls(len(table), wanted)
+                table = table.append_column(name, empty)
+                continue
+            what = f"there is no column {name!r}"
+        elif table.schema.field(name).type != wanted:
+            found = quote(str(table.schema.field(name).type))
+            what = f"the column {name!r} is of the type {found}, not {str(wanted)!r}"
+        elif kind is str and table[name].null_count:
+            what = f"the column {name!r} has empty cells"
+        if what:
+            raise DataError(f"not a table of such a run: {what}", where=str(path), fix=fix)
+    return table
 
 
 def _regrouped(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -18,8 +18,8 @@ class SweepKind:
     """The quantity that is varied, a column of the result table, and those that are held."""
 
     name: str
-    column: str
-    values: tuple[float, ...]
+    column: Literal["noise_px", "points", "outlier_share"]
+    values: tuple[int | float, ...]
     points: int
     noise_px: float
     outlier_share: float

@@ -37,6 +37,7 @@ SPEC = Spec(
     options=SweepOptions,
     plan=plan,
     columns=(metrics.INSTANCES, metrics.FAILED, *experiment.ERRORS, metrics.MICROSECONDS),
+    results=experiment.COLUMNS,
     summarize=summary.summarize,
     lines=summary.lines,
     table=summary.console_table,

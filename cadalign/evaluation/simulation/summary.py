@@ -8,7 +8,7 @@ and ``failed``, the number of problems and of those that the method did not solv
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict
 
 from cadalign.evaluation import metrics
 from cadalign.evaluation.metrics import Metric
@@ -18,6 +18,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.simulation.experiment import ERRORS
 from cadalign.evaluation.simulation.options import SWEEPS, SweepKind
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
+from cadalign.io.documents import convert, in_file
 
 VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
 """Quantities that a sweep may vary."""
@@ -25,10 +26,12 @@ VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metri
 
 def kind_of(run: Run) -> SweepKind:
     """The sweep that a run makes."""
-    given = run.config["sweep"]
-    lists = {name: tuple(given[name]) for name in ("values", "methods")}
+    given = run.config.get("sweep")
     # What an older run does not say is as in this sweep.
-    return replace(SWEEPS["noise"], **{**given, **lists})
+    stated = {**asdict(SWEEPS["noise"]), **given} if isinstance(given, dict) else given
+    with in_file(run.folder.config_file):
+        found: SweepKind = convert(stated, SweepKind, "sweep")
+    return found
 
 
 def varied(run: Run) -> Metric:

@@ -101,6 +101,10 @@ def assemble(
 def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
     scale = np.exp(minimum.state.log_scales)
     stretched = points_of(minimum.evidence.shape, minimum.state)
+    seen = stretched[np.unique(minimum.evidence.sightings.point)]
+    if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
+        stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
+        stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
     unknowns, of_points = joint_covariance(minimum.evidence, minimum.state)
     return _Estimate(
         stretched / scale,

@@ -1,0 +1,58 @@
+"""`cadalign shape`: learn from a data set, show, refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from support.refusals import refusal_line
+
+from cadalign import ShapeModel
+from cadalign.cli import main
+from cadalign.datasets import write_sample_dataset
+
+
+def test_learn_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample_root = write_sample_dataset(tmp_path / "sample", per_category=5, categories=["chair"])
+    out = tmp_path / "shapes" / "chair.shape"
+    assert main(["shape", "learn", str(sample_root), "--category", "chair", "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert f"Written: {out}" in captured.err
+    model = ShapeModel.open(out)
+    assert model.category == "chair"
+    assert model.up_axis == "y"
+    assert model.unit == "diagonal"
+    assert model.training is not None
+    assert model.training.mesh_paths[0] is not None
+
+    assert main(["shape", "show", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert f"chair: {len(model.ids)} keypoints, learned from {len(model.training)} models" in shown
+    assert "component 1" in shown
+    with Image.open(out.with_suffix(".png")) as picture:
+        assert picture.width > 400
+
+    picture_path = tmp_path / "other.png"
+    assert main(["shape", "show", str(out), "--json", "--out", str(picture_path)]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["picture"] == str(picture_path)
+    assert sum(each["weight"] for each in summary["components"]) == pytest.approx(1)
+    assert all(sum(each["variance_shares"]) <= 1 + 1e-9 for each in summary["components"])
+
+
+def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "zebra")
+    assert "zebra" in line
+    line = refusal_line(capsys, "shape", "learn", sample_root, "--category", "chair")
+    assert line == "chair: 1 models are too few to learn a shape from; at least 4 are needed"
+    line = refusal_line(
+        capsys, "shape", "learn", sample_root, "--category", "chair", "--split", "none"
+    )
+    assert "unknown split 'none'" in line
+    wrong = tmp_path / "wrong.shape"
+    wrong.write_text("no shape")
+    line = refusal_line(capsys, "shape", "show", wrong)
+    assert line == f"{wrong}: not a shape file; learn it with: cadalign shape learn"

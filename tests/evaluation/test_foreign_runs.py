@@ -1,0 +1,290 @@
+"""Folders of runs whose files are damaged, missing, or another program's."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.refusals import refusal_line
+
+import cadalign
+from cadalign.cli import main
+from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.correspondences.options import CorrespondenceOptions
+from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.retrieval.options import RetrievalRunOptions
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.simulation.options import SweepOptions
+
+SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))
+Change = Callable[[Path], None]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished sweep."""
+    path = tmp_path_factory.mktemp("finished") / "run"
+    do_run(SWEEP, RunFolder(path), workers=0, dask=None)
+    return path
+
+
+@pytest.fixture(scope="module")
+def halved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep with one of its two chunks."""
+    path = tmp_path_factory.mktemp("halved") / "run"
+
+    def stop(progress: Progress) -> None:
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        do_run(SWEEP, RunFolder(path), workers=0, dask=None, on_progress=stop)
+    return path
+
+
+def changed(column: str, values: Any) -> Change:
+    """Give another column to the table of results."""
+
+    def change(run: Path) -> None:
+        table = pq.read_table(run / "results.parquet")
+        cells = pa.array([values] * len(table))
+        index = table.column_names.index(column)
+        pq.write_table(table.set_column(index, column, cells), run / "results.parquet")
+
+    return change
+
+
+def foreign(run: Path) -> None:
+    pq.write_table(pa.table({"a": [1, 2], "b": ["x", "y"]}), run / "results.parquet")
+
+
+def without_method(run: Path) -> None:
+    table = pq.read_table(run / "results.parquet")
+    pq.write_table(table.drop_columns("method"), run / "results.parquet")
+
+
+def twice(run: Path) -> None:
+    table = pq.read_table(run / "results.parquet")
+    pq.write_table(table.append_column("method", table["method"]), run / "results.parquet")
+
+
+def cut_short(run: Path) -> None:
+    path = run / "results.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def cut_timings(run: Path) -> None:
+    path = run / "timings.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+_ANEW = "; remove it and start the same run again: what is missing is done anew"
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (foreign, f"not a table of such a run: there is no column 'points'{_ANEW}"),
+        (without_method, f"not a table of such a run: there is no column 'method'{_ANEW}"),
+        (twice, None),
+        (
+            changed("rotation_error_deg", "large"),
+            "not a table of such a run: the column 'rotation_error_deg' is of the type 'string', "
+            f"not 'double'{_ANEW}",
+        ),
+        (
+            changed("method", None),
+            f"not a table of such a run: the column 'method' is of the type 'null', not "
+            f"'string'{_ANEW}",
+        ),
+        (cut_short, None),
+    ],
+)
+def test_a_foreign_or_damaged_table_of_results_is_refused(
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Change,
+    text: str | None,
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    change(run)
+    for arguments in (["report", run], ["report", run, "--format", "md"]):
+        line = refusal_line(capsys, *arguments)
+        assert line.startswith(f"{run / 'results.parquet'}: not a table ")
+        assert line.endswith(_ANEW)
+        if text is not None:
+            assert line == f"{run / 'results.parquet'}: {text}"
+    # The advice works.
+    (run / "results.parquet").unlink()
+    do_run(SWEEP, RunFolder(run), workers=0, dask=None)
+    assert (run / "results.parquet").read_bytes() == (finished / "results.parquet").read_bytes()
+
+
+def test_empty_cells_of_a_text_are_refused(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    table = pq.read_table(run / "results.parquet")
+    cells = pa.array([None, *table["method"].to_pylist()[1:]], pa.string())
+    index = table.column_names.index("method")
+    pq.write_table(table.set_column(index, "method", cells), run / "results.parquet")
+    assert "the column 'method' has empty cells" in refusal_line(capsys, "report", run)
+
+
+def test_damaged_timings_may_be_removed(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    cut_timings(run)
+    line = refusal_line(capsys, "report", run)
+    assert line.endswith("; remove it: the run is shown without times")
+    (run / "timings.parquet").unlink()
+    assert main(["report", str(run)]) == 0
+    table = cadalign.simulate(
+        "points", values=(8, 10), runs=40, methods=("aepnp",), workers=0, out=run
+    )
+    assert table.seconds.isna().all()
+
+
+def test_an_unfinished_run_with_a_missing_part_is_shown(
+    halved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(halved, run)
+    (timings,) = (run / "parts").glob("*.timings.parquet")
+    timings.unlink()
+    assert main(["report", str(run)]) == 0
+    capsys.readouterr()
+    (part,) = (run / "parts").iterdir()
+    pq.write_table(pa.table({"a": [1]}), part)
+    assert "there is no column 'points'" in refusal_line(capsys, "report", run)
+    # Parts of another, longer run.
+    shutil.copy(halved / "parts" / part.name, part)
+    shutil.copy(part, run / "parts" / "0000900.parquet")
+    assert main(["report", str(run)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"tasks": "many"}, "tasks: 'many' is not a whole number"),
+        ({"tasks": -3}, "tasks: -3 is not a whole number >= 0"),
+        ({"chunk_size": 0}, "chunk_size: 0 is not a whole number >= 1"),
+        ({"versions": "new"}, "versions: 'new' is not an object"),
+        ({"experiment": 3}, "experiment: 3 is not a text"),
+        ({"sweep": None}, "sweep: None is not an object"),
+        ({"sweep": {"column": "weight"}}, "sweep.column: 'weight' is not one of 'noise_px', "),
+        ({"sweep": {"values": [1, "x"]}}, "sweep.values[1]: 'x' is not "),
+        ({"sweep": {"runs": 2.5}}, "sweep.runs: 2.5 is not a whole number"),
+        ({"sweep": {"methods": "aepnp"}}, "sweep.methods: 'aepnp' is not a list"),
+    ],
+)
+def test_a_hostile_run_file_is_refused_by_field(
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    fields: dict[str, Any],
+    text: str,
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    config = json.loads((run / "run.json").read_text()) | fields
+    (run / "run.json").write_text(json.dumps(config))
+    line = refusal_line(capsys, "report", run)
+    assert line.startswith(f"{run / 'run.json'}: {text}")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"tasks": ' + "9" * 5000 + "}", "\xff", "[1]"])
+def test_a_run_file_that_is_none_is_refused(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "run.json").write_text(text, encoding="latin-1")
+    line = refusal_line(capsys, "report", run)
+    assert line.startswith(f"{run / 'run.json'}: ")
+    assert len(line) < 600
+
+
+def test_odd_values_of_a_run_file_do_no_harm(finished: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    config = json.loads((run / "run.json").read_text())
+    config |= {"noise_px": "loud", "root": 7, "seed": [None], "versions": {"cadalign": {}}}
+    (run / "run.json").write_text(json.dumps(config))
+    (run / "progress.json").write_text("[" * 100_000)
+    assert main(["report", str(run)]) == 0
+
+
+def _keypointnet(root: Path, out: Path) -> None:
+    options = KeypointNetOptions(root, methods=("aepnp",), categories=("chair",))
+    do_run(options, RunFolder(out), workers=0, dask=None)
+
+
+def _retrieval(root: Path, out: Path) -> None:
+    options = RetrievalRunOptions(root, methods=("epnp",), keypoints=(6,), noises_px=(1.0,))
+    do_run(options, RunFolder(out), workers=0, dask=None)
+
+
+def _correspondences(root: Path, out: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (30, 3)) + [0, 0, 5]
+    folder = root / "nyu_train"
+    folder.mkdir(parents=True)
+    values = {
+        "matches": [np.hstack([points[:, :2] / points[:, 2:], points])],
+        "R": [np.eye(3)],
+        "t": [np.zeros(3)],
+    }
+    for name, value in values.items():
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps(value, protocol=2))
+    options = CorrespondenceOptions(folder, methods=("aepnp",), outliers=(0.0,))
+    do_run(options, RunFolder(out), workers=0, dask=None)
+
+
+@pytest.mark.parametrize("make", [_keypointnet, _retrieval, _correspondences])
+def test_a_finished_run_without_timings_is_shown(
+    sample_root: Path, tmp_path: Path, make: Callable[[Path, Path], None]
+) -> None:
+    run = tmp_path / "run"
+    make(sample_root if make is not _correspondences else tmp_path / "scene", run)
+    code = main(["evaluate", "show", str(run)])
+    assert code in (0, 3)
+    (run / "timings.parquet").unlink()
+    assert main(["report", str(run)]) == 0
+    assert main(["evaluate", "show", str(run)]) == code
+
+
+@pytest.mark.parametrize("assets", [[], ["--assets"]])
+@pytest.mark.parametrize("record", ["", "alert(1)", "[1]", "[" * 100_000, "{} alert(1)"])
+def test_records_that_are_no_objects_are_refused(
+    sample_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    record: str,
+    assets: list[str],
+) -> None:
+    run = tmp_path / "run"
+    _keypointnet(sample_root, run)
+    table = pq.read_table(run / "exhibits.parquet")
+    cells = pa.array([record] * len(table), pa.string())
+    index = table.column_names.index("exhibit")
+    pq.write_table(table.set_column(index, "exhibit", cells), run / "exhibits.parquet")
+    line = refusal_line(capsys, "report", run, *assets)
+    assert "is not an object of JSON; remove it: the run is shown without it" in line
+    assert len(line) < 600
+    (run / "exhibits.parquet").unlink()
+    assert main(["report", str(run), *assets]) == 0

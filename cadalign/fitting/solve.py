@@ -48,7 +48,8 @@ def solve(
     if options.focal == "known":
         for camera in problems.cameras:
             camera.require_focal()
-    if options.method != "optimal":  # which would not notice
+    if options.method != "optimal" and not _is_plain(options.sigma, sigmas):
+        # The other methods would not notice a wrong one.
         check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
     if options.method == "optimal":
         found = _solve_optimal(problems, options, points, sigmas)
@@ -63,6 +64,11 @@ def solve(
     if np.count_nonzero(statuses):
         found = found._replace(errors=_errors(problems, options, found))
     return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
+    """True for one positive number, which needs no further check."""
+    return sigmas is None and type(sigma) is float and 0.0 < sigma < math.inf
 
 
 def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors:

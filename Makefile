@@ -23,7 +23,8 @@ test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones
 	$(BIN)/python -m pytest -m "not slow"
 
 fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)
-	for what in fits readers commands; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
+	for what in fits batches readers; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
+	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, renderers and retrieval
 	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)

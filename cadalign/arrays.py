@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+_LEAST, _MOST = 1e-100, 1e100  # squares of what lies between do not overflow
 _NUMBERS = (float, int, np.integer, np.floating)
 
 
@@ -72,12 +73,33 @@ def as_floats(
 
 def is_number(value: Any) -> bool:
     """True for a finite real number, of NumPy or not."""
-    if not isinstance(value, _NUMBERS) or isinstance(value, bool):
+    if not isinstance(value, _NUMBERS) or isinstance(value, bool | np.timedelta64):
         return False
     try:
         return math.isfinite(value)
     except OverflowError:  # a whole number beyond all floats
         return False
+
+
+def is_whole(value: Any) -> bool:
+    """True for an integer, of NumPy or not."""
+    return is_number(value) and isinstance(value, int | np.integer)
+
+
+def as_positive(value: Any, *, name: str) -> float:
+    """Convert a positive number of any type to a float: kernels take no other.
+
+    Raises
+    ------
+    InputError
+        If it is not a positive number, or its square is out of range.
+    """
+    if not is_number(value) or not value > 0:
+        raise InputError(f"{quote(value)} is not positive", where=name)
+    number = float(value)
+    if not _LEAST <= number <= _MOST:
+        raise InputError(f"{number} is not between {_LEAST:g} and {_MOST:g}", where=name)
+    return number
 
 
 def as_points(value: Any, *, name: str, dimension: int) -> FloatArray:

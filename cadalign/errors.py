@@ -109,4 +109,19 @@ def quote(value: Any) -> str:
         text = short.repr(value)
     except ValueError:  # a whole number of thousands of digits
         text = f"a {type(value).__name__} of thousands of digits"
+    return _cut(text)
+
+
+def brief(text: object) -> str:
+    """A text that a file holds, or another library's message, in at most 200 printable characters.
+
+    Examples
+    --------
+    >>> brief("wood\\x1b[2J.png")
+    'wood?[2J.png'
+    """
+    return _cut("".join(c if c.isprintable() else "?" for c in str(text)[: 2 * _QUOTED_LENGTH]))
+
+
+def _cut(text: str) -> str:
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."

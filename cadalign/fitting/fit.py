@@ -132,8 +132,10 @@ def fit(
     chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
     try:
         options = _checked_options(*chosen)
-    except TypeError:  # an array as sigma has no hash, and the caller may go on to change it
-        options = FitOptions(method, deepcopy(sigma), *chosen[2:])
+    except InputError:
+        raise
+    except (TypeError, ValueError):  # an array as sigma has no hash
+        options = FitOptions(method, _copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
     if ransac is None:
@@ -243,6 +245,14 @@ def fit_batch(
         return run((0, len(problems)))
     with ThreadPoolExecutor(len(parts)) as pool:
         return BatchResult.joined(list(pool.map(run, parts)))
+
+
+def _copied(sigma: Any) -> Any:
+    """A copy that the caller does not go on to change."""
+    try:
+        return deepcopy(sigma)
+    except TypeError:  # a memoryview
+        return np.array(sigma)
 
 
 def _check_ransac(ransac: object, confidences: object) -> None:

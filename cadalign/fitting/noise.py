@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_floats, is_number
+from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.fitting.options import Sigma
 from cadalign.geometry.camera import Camera
@@ -40,6 +41,24 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
     b = of_rays[:, 0, 1] / a
     c = np.sqrt(of_rays[:, 1, 1] - b * b)
     return np.stack([a, b, c], axis=1)
+
+
+def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
+    """Check the standard deviations of problems of so many keypoints each, or one for all.
+
+    Raises
+    ------
+    InputError
+        If one is no standard deviation, or has another shape than its keypoints.
+    """
+    for b, sigma in enumerate(sigmas):
+        if sigma is None or (isinstance(sigma, int | float) and is_number(sigma) and sigma > 0):
+            continue
+        if np.ndim(sigma) == 0 or len(sigmas) > 1:
+            pixel_information(sigma, int(counts[b]))
+        else:
+            for count in set(counts.tolist()):
+                pixel_information(sigma, count)
 
 
 _FIX = "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"

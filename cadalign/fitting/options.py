@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, is_number
+from cadalign.arrays import FloatArray, IntArray, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -22,8 +21,6 @@ FOCALS = ("known", "estimate")
 AXES = ("x", "y", "z")
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
-
-_LEAST, _MOST = 1e-100, 1e100  # whose squares do not overflow
 
 Sigma = float | npt.ArrayLike
 
@@ -73,9 +70,10 @@ class FitOptions(AlignmentOptions):
         _check_known("loss", self.loss, LOSSES)
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
-        _check_positive("loss_scale", self.loss_scale)
+        object.__setattr__(self, "loss_scale", as_positive(self.loss_scale, name="loss_scale"))
         if self.scale_prior_sigma is not None:
-            _check_positive("scale_prior_sigma", self.scale_prior_sigma)
+            scale_prior_sigma = as_positive(self.scale_prior_sigma, name="scale_prior_sigma")
+            object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
         if self.sigma is not None and not is_number(self.sigma):
             try:
                 np.ndim(self.sigma)
@@ -96,12 +94,12 @@ class FitOptions(AlignmentOptions):
                 fix="use the method 'optimal', or leave these options at their defaults",
             )
 
-    def _check_stretch(self, stretch: str) -> None:
+    def _check_stretch(self, stretch: object) -> None:
         axes = [axis for axis in "xyz" if axis != self.known_axis]
         allowed = ("".join(axes), axes[0], axes[1], "none")
-        if stretch not in allowed:
+        if not isinstance(stretch, str) or stretch not in allowed:
             raise InputError(
-                f"{stretch!r} are not axes that can stretch where {self.known_axis} is known",
+                f"{quote(stretch)} are not axes that can stretch where {self.known_axis} is known",
                 where="stretch",
                 fix=f"give one of {', '.join(allowed)}",
             )
@@ -221,11 +219,15 @@ class RansacOptions:
     the best hypothesis as the minimal solver left it."""
 
     def __post_init__(self) -> None:
-        _check_positive("max_reproj_error", self.max_reproj_error)
+        error = as_positive(self.max_reproj_error, name="max_reproj_error")
+        object.__setattr__(self, "max_reproj_error", error)
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or not least <= value < 2**63:
+            if not is_whole(value) or not least <= value < 2**63:
                 raise InputError(f"{quote(value)} is not a number of at least {least}", where=name)
+            object.__setattr__(self, name, int(value))
+        if not isinstance(self.refine, bool | np.bool_):
+            raise InputError(f"{quote(self.refine)} is neither True nor False", where="refine")
         if not is_number(self.success_prob) or not 0 < self.success_prob < 1:
             what = f"{quote(self.success_prob)} is not between 0 and 1"
             raise InputError(what, where="success_prob")
@@ -236,10 +238,3 @@ def _check_known(name: str, value: object, known: Collection[str]) -> None:
     if not isinstance(value, str) or value not in known:
         fix = f"known are {', '.join(known)}"
         raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
-
-
-def _check_positive(name: str, value: Any) -> None:
-    if not is_number(value) or not value > 0:
-        raise InputError(f"{quote(value)} is not positive", where=name)
-    if not _LEAST <= value <= _MOST:
-        raise InputError(f"{value} is not between {_LEAST:g} and {_MOST:g}", where=name)

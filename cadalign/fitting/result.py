@@ -158,7 +158,7 @@ class FitResult:
 
     @cached_property
     def misfit(self) -> Misfit | None:
-        """What a chi-square test says of residuals that the given sigma does not explain.
+        """Result of a chi-square test of residuals that the given sigma does not explain.
 
         None if they pass (of right data, 99.5 % or more do), for an estimated sigma, for methods
         that are not statistical, and for results without ``options``.

@@ -12,7 +12,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError
 from cadalign.fitting.degeneracy import no_redundancy_error, solver_error
 from cadalign.fitting.focal.search import search_focal
-from cadalign.fitting.noise import rays_of, whitening_of
+from cadalign.fitting.noise import check_sigmas, rays_of, whitening_of
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
 from cadalign.fitting.solutions import Solutions
@@ -48,6 +48,9 @@ def solve(
     if options.focal == "known":
         for camera in problems.cameras:
             camera.require_focal()
+    if options.method != "optimal" and not _is_plain(options.sigma, sigmas):
+        # The other methods would not notice a wrong one.
+        check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
     if options.method == "optimal":
         found = _solve_optimal(problems, options, points, sigmas)
     elif options.method == "aepnp":
@@ -61,6 +64,11 @@ def solve(
     if np.count_nonzero(statuses):
         found = found._replace(errors=_errors(problems, options, found))
     return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
+    """True for one positive number, which needs no further check."""
+    return sigmas is None and type(sigma) is float and 0.0 < sigma < math.inf
 
 
 def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors:

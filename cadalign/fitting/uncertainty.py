@@ -62,6 +62,7 @@ def unknown_axes(known_axis: str) -> tuple[int, int]:
     return first, second
 
 
+@np.errstate(all="ignore")  # lengths that overflow are of translations known well enough
 def warnings_of(
     points_3d: FloatArray,
     alignment: Alignment,

@@ -89,9 +89,15 @@ class Camera:
                     where=f"camera.{name}",
                     fix="give the calibrated focal length in pixels",
                 )
+        known: object = self.focal_known
+        if not isinstance(known, bool | np.bool_):
+            what = f"{quote(known)} is neither True nor False"
+            raise InputError(what, where="camera.focal_known")
         try:
+            if np.iscomplexobj(self.distortion) or np.ma.is_masked(self.distortion):
+                raise TypeError
             coefficients = tuple(float(value) for value in self.distortion)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
             raise InputError("not a sequence of numbers", where="camera.distortion") from None
         if len(coefficients) not in (0, 4, 5, 8) or not np.isfinite(coefficients).all():
             raise InputError(

@@ -34,6 +34,8 @@ Index = Annotated[int, Meta(ge=-(2**63) + 1, le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 _PATH = r"\A[^\0]+\Z"
 _FILE_NAME = r"\A(?!\.{1,2}\Z)[^/\\\0]+\Z"
+_HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
+_HALF_REASON = r"a text has half of a character, such as \ud800 without its second half"
 Text = Annotated[str, Meta(pattern=r"\S")]
 PathText = Annotated[str, Meta(pattern=_PATH)]
 Id = Annotated[str, Meta(pattern=_FILE_NAME)]  # becomes a part of paths and must not leave a folder
@@ -70,9 +72,14 @@ def read_json(path: Path) -> Any:
         text = path.read_text(encoding="utf-8")
     where, reason = str(path), "nested too deeply"
     try:
-        return json.loads(text)
+        data = json.loads(text)
+        if _HALF_CHARACTER.search(text):  # perhaps one half of two
+            json.dumps(data, ensure_ascii=False).encode("utf-8")
+        return data
     except json.JSONDecodeError as error:
         where, reason = f"{path}, line {error.lineno}", error.msg
+    except UnicodeEncodeError:
+        reason = _HALF_REASON
     except ValueError as error:  # a whole number of thousands of digits
         reason = str(error)[:200]
     except RecursionError:
@@ -93,6 +100,8 @@ def convert(data: Any, kind: type[T] | Any, where: str = "") -> T | Any:
         if plain is not data:
             return convert(plain, kind, where)
         raise _located(error, data, kind, where) from None
+    except UnicodeEncodeError:
+        raise DataError(_HALF_REASON, where=where or None) from None
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import DataError
+from cadalign.errors import DataError, brief
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ ByteImage = npt.NDArray[np.uint8]
 
 _ORIENTATION = 0x0112
 _ON_ITS_SIDE = frozenset((5, 6, 7, 8))
+# Deflate compresses bytes to 1/1032 at most; images of one bit per pixel grow further when decoded.
+_COMPRESSION = 1032
+_FREE_BYTES = 2**26
 
 
 @contextmanager
@@ -37,11 +41,28 @@ def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
         # Waiting for the other end of a pipe could take for ever, and images need random access.
         if not path.is_file():
             raise OSError("not a regular file")
-        with Image.open(path) as image:
-            yield image
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's about EXIF data of which it skips a part
+            with Image.open(path) as image:
+                check_pixels(image, path.stat().st_size)
+                yield image
     # ValueError: a NUL in the path; SyntaxError: Pillow's word for a broken PNG.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"not an image that can be read ({error})", where=str(path)) from None
+        what = f"not an image that can be read ({brief(error)})"
+        raise DataError(what, where=str(path)) from None
+
+
+def check_pixels(image: Image, file_size: int) -> None:
+    """Refuse an image whose pixels take far more memory than its file can describe.
+
+    Raises
+    ------
+    ValueError
+        If they are more than 64 MB and 1032 times the file's bytes, the most that PNG compresses.
+    """
+    width, height = image.size
+    if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
+        raise ValueError(f"{width} x {height} pixels in {file_size} bytes")
 
 
 def read_photo(path: str | os.PathLike[str]) -> ByteImage:

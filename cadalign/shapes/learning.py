@@ -291,6 +291,6 @@ def _least_enough(scores: Sequence[FloatArray], tolerance: float) -> int:
 
 
 def _is_enough(scores: FloatArray, best: FloatArray, tolerance: float) -> bool:
-    """Whether models are less likely by no more than a tolerance or the standard error."""
+    """True if models are less likely by no more than a tolerance or the standard error."""
     losses = best - scores
     return float(losses.mean()) <= max(tolerance, float(losses.std()) / math.sqrt(len(losses)))

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import reading
 
@@ -65,7 +65,7 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
                 if row is not None:
                     by_image.setdefault(row.get("image") or None, []).append(row)
     except csv.Error as error:
-        raise DataError(f"cannot be read ({error})", where=str(path)) from None
+        raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
     if not by_image:
         raise DataError("there are no keypoints", where=str(path))
     return [_object(path, image, rows) for image, rows in by_image.items()]

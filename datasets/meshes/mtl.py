@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,15 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from trimesh.exchange.obj import parse_mtl
 
+from cadalign.errors import brief, quote
 from cadalign.geometry.mesh import GREY, Material
+from cadalign.io.images import check_pixels
 
 logger = logging.getLogger("cadalign")
 
 Texture = npt.NDArray[np.uint8]
 
-# Deflate compresses bytes to 1/1032 at most; images of one bit per pixel grow further when decoded.
-_COMPRESSION = 1032
-_FREE_BYTES = 2**26
 WHITE = (1.0, 1.0, 1.0, 1.0)
 # How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
 _MAP_OPTIONS = {
@@ -50,16 +50,14 @@ def load_materials(
         if key in entries:
             found[name] = _material(name, *entries[key], load_texture)
         else:
-            logger.warning("%s: material %r is not defined; it becomes grey", obj_path, name)
+            logger.warning("%s: material %s is not defined; it becomes grey", obj_path, quote(name))
             found[name] = Material(name=name)
     return found
 
 
 def texture_array(image: Any, file_size: int) -> Texture:
     """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
-    width, height = image.size
-    if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:
-        raise ValueError(f"{width} x {height} pixels in {file_size} bytes")
+    check_pixels(image, file_size)
     transparent = "A" in image.getbands() or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if transparent else "RGB"))
 
@@ -73,7 +71,7 @@ def _library_paths(obj_path: Path, library: str) -> list[Path]:
     for word in library.split():
         path = _find(obj_path.parent, word)
         if path is None:
-            logger.warning("%s: no material library %s beside it", obj_path, word)
+            logger.warning("%s: no material library %s beside it", obj_path, brief(word))
         else:
             paths.append(path)
     return paths
@@ -104,7 +102,7 @@ def _parse_library(path: Path) -> dict[str, dict[str, Any]]:
         lines = (_rename_map(line) for line in text.splitlines())
         return dict(parse_mtl("\n".join(lines), resolver=_DeferredTextures()))  # type: ignore[no-untyped-call]
     except Exception as error:  # the parser promises nothing about damaged files
-        logger.warning("%s: the material library cannot be read (%s)", path, error)
+        logger.warning("%s: the material library cannot be read (%s)", path, brief(error))
         return {}
 
 
@@ -159,13 +157,14 @@ def _load_texture(path: Path, words: tuple[str, ...]) -> Texture | None:
     name = " ".join(_without_options(words))
     found = _find(path.parent, name) or _find(path.parent, PurePosixPath(name).name)
     if found is None:
-        logger.warning("%s: the texture %s is missing; drawn grey", path, name)
+        logger.warning("%s: the texture %s is missing; drawn grey", path, brief(name))
         return None
     try:
-        with PIL.Image.open(found) as image:
+        with warnings.catch_warnings(action="ignore"), PIL.Image.open(found) as image:
             return texture_array(image, found.stat().st_size)
     except Exception as error:  # PIL's plugins raise what they like on damaged files
-        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", path, name, error)
+        given = path, brief(name), brief(error)
+        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
         return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -71,7 +72,8 @@ def read_scene(path: Path) -> Mesh:
 def _parsing(path: Path) -> Iterator[None]:
     """Convert all errors on damaged content to `DataError`: trimesh's readers raise any kind."""
     try:
-        with np.errstate(all="ignore"):  # coordinates that are not finite are refused by Mesh
+        # Coordinates that are not finite are refused by Mesh; other warnings are about textures.
+        with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):
             yield
     except (OSError, CadalignError):
         raise

@@ -211,7 +211,9 @@ def _read_bundler(path: Path) -> _Model:
     view_points = np.repeat(np.arange(point_count), [len(each) for each in views])
     table = np.concatenate([np.empty((0, _VIEW_VALUES)), *views])
     cameras = table[:, 0]
-    bad = np.flatnonzero(~((cameras >= 0) & (cameras < camera_count) & (cameras % 1 == 0)))
+    bad = np.flatnonzero(
+        ~((cameras >= 0) & (cameras < camera_count) & (cameras == np.floor(cameras)))
+    )
     if len(bad):
         raise damaged(
             f"point {view_points[bad[0]]} is observed in camera {cameras[bad[0]]:g}, which doesn't "

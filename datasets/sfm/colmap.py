@@ -14,7 +14,7 @@ import numpy as np
 from cadalign.arrays import IntArray
 from cadalign.datasets.sfm import colmap_files
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
@@ -92,7 +92,7 @@ class Colmap(CorrespondenceSet):
             raise DataError(
                 f"{len(missing)} of the points that it observes do not exist, the first is point "
                 f"{missing[0]}",
-                where=f"{self.source}, image {name}",
+                where=f"{self.source}, image {brief(name)}",
                 fix=f"does {self._point_file.name} belong to the same model?",
             )
         return rows
@@ -101,7 +101,7 @@ class Colmap(CorrespondenceSet):
         if camera_id not in self._cameras:
             raise DataError(
                 f"there is no camera {camera_id}",
-                where=f"{self.source}, image {name}",
+                where=f"{self.source}, image {brief(name)}",
                 fix=f"does {self._camera_file.name} belong to the same model?",
             )
         try:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import DataError, quote
+from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.camera import COLMAP_PARAMS
 from cadalign.io.files import damaged, reading
 
@@ -243,7 +243,7 @@ def read_images_text(path: Path) -> list[ColmapImage]:
         # The observations' line follows in any case; it is empty where there are none.
         _, observations = next(lines, (0, None))
         name = words[-1].strip()
-        where = f"{path}, image {name}"
+        where = f"{path}, image {brief(name)}"
         images.append((name, partial(_text_view, words[1:-1], observations, where)))
     return images
 
@@ -253,7 +253,7 @@ def _text_view(pose: list[str], observations: str | None, where: str) -> ColmapV
         values = np.array([float(word) for word in pose[:-1]])
         camera_id = int(pose[-1])
     except ValueError as error:
-        raise DataError(f"the pose is malformed ({error})", where=where) from None
+        raise DataError(f"the pose is malformed ({brief(error)})", where=where) from None
     if observations is None:
         what = "the file ends before its observations"
         raise DataError(what, where=where, fix="get the whole file")
@@ -264,7 +264,7 @@ def _text_view(pose: list[str], observations: str | None, where: str) -> ColmapV
         x, y = (np.array([float(word) for word in words[k::3]], dtype=float) for k in (0, 1))
         point_ids = np.array([int(word) for word in words[2::3]], dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise DataError(f"an observation is malformed ({error})", where=where) from None
+        raise DataError(f"an observation is malformed ({brief(error)})", where=where) from None
     return ColmapView(values[:4], values[4:], camera_id, np.stack([x, y], axis=1), point_ids)
 
 

@@ -200,7 +200,8 @@ def test_nan_observations_concern_their_image_only(tmp_path, sizes):
         images["1"]
 
 
-@pytest.mark.parametrize("camera", [3, -1, 0.5, np.nan])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("camera", [3, -1, 0.5, np.nan, np.inf])
 def test_observations_in_cameras_that_do_not_exist_are_refused(tmp_path, camera):
     model = Model()
     model.views[7][1] = (camera, 0, 1.0, 3.0)

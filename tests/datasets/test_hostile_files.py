@@ -18,10 +18,19 @@ import pytest
 from PIL import Image
 
 from cadalign import Camera
-from cadalign.datasets import BlindPnP, Colmap, KeypointNet, load_mesh, read_image_keypoints
+from cadalign.datasets import (
+    BlindPnP,
+    Colmap,
+    KeypointNet,
+    ModelKeypoints,
+    load_mesh,
+    read_image_keypoints,
+)
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError
+from cadalign.io.documents import read_json
 from cadalign.io.images import read_photo
+from cadalign.io.observation import Observation
 from cadalign.render.views.camera_files import read_camera_views
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -259,6 +268,30 @@ def test_ragged_coco_keypoints_are_refused(tmp_path: Path, keypoints: str) -> No
     path.write_text(f'[{{"keypoints": {keypoints}}}]')
     with pytest.raises(DataError, match=r"\[0\]\.keypoints"):
         read_image_keypoints(path)
+
+
+@pytest.mark.parametrize("name", [r"\ud800", r"x\udfff", r"\udc00\ud800"])
+def test_half_characters_are_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'{{"keypoints": [], "image": "{name}"}}')
+    for read in (Observation.load, ModelKeypoints.load, read_image_keypoints, read_json):
+        with pytest.raises(DataError, match="half of a character"):
+            read(path)
+    path.write_text(r'{"image": "\ud83e\ude91"}')
+    assert read_json(path) == {"image": "\N{CHAIR}"}
+
+
+@pytest.mark.parametrize("library", ["newmtl a\nmap_Kd {}", "newmtl {}\nmap_Kd a.png"])
+def test_long_names_of_textures_and_materials_are_cut(
+    tmp_path: Path, library: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{TRIANGLE}usemtl {'y' * 999}\x1b[2J\nf 1 2 3\n")
+    (tmp_path / "a.mtl").write_text(library.format("x" * 5000 + "\x1b[2J"))
+    load_mesh(tmp_path / "a.obj")
+    assert caplog.records
+    for record in caplog.records:
+        assert record.getMessage().isprintable()
+        assert len(record.getMessage()) < 600
 
 
 def test_digits_without_end_in_annotations_are_refused(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzz.fits import draw_case
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
@@ -205,9 +204,31 @@ def test_robust_fit_of_a_chair_is_not_certain() -> None:
 
 
 def test_covariance_that_overflows_is_refused() -> None:
-    case = draw_case(3176)
+    points_3d = 1e143 * np.array(
+        [
+            [-3.01921926, -1.40069160, -0.323787504],
+            [1.58918449, 3.68002198, 0.902957127],
+            [1.69184056, 2.79916949, 2.08083567],
+            [-1.34626278, 0.547198609, 0.955675583],
+            [-1.47428239, -0.348814863, -2.27185582],
+            [0.442739103, -3.00925987, 3.05553329],
+            [-2.62555778, -3.21181564, -2.75531399],
+        ]
+    )
+    points_2d = 1e59 * np.array(
+        [
+            [4.40611523, 1.85512196],
+            [0.987048282, 2.31473839],
+            [3.12152510, 1.74570863],
+            [3.44817634, 1.86680212],
+            [3.90888677, 0.418181099],
+            [0.522368448, 3.15601929],
+            [2.26568202, 0.575478618],
+        ]
+    )
+    camera = Camera(640, 480, 1048204.971549734, 245403.3967991035, 319.5, 239.5)
     with pytest.raises(DegenerateError, match="beyond the range"):
-        fit(case.points_3d, case.points_2d, case.camera, **case.options)
+        fit(points_3d, points_2d, camera, stretch="none", scale_prior_sigma=0.001, sigma=None)
 
 
 def test_batches_estimate_the_same_noise() -> None:

@@ -249,6 +249,11 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
             "sigma: the covariance of keypoint 6 is not symmetric and positive definite; "
             + SIGMA_FIX,
         ),
+        ({"method": "aepnp", "sigma": np.ones(5)}, "sigma: shape (5,), expected (8)"),
+        (
+            {"method": "epnp", "sigma": np.zeros(8)},
+            f"sigma: has values that are not positive; {SIGMA_FIX}",
+        ),
         ({"loss": "l1"}, "loss: unknown loss 'l1'; known are linear, huber, cauchy"),
         ({"loss_scale": 0}, "loss_scale: 0 is not positive"),
         ({"loss_scale": np.nan}, "loss_scale: nan is not positive"),
@@ -279,6 +284,20 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
             {"stretch": "yz", "known_axis": "z"},
             "stretch: 'yz' are not axes that can stretch where z is known; "
             "give one of xy, x, y, none",
+        ),
+        (
+            {"stretch": np.array(["y", "z"])},
+            "stretch: array(['y', 'z'], dtype='<U1') are not axes that can stretch where x is "
+            "known; give one of yz, y, z, none",
+        ),
+        (
+            {"stretch": "a" * 300},
+            f"stretch: {quote('a' * 300)} are not axes that can stretch where x is known; "
+            "give one of yz, y, z, none",
+        ),
+        (
+            {"scale_prior_sigma": np.timedelta64(2, "s")},
+            "scale_prior_sigma: np.timedelta64(2,'s') is not positive",
         ),
         ({"known_axis": "w"}, "known_axis: unknown known_axis 'w'; known are x, y, z"),
         (
@@ -318,6 +337,18 @@ def test_matrices_and_numbers_of_any_width_are_taken() -> None:
     result = fit(np.asmatrix(GOOD.points_3d), *given, loss="huber", loss_scale=np.float32(2.0))
     assert type(result.points_3d) is np.ndarray
     assert result.alignment == expected.alignment
+    wide = fit(GOOD.points_3d, *given, loss="huber", loss_scale=np.longdouble(2.0))
+    assert wide.alignment == expected.alignment
+    sigma = memoryview(np.ones(len(GOOD.points_2d)))
+    assert fit(GOOD.points_3d, *given, loss="huber", sigma=sigma).alignment == expected.alignment
+
+
+def test_noise_beyond_all_numbers_is_refused() -> None:
+    size = 1e200
+    error = fit_refusal(
+        GOOD.points_3d, size * GOOD.points_2d, GOOD.camera, sigma=None, scale_prior_sigma=0.1
+    )
+    assert isinstance(error, InputError | DegenerateError)
 
 
 @pytest.mark.filterwarnings("error")

@@ -195,6 +195,9 @@ def test_confidences_without_ransac_are_refused() -> None:
         ({"seed": 1.5}, "seed: 1.5 is not a number of at least 0"),
         ({"success_prob": 1.0}, "success_prob: 1.0 is not between 0 and 1"),
         ({"minimal": "p3p"}, "minimal: unknown minimal 'p3p'; known are ap4p, aepnp"),
+        ({"max_iterations": True}, "max_iterations: True is not a number of at least 1"),
+        ({"refine": [1.0]}, "refine: [1.0] is neither True nor False"),
+        ({"refine": np.array([])}, "refine: array([], dtype=float64) is neither True nor False"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:

@@ -1,7 +1,8 @@
 """Fuzz for as long as you like: ``python -m fuzz fits 1000000``, ``python -m fuzz readers 20000``.
 
-Every case follows from its seed, which a failure names. Cases run in worker processes, since what a
-reader reads may kill it.
+Every case follows from its seed, which a failure names: ``--first-seed`` goes on where an earlier
+run ended, or repeats one case. Cases run in worker processes, since what a reader reads may kill
+it.
 """
 
 from __future__ import annotations
@@ -9,65 +10,71 @@ from __future__ import annotations
 import argparse
 import collections
 import multiprocessing
-import resource
+import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from collections.abc import Iterator
 
 from fuzz import readers
-from fuzz.failures import Failure, command_failures, fit_failures, reader_failures
+from fuzz.failures import command_outcome, fit_outcome, reader_outcome
+from fuzz.pool import Job, run_jobs
 
-CHUNK = 200
+CHUNK = 500
+MEMORY = 500.0  # MB of a worker process, libraries and compiled kernels included
+_NAMED = 5
+_EVERY = 60.0  # seconds from one line of progress to the next
+_RUNS = {"fits": fit_outcome, "batches": fit_outcome, "commands": command_outcome}
 
-Job = tuple[Callable[..., list[Failure]], tuple[Any, ...]]
 
-
-def _jobs(
-    what: str, first: int, count: int
-) -> Iterator[tuple[Callable[..., list[Failure]], tuple]]:  # type: ignore[type-arg]
+def _jobs(what: str, only: str | None, first: int, count: int) -> Iterator[Job]:
     for start in range(first, first + count, CHUNK):
-        seeds = (start, min(start + CHUNK, first + count))
-        if what == "fits":
-            yield fit_failures, seeds
-        elif what == "commands":
-            yield command_failures, seeds
+        stop = min(start + CHUNK, first + count)
+        if what == "readers":
+            kinds = readers.FORMATS if only is None else [only]
+            yield from (Job(reader_outcome, kind, start, stop) for kind in kinds)
         else:
-            yield from ((reader_failures, (name, *seeds)) for name in readers.FORMATS)
+            yield Job(_RUNS[what], what, start, stop)
 
 
 def main() -> int:
     """Run the cases of a range of seeds; returns 1 where one of them failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("fits", "readers", "commands"))
+    parser = argparse.ArgumentParser(prog="fuzz", description=__doc__)
+    parser.add_argument("what", choices=(*_RUNS, "readers"))
     parser.add_argument("count", type=int, help="cases; for readers, mutations of each format")
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--format", choices=readers.FORMATS, help="only this reader")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     chosen = parser.parse_args()
     found: dict[str, list[int]] = collections.defaultdict(list)
-    context = multiprocessing.get_context("spawn")
-    begin = time.monotonic()
-    with ProcessPoolExecutor(chosen.workers, mp_context=context) as pool:
-        jobs = list(_jobs(chosen.what, chosen.first_seed, chosen.count))
-        running = [pool.submit(job, *arguments) for job, arguments in jobs]
-        for future, (_, arguments) in zip(running, jobs, strict=True):
-            try:
-                for text, seed in future.result():
-                    found[text].append(seed)
-            except BrokenProcessPool:
-                print(f"a worker was killed, at or after the seeds {arguments}", file=sys.stderr)
-                return 1
-    for text, seeds in sorted(found.items(), key=lambda item: -len(item[1])):
-        print(f"{len(seeds):6d} {text}, seeds {seeds[:4]}")
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    slowest: list[tuple[float, str, int]] = []
+    cases, memory, begin, told = 0, 0.0, time.monotonic(), time.monotonic()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a killed run says what it found
+    jobs = _jobs(chosen.what, chosen.format, chosen.first_seed, chosen.count)
+    try:
+        for job, outcome in run_jobs(jobs, chosen.workers):
+            cases += job.stop - job.start
+            memory = max(memory, outcome.memory)
+            slowest = sorted(slowest + outcome.slowest)[-_NAMED:]
+            for what, seed in outcome.failures:
+                if what not in found:
+                    print(f"{what}, seed {seed}", flush=True)
+                found[what].append(seed)
+            if time.monotonic() > told + _EVERY:
+                told = time.monotonic()
+                failed = sum(map(len, found.values()))
+                print(f"{cases} cases, to seed {job.stop}, {failed} failed", flush=True)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+    for what, seeds in sorted(found.items(), key=lambda item: -len(item[1])):
+        print(f"{len(seeds):6d} {what}, seeds {sorted(seeds)[:_NAMED]}")
+    print("slowest: " + ", ".join(f"{s:.2f} s {kind} {seed}" for s, kind, seed in slowest[::-1]))
     failed = sum(map(len, found.values()))
+    seconds = time.monotonic() - begin
     print(
-        f"{chosen.what}: {len(jobs)} x {CHUNK} cases at most, {failed} failed, "
-        f"{time.monotonic() - begin:.0f} s, at most {peak:.0f} MB in a worker"
+        f"{chosen.what}: {cases} cases, {failed} failed, {seconds:.0f} s, "
+        f"at most {memory:.0f} MB in a worker"
     )
-    return 1 if failed else 0
+    return 1 if failed or memory > MEMORY else 0
 
 
 if __name__ == "__main__":

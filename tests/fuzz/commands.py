@@ -7,11 +7,10 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from fuzz import readers
+from fuzz import mutations, readers
 
 from cadalign.cli import main
 
@@ -49,14 +48,6 @@ def draw_command(seed: int, folder: Path) -> list[str]:
     return words
 
 
-@contextlib.contextmanager
-def silenced() -> Iterator[None]:
-    """Swallow what is printed."""
-    nowhere = io.StringIO()
-    with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
-        yield
-
-
 def run_command(seed: int, folder: Path) -> int:
     """Run the command of a seed; anything but one of the exit codes passes through."""
     shutil.rmtree(folder, ignore_errors=True)
@@ -73,7 +64,7 @@ def run_command(seed: int, folder: Path) -> int:
         with (
             contextlib.redirect_stdout(silent),
             contextlib.redirect_stderr(silent),
-            readers.bounded(),
+            mutations.bounded(),
         ):
             code = main(draw_command(seed, folder))
     except SystemExit as error:

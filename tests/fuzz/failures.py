@@ -1,73 +1,104 @@
-"""Failures of ranges of seeds: what worker processes do."""
+"""Run ranges of seeds and collect what fails: what worker processes do."""
 
 from __future__ import annotations
 
+import faulthandler
 import logging
+import resource
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from fuzz import commands, fits, readers
+from fuzz import commands, fit_cases, fits, mutations, readers
+from fuzz.outcome import Failure, Outcome
 
-SLOW = 1.0  # seconds of processor time that one fit may take
-
-Failure = tuple[str, int]
-"""A description of what went wrong, and the seed."""
-
-
-def fit_failures(start: int, stop: int) -> list[Failure]:
-    """The failures of the fits of some seeds."""
-
-    def one(seed: int) -> str:
-        case = fits.draw_case(seed)
-        begin = time.process_time()
-        try:
-            fits.run_case(case)
-        except Exception as error:
-            return f"{case.kind}: {_describe(error)}"
-        is_slow = time.process_time() - begin > SLOW and seed > start  # the first one compiles
-        return f"{case.kind}: slow" if is_slow else ""
-
-    return _failures(one, start, stop)
+LONGEST_FIT = 1.0  # seconds of processor time that one call of fit may take
+BATCH = 4
+LONGEST_SEARCH = 10.0  # the same, for a focal length to be estimated too
+_STUCK = 120  # seconds after which a process that hangs in compiled code ends itself
+_SLOWEST = 3
 
 
-def reader_failures(name: str, start: int, stop: int) -> list[Failure]:
-    """The failures of one format's reader on the mutations of some seeds."""
+def fit_outcome(kind: str, start: int, stop: int) -> Outcome:
+    """Fit the cases of some seeds, ``"fits"``, or a batch of cases for each, ``"batches"``."""
+
+    def one(seed: int) -> tuple[str, float]:
+        if kind == "batches":
+            begin = time.process_time()
+            fits.run_batch(fit_cases.draw_cases(seed, BATCH))
+            return kind, (time.process_time() - begin) / (2 * BATCH)
+        case = fit_cases.draw_case(seed)
+        seconds = fits.run_case(case)
+        if seconds > LONGEST_FIT:  # the first call with arguments of some type compiles
+            seconds = fits.run_case(fit_cases.draw_case(seed))
+        focal = case.options.get("focal")
+        searches = isinstance(focal, str) and focal == "estimate"
+        longest = LONGEST_SEARCH if searches else LONGEST_FIT
+        assert seconds < longest, f"took more than {longest} s"
+        return case.kind, seconds
+
+    return _outcome(one, kind, start, stop)
+
+
+def reader_outcome(kind: str, start: int, stop: int) -> Outcome:
+    """Read the mutations of some seeds of one format."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = mutations.MutatedFiles(readers.FORMATS[kind], Path(folder))
+
+        def one(seed: int) -> tuple[str, float]:
+            begin = time.process_time()
+            files.run(seed)
+            return kind, time.process_time() - begin
+
+        return _outcome(one, kind, start, stop)
+
+
+def command_outcome(kind: str, start: int, stop: int) -> Outcome:
+    """Run the commands of some seeds."""
     with tempfile.TemporaryDirectory() as folder:
 
-        def one(seed: int) -> str:
+        def one(seed: int) -> tuple[str, float]:
+            begin = time.process_time()
+            commands.run_command(seed, Path(folder) / "data")
+            words = commands.draw_command(seed, Path("data"))
+            return " ".join(word[:30] for word in words[:1]), time.process_time() - begin
+
+        return _outcome(one, kind, start, stop)
+
+
+def _outcome(one: Callable[[int], tuple[str, float]], kind: str, start: int, stop: int) -> Outcome:
+    failures, times = [], []
+    with _unlogged():
+        for seed in range(start, stop):
+            faulthandler.dump_traceback_later(_STUCK, exit=True)
             try:
-                readers.run_mutation(readers.FORMATS[name], seed, Path(folder) / "data")
+                what, seconds = one(seed)
+                times.append((seconds, what, seed))
             except Exception as error:
-                return f"{name}: {_describe(error)}"
-            return ""
-
-        return _failures(one, start, stop)
-
-
-def command_failures(start: int, stop: int) -> list[Failure]:
-    """The failures of the command line on the arguments of some seeds."""
-    with tempfile.TemporaryDirectory() as folder:
-
-        def one(seed: int) -> str:
-            try:
-                commands.run_command(seed, Path(folder) / "data")
-            except Exception as error:
-                return f"{' '.join(commands.draw_command(seed, Path('data')))}: {_describe(error)}"
-            return ""
-
-        return _failures(one, start, stop)
+                failures.append(Failure(f"{kind}: {describe(error)}", seed))
+        faulthandler.cancel_dump_traceback_later()
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return Outcome(failures, sorted(times)[-_SLOWEST:], memory)
 
 
-def _failures(one: Callable[[int], str], start: int, stop: int) -> list[Failure]:
-    logging.disable(logging.WARNING)
-    return [(text, seed) for seed in range(start, stop) if (text := one(seed))]
+@contextmanager
+def _unlogged() -> Iterator[None]:
+    """Keep the warnings that are logged of damaged files from the terminal."""
+    logger, nowhere = logging.getLogger("cadalign"), logging.NullHandler()
+    logger.addHandler(nowhere)
+    propagated, logger.propagate = logger.propagate, False
+    try:
+        yield
+    finally:
+        logger.removeHandler(nowhere)
+        logger.propagate = propagated
 
 
-def _describe(error: Exception) -> str:
+def describe(error: Exception) -> str:
+    """The error's type, its message's beginning, and where it was raised."""
     place = traceback.extract_tb(error.__traceback__)[-1]
-    return (
-        f"{type(error).__name__}: {str(error)[:100]} ({Path(place.filename).name}:{place.lineno})"
-    )
+    name = "/".join(Path(place.filename).parts[-2:])
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:100]} ({name}:{place.lineno})"

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import pickle
-import re
-import resource
-import shutil
-import signal
 import struct
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +17,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from cadalign import Alignment, CadalignError, Camera, FitResult, Library, fit
+import cadalign
+from cadalign import Alignment, Camera, FitResult, FocalPrior, Library, fit
 from cadalign.datasets import (
     BlindPnP,
     Bundler,
@@ -31,7 +28,7 @@ from cadalign.datasets import (
     load_mesh,
     read_image_keypoints,
 )
-from cadalign.io.images import read_photo
+from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
 from cadalign.render.views.camera_files import (
     CameraView,
@@ -39,14 +36,8 @@ from cadalign.render.views.camera_files import (
     write_nerf,
     write_open3d,
 )
+from cadalign.report import headline_text
 from cadalign.retrieval import LibraryModel
-
-MEMORY = 500 << 20
-SECONDS = 10
-_EXTREMES = [
-    b"0", b"-1", b"1e999", b"nan", b"1e308", b"2147483648", b"9223372036854775808", b"99999999",
-    b"0.1.2", b"", b"null", b"\xff\xfe", b"[" * 2000, b"9" * 5000, b"-0", b"true", b'"', b"{",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,83 +59,6 @@ class Format:
     write: Callable[[Path], Path]
     read: Callable[[Path], object]
     seal: Callable[[bytes], bytes] = bytes
-
-
-def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """Change a file's bytes in one to four places."""
-    for _ in range(int(rng.integers(1, 5))):
-        start = int(rng.integers(len(data) + 1))
-        size = int(min(rng.geometric(0.05), len(data)))
-        match rng.integers(7):
-            case 0:
-                data = data[:start]
-            case 1:
-                data = data[:start] + rng.bytes(size) + data[start + size :]
-            case 2:
-                data = data[:start] + data[start + size :]
-            case 3:
-                data = (
-                    data[:start]
-                    + data[start : start + size] * int(rng.integers(2, 40))
-                    + data[start:]
-                )
-            case 4:
-                other = int(rng.integers(len(data) + 1))
-                data = data[:start] + data[other : other + size] + data[start:]
-            case 5 if data:
-                place = start % len(data)
-                data = (
-                    data[:place]
-                    + bytes([data[place] ^ (1 << int(rng.integers(8)))])
-                    + data[place + 1 :]
-                )
-            case _:
-                numbers = list(re.finditer(rb"-?\d+(\.\d+)?([eE]-?\d+)?", data))
-                if numbers:
-                    chosen = numbers[rng.integers(len(numbers))]
-                    extreme = _EXTREMES[rng.integers(len(_EXTREMES))]
-                    data = data[: chosen.start()] + extreme + data[chosen.end() :]
-    return data
-
-
-def run_mutation(kind: Format, seed: int, folder: Path) -> str:
-    """Read one mutation of a format's file; returns ``"read"`` or ``"refused"``.
-
-    Anything but a `CadalignError`, a warning too, passes through.
-    """
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    path = kind.write(folder)
-    data = mutate(path.read_bytes(), np.random.default_rng([seed, len(kind.name)]))
-    path.write_bytes(kind.seal(data))
-    with bounded(), warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            kind.read(path)
-        except CadalignError as error:
-            assert len(str(error)) < 2000, "the message quotes its input at length"
-            return "refused"
-    return "read"
-
-
-@contextmanager
-def bounded() -> Iterator[None]:
-    """Raise MemoryError and TimeoutError where a reader takes more than it should."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    previous = signal.signal(signal.SIGALRM, _too_long)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, before[1]))
-    signal.alarm(SECONDS)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
-        resource.setrlimit(resource.RLIMIT_AS, before)
-
-
-def _too_long(number: int, frame: object) -> None:
-    raise TimeoutError(f"takes more than {SECONDS} s")
 
 
 # --- formats ------------------------------------------------------------------------------------
@@ -192,6 +106,76 @@ def _export(name: str) -> Callable[[Path], Path]:
         box.visual.vertex_colors = np.full((8, 4), 200, np.uint8)
         box.export(folder / name)
         return folder / name
+
+    return write
+
+
+def _write_gltf(folder: Path) -> Path:
+    """A triangle whose data stand in the document itself."""
+    data = np.array([0, 1, 2, 0], "<u2").tobytes() + np.eye(3, dtype="<f4").tobytes()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": size} for start, size in ((0, 6), (8, 36))
+    ]
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "scale": [1, 2, 1], "children": [1]}, {"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 1}, "indices": 0, "material": 0, "mode": 4}
+                ]
+            }
+        ],
+        "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0, 1]}}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5123, "count": 3, "type": "SCALAR"},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC3"},
+        ],
+        "bufferViews": views,
+        "buffers": [
+            {
+                "byteLength": len(data),
+                "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode(),
+            }
+        ],
+    }
+    return _json("box.gltf", document)(folder)
+
+
+def _seal_png(data: bytes) -> bytes:
+    """A PNG file whose chunks have right checksums."""
+    sealed, place = data[:8], 8
+    while place + 12 <= len(data):
+        length = min(int.from_bytes(data[place : place + 4], "big"), len(data) - place - 12)
+        body = data[place + 4 : place + 8 + length]
+        sealed += length.to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+        place += 12 + length
+    return sealed
+
+
+def _write_photo(folder: Path) -> Path:
+    """A JPEG with EXIF data."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif[0x8769] = {0x920A: 35.0, 0xA405: 50, 0xA20E: 4000.0, 0xA210: 3, 0xA002: 40, 0xA003: 30}
+    path = folder / "photo.jpg"
+    Image.new("RGB", (40, 30), "red").save(path, exif=exif)
+    return path
+
+
+def _read_photo(path: Path) -> object:
+    return FocalPrior.from_exif(path), photo_size(path), read_photo(path)
+
+
+def _write_run(changed: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        methods = ("optimal", "limit")
+        cadalign.simulate(
+            "noise", out=folder / "run", values=(1,), runs=2, points=8, methods=methods, workers=0
+        )
+        return folder / "run" / changed
 
     return write
 
@@ -367,6 +351,10 @@ def _read_fit(path: Path) -> object:
     return FitResult.from_json(path.read_text("utf-8", "replace"))
 
 
+def _read_run(path: Path) -> object:
+    return headline_text([path], format="csv")
+
+
 FORMATS = {
     kind.name: kind
     for kind in (
@@ -375,7 +363,11 @@ FORMATS = {
         Format("ply", _export("box.ply"), load_mesh),
         Format("stl", _export("box.stl"), load_mesh),
         Format("glb", _export("box.glb"), load_mesh),
+        Format("gltf", _write_gltf, load_mesh),
+        Format("off", _export("box.off"), load_mesh),
         Format("image", _write_image, read_photo),
+        Format("sealed image", _write_image, read_photo, _seal_png),
+        Format("photo", _write_photo, _read_photo),
         Format("observation", _json("o.json", _OBSERVATION), Observation.load),
         Format("coco", _json("c.json", _COCO), read_image_keypoints),
         Format("csv", _text("k.csv", "name,u,v,score\na,1,2,.5\nb,3,4,.1\n"), read_image_keypoints),
@@ -404,6 +396,10 @@ FORMATS = {
         Format("fit", _write_fit, _read_fit),
         Format("library", _write_library, _read_library),
         Format("forged library", _write_library, _read_library, _seal_library),
+        *(
+            Format(f"run {name}", _write_run(f"{name}"), lambda path: _read_run(path.parent))
+            for name in ("run.json", "results.parquet", "timings.parquet")
+        ),
         Format("open3d", _write_views(write_open3d, "v.json"), read_camera_views),
         Format("nerf", _write_views(write_nerf, "transforms.json"), read_camera_views),
     )

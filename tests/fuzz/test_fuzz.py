@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fuzz import fits, readers
+from fuzz import fits, mutations, readers
+from fuzz.failures import LONGEST_FIT, fit_outcome
+from fuzz.fit_cases import draw_case, draw_cases
 
 
-@pytest.mark.parametrize("start", range(0, 600, 100))
+def over_seeds(run: Callable[[int], object], seeds: range) -> None:
+    for seed in seeds:
+        try:
+            run(seed)
+        except Exception as error:
+            error.add_note(f"seed {seed}")
+            raise
+
+
+@pytest.mark.parametrize("start", range(0, 400, 100))
 def test_fits_are_rotations_or_refused(start: int) -> None:
-    for seed in range(start, start + 100):
-        try:
-            fits.run_case(fits.draw_case(seed))
-        except Exception as error:
-            error.add_note(f"seed {seed}")
-            raise
+    over_seeds(lambda seed: fits.run_case(draw_case(seed)), range(start, start + 100))
+
+
+def test_batches_are_as_single_fits() -> None:
+    over_seeds(lambda seed: fits.run_batch(draw_cases(seed, 3)), range(40))
 
 
 @pytest.mark.parametrize("name", readers.FORMATS)
-def test_valid_files_are_read(name: str, tmp_path: Path) -> None:
-    kind = readers.FORMATS[name]
-    kind.read(kind.write(tmp_path))
+def test_files_are_read_and_mutated_ones_read_or_refused(name: str, tmp_path: Path) -> None:
+    files = mutations.MutatedFiles(readers.FORMATS[name], tmp_path)
+    readers.FORMATS[name].read(files.path)
+    over_seeds(files.run, range(40))
 
 
-@pytest.mark.parametrize("name", readers.FORMATS)
-def test_mutated_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    for seed in range(40):
-        try:
-            readers.run_mutation(readers.FORMATS[name], seed, tmp_path / "data")
-        except Exception as error:
-            error.add_note(f"seed {seed}")
-            raise
+def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(case: fits.Case) -> float:
+        if case.kind == "exact":
+            raise ArithmeticError("broken on purpose")
+        return 2 * LONGEST_FIT
+
+    monkeypatch.setattr(fits, "run_case", wrong)
+    outcome = fit_outcome("fits", 0, 20)
+    kinds = {seed: draw_case(seed).kind for seed in range(20)}
+    assert [seed for _, seed in outcome.failures] == list(range(20))
+    for what, seed in outcome.failures:
+        assert ("broken on purpose" if kinds[seed] == "exact" else "took more than") in what

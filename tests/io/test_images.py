@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import pytest
 from PIL import Image
 
 from cadalign import FocalPrior
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.io.images import open_photo, photo_size, read_photo
 
 TAGS = {
@@ -107,6 +108,30 @@ def test_missing_photo_and_folder_are_refused(
         read(tmp_path)
 
 
+@pytest.mark.filterwarnings("error")
+def test_damaged_exif_data_are_passed_over(tmp_path: Path) -> None:
+    path = write_photo(tmp_path / "photo.jpg", equivalent=26, focal=4.0, density=3000.0)
+    data = path.read_bytes()
+    start = data.index(b"Exif")
+    for place in range(start + 6, start + 120):
+        path.write_bytes(data[:place] + b"\xff" + data[place + 1 :])
+        for read in (read_photo, photo_size, FocalPrior.from_exif):
+            with contextlib.suppress(DataError):
+                read(path)
+
+
+@pytest.mark.parametrize("read", [read_photo, photo_size, FocalPrior.from_exif])
+def test_pixels_that_the_file_cannot_hold_are_refused(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "photo.png"
+    Image.new("1", (12_000, 12_000)).save(path)
+    with pytest.raises(DataError, match="12000 x 12000 pixels in"):
+        read(path)
+    Image.new("1", (4000, 3000)).save(path)
+    assert read(path) is None or read is not FocalPrior.from_exif
+
+
 def test_errors_of_the_reader_are_not_taken_for_the_photos(tmp_path: Path) -> None:
     path = write_photo(tmp_path / "photo.jpg")
     with pytest.raises(ZeroDivisionError), open_photo(path):
@@ -182,10 +207,12 @@ def test_focal_length_that_cannot_be_right_is_ignored_with_a_warning(
     assert [record.getMessage() for record in caplog.records] == [f"{path}: {text}"]
 
 
-@pytest.mark.parametrize("value", [0, -3.0, math.nan, math.inf, "900", None])
+@pytest.mark.parametrize(
+    "value", [0, -3.0, math.nan, math.inf, "900", None, True, 10**400, np.complex128(1 + 2j)]
+)
 def test_priors_that_are_none_are_refused(value: Any) -> None:
     with pytest.raises(InputError) as caught:
         FocalPrior(value)
-    assert str(caught.value) == f"focal_prior.focal: {value!r} is not positive"
+    assert str(caught.value) == f"focal_prior.focal: {quote(value)} is not positive"
     with pytest.raises(InputError, match=r"focal_prior\.relative_sigma: .* is not positive"):
         FocalPrior(900.0, value)

@@ -152,7 +152,7 @@ class RunFolder:
 
 
 class _Config(ForeignDocument):
-    """What all runs have in ``run.json``, besides the experiment's own."""
+    """Fields of ``run.json`` that all runs have, besides the experiment's own."""
 
     experiment: str | None = None
     tasks: Count = 0

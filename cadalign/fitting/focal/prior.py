@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, as_positive
+from cadalign.errors import brief
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import open_photo
 
@@ -65,9 +65,7 @@ class FocalPrior:
     def __post_init__(self) -> None:
         for name in ("focal", "relative_sigma"):
             value = getattr(self, name)
-            if not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
-                raise InputError(f"{value!r} is not positive", where=f"focal_prior.{name}")
-            object.__setattr__(self, name, float(value))
+            object.__setattr__(self, name, as_positive(value, name=f"focal_prior.{name}"))
 
     @classmethod
     def from_exif(
@@ -180,7 +178,7 @@ def _positive(tags: Mapping[int, Any], tag: int, name: str, where: str) -> float
         return value
     if tag == _FOCAL_LENGTH_35MM and value == 0:  # EXIF's way to say that it is not known
         return None
-    logger.warning("%s: the EXIF data state %s %s; ignored", where, name, tags[tag])
+    logger.warning("%s: the EXIF data state %s %s; ignored", where, name, brief(tags[tag]))
     return None
 
 

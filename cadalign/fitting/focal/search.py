@@ -33,6 +33,9 @@ from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
 
 _MOST_STARTS = 8
+_COARSE_POINTS = 256  # that many tell the minima apart; all points then refine them
+_MOST_LIKELY = 3  # coarse minima that all points refine
+_UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
 _SAME_CHORD = 1e-3
 _SAME_FOCAL = 0.01
@@ -59,6 +62,22 @@ class _Task:
             self.options.free,
             Keypoints(self.points, *view, LOSSES[self.options.loss], loss_scale),
             ScalePrior(self.options.prior_weight * self.noise**2),
+        )
+
+    def thinned(self, most: int) -> _Task:
+        """The task of at most ``most`` of its points, evenly spread over their order."""
+        count = len(self.points)
+        if count <= most:
+            return self
+        chosen = np.arange(most) * count // most
+        sigma = self.sigma
+        if sigma is not None and np.ndim(sigma) > 0:
+            sigma = np.asarray(sigma, dtype=np.float64)[chosen]
+        return replace(
+            self,
+            points=np.ascontiguousarray(self.points[chosen]),
+            points_2d=np.ascontiguousarray(self.points_2d[chosen]),
+            sigma=sigma,
         )
 
     @property
@@ -132,17 +151,39 @@ def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
     if not unit > 0:
         return [], 0, 0
     local = replace(task, points=(task.points - center) / unit)
-    starts, iterations, hypotheses = _starts(local)
+    coarse = local.thinned(_COARSE_POINTS)
+    starts, iterations, hypotheses = _starts(coarse)
+    minima, used = _distinct_minima(coarse, starts)
+    iterations += used
+    if len(coarse.points) < len(local.points):
+        minima, used = _distinct_minima(local, _likely(minima, len(coarse.points)))
+        iterations += used
+    minima = [replace(minimum, pose=_uncentered(minimum.pose, center, unit)) for minimum in minima]
+    return minima, iterations, hypotheses
+
+
+def _distinct_minima(task: _Task, starts: Sequence[_Minimum]) -> tuple[list[_Minimum], int]:
+    """The minima below starts, the best first, and the iterations they took."""
     minima: list[_Minimum] = []
+    iterations = 0
     for start in starts:
-        minimum, used = _descend(local, start)
+        minimum, used = _descend(task, start)
         iterations += used
         if not minimum.cost < np.inf or has_collapsed(minimum.pose):
             continue
         if not any(_are_same(minimum, other) for other in minima):
             minima.append(minimum)
-    minima = [replace(minimum, pose=_uncentered(minimum.pose, center, unit)) for minimum in minima]
-    return sorted(minima, key=lambda minimum: minimum.cost), iterations, hypotheses
+    return sorted(minima, key=lambda minimum: minimum.cost), iterations
+
+
+def _likely(minima: Sequence[_Minimum], count: int) -> list[_Minimum]:
+    """The minima for some of the points, ``count``, that all points may still prefer."""
+    if not minima:
+        return []
+    # A wrong sigma should not make every other minimum look unlikely.
+    variance = max(1.0, minima[0].cost / (2.0 * count - UNKNOWNS - 1))
+    least = minima[0].cost
+    return [each for each in minima[:_MOST_LIKELY] if each.cost - least < _UNLIKELY * variance]
 
 
 def _uncentered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:

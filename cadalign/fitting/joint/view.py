@@ -20,7 +20,7 @@ _ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one image tells about an object.
+    """Evidence of one image about an object.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ class Shape(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """What N image measurements tell about points.
+    """Measurements of points in images, N of them.
 
     ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
     ``whitening`` (N, 3) as in `cadalign.solvers.evidence.Keypoints`; ``depths`` (N, 2) holds depths

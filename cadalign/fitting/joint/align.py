@@ -67,6 +67,7 @@ def align(
     --------
     A box of which the model's proportions are known to some 5 % of its size:
 
+    >>> from cadalign import Alignment, Camera
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
     >>> truth = Alignment(np.diag([1.0, -1.0, -1.0]), [0.3, 0.2, 6.0], np.ones(3))

@@ -18,6 +18,7 @@ from cadalign.retrieval.options import RetrievalOptions
 
 if TYPE_CHECKING:
     from cadalign.retrieval import Match
+    from cadalign.shapes.model import ShapeModel
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class Retrieve(ObservationCommand):
     """JSON file with camera and keypoints, optionally image."""
     library: Path
     """File that `cadalign library build` wrote."""
+    shape: tuple[Path, ...] = ()
+    """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
+    shape estimated from the keypoints, for objects that are not in the library."""
     robust: bool = False
     """Not available here: use --loss cauchy against outliers."""
     mask: Path | None = None
@@ -70,6 +74,7 @@ class Retrieve(ObservationCommand):
         query = read_query(self.observation)
         assert query.semantic_ids is not None
         library = Library.open(self.library)
+        shape = _open_shapes(self.shape)
         camera = query.camera
         mask = None if self.mask is None else read_mask(self.mask, camera)
         image = read_opacity(query.image, camera) if self.silhouette else None
@@ -85,6 +90,7 @@ class Retrieve(ObservationCommand):
                 query.semantic_ids,
                 camera,
                 **vars(replace(self.ranking, sigma=self.sigma_of(query))),
+                shape=shape,
                 mask=mask,
                 image=image,
                 workers=self.workers,
@@ -105,6 +111,21 @@ class Retrieve(ObservationCommand):
             )
             console.print(f"Page: {page}", markup=False)
         return 0
+
+
+def _open_shapes(paths: Sequence[Path]) -> ShapeModel | dict[str, ShapeModel] | None:
+    """The shape models of files: one, or several by category; None of no file."""
+    from cadalign.shapes.model import ShapeModel
+
+    models = [ShapeModel.open(path) for path in paths]
+    if len(models) < 2:
+        return models[0] if models else None
+    by_category = {model.category: model for model in models}
+    if len(by_category) < len(models):
+        names = [model.category for model in models]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"two files of the category {twice!r}", where="--shape")
+    return by_category
 
 
 def _print_table(matches: Sequence[Match]) -> None:

@@ -25,6 +25,7 @@ _LINEAR = LOSSES["linear"]
 class Observed:
     """An image's keypoints, in the order of their semantic ids."""
 
+    order: IntArray  # (n,), their rows as they were given
     points_2d: FloatArray  # (n, 2) [px]
     camera: Camera
     query: Query  # semantic ids and rays of the keypoints, for the kernels
@@ -57,7 +58,7 @@ def observe(
         max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
-    return Observed(pixels, camera, query, float(off) * len(ids))
+    return Observed(order, pixels, camera, query, float(off) * len(ids))
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.retrieval.by_shape import rank_by_shape, shapes_by_category
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
@@ -20,6 +22,7 @@ from cadalign.retrieval.ranking import make_matches, rank
 
 if TYPE_CHECKING:
     from cadalign.datasets import KeypointNet
+    from cadalign.shapes.model import ShapeModel
 
 logger = logging.getLogger("cadalign")
 
@@ -161,6 +164,7 @@ class Library:
         semantic_ids: npt.ArrayLike,
         camera: Camera,
         *,
+        shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
         mask: npt.ArrayLike | None = None,
         image: npt.ArrayLike | None = None,
         exclude: Collection[ModelKey] = (),
@@ -184,6 +188,10 @@ class Library:
             ``category`` each model reads them in its own category's sense.
         camera : Camera
             The calibrated camera. Lens distortion is honoured.
+        shape : ShapeModel or mapping of category to ShapeModel, optional
+            Rank by the shape that these estimate from the image, for objects that no model of the
+            library is, not even stretched: only models of these categories, a single shape model
+            being that of ``category``, if given. See `cadalign.retrieval.by_shape`.
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
@@ -217,9 +225,18 @@ class Library:
             chosen = RetrievalOptions(**options)
         except TypeError as error:
             raise InputError(f"unknown option ({error})", where="options") from None
-        observed = observe(points_2d, semantic_ids, camera, chosen)
-        candidates = gather_candidates(self._table, observed, chosen, exclude)
-        ranking = rank(candidates, observed, chosen, workers)
+        if shape is None:
+            observed = observe(points_2d, semantic_ids, camera, chosen)
+            candidates = gather_candidates(self._table, observed, chosen, exclude)
+            ranking = rank(candidates, observed, chosen, workers)
+        else:
+            shapes = shapes_by_category(shape, chosen, self._table)
+            category = next(iter(shapes)) if len(shapes) == 1 else None
+            # The deviation of shapes is no noise of the keypoints here.
+            plain = replace(chosen, shape_sigma=0.0, category=category)
+            observed = observe(points_2d, semantic_ids, camera, plain)
+            candidates = gather_candidates(self._table, observed, plain, exclude)
+            ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
         matches = make_matches(self._table, candidates, observed, ranking, chosen.top)
         if mask is None and image is None:
             return matches

@@ -98,7 +98,11 @@ class Vectors:
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
         """The vectors grouped by the entries that they have."""
-        kinds, kind_of = np.unique(~np.isnan(self.values), axis=0, return_inverse=True)
+        has = ~np.isnan(self.values)
+        if has.all():  # saves the sorting
+            kinds, kind_of = has[:1], np.zeros(len(has), dtype=np.int64)
+        else:
+            kinds, kind_of = np.unique(has, axis=0, return_inverse=True)
         found = []
         for number, kind in enumerate(kinds):
             rows, seen = np.flatnonzero(kind_of.ravel() == number), np.flatnonzero(kind)

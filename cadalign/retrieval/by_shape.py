@@ -1,0 +1,333 @@
+"""Ranking of models that are only similar to the object, by the shape estimated from the image.
+
+The category's `ShapeModel` is aligned with the image's keypoints, which gives the posterior of the
+object's shape, also of the parts that the image does not show. A model of the library is then as
+probable as its keypoints and box are under that posterior, widened by what tells a model from the
+object that it stands for:
+
+- its size and place, which one image does not tell;
+- a deviation of each coordinate: ``shape_sigma`` times the extent of the mean shape or, where that
+  is 0, the distance of the library's models from their nearest ones;
+- each keypoint of the image that the model lacks, by the probability ``spurious``, and each of the
+  model's that the image lacks, by ``missing_prob``.
+
+Keypoints that a model lacks are filled in with those that the category leads to expect. With
+several categories, each has the probability that its shape model gives to the image's keypoints.
+All models are ranked, but those that would reach behind the camera; none is searched for a pose.
+Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
+box closest to the estimated ones. Of the options, ``scale_prior_sigma`` and ``exhaustive`` have no
+effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import DegenerateError, InputError
+from cadalign.fitting.joint.align import align
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.shape_posterior import ShapePosterior, gaussians_of, shape_posterior
+from cadalign.fitting.joint.view import View
+from cadalign.retrieval.candidates import CandidateSet, Observed
+from cadalign.retrieval.models import ModelTable
+from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.ranking import Ranking
+from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import BOX_ROWS
+
+_LEAST_KEYPOINTS = 3
+_FREE_SIZE = 1.0  # deviations of what the image does not tell: of the log size,
+_FREE_PLACE = 0.5  # and of the place, in extents of the shape
+_NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
+_FLOOR = 1e-4  # least deviation of a coordinate, in extents of the shape
+_FLAT = 1e-9  # share of a model's variance along an axis without extent
+_MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
+_INAPPLICABLE = {"method": "optimal", "symmetries": False}
+
+
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Models of a category in the terms of its shape model.
+
+    ``centred`` (n, m + 2, 3) holds their keypoints and boxes, completed, about their ``centres``
+    (n, 3), and ``squares`` (n, 3) their variances, all weighted by `_weights`; ``has`` (n, m) says
+    which keypoints they have; ``deviation`` is their distance from their nearest ones per
+    coordinate.
+    """
+
+    centred: FloatArray
+    centres: FloatArray
+    squares: FloatArray
+    has: BoolArray
+    deviation: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Ranked:
+    """Candidates of a category, their log probabilities, and their poses (c, 15)."""
+
+    candidates: IntArray
+    logs: FloatArray
+    poses: FloatArray
+
+
+def shapes_by_category(
+    shape: object, options: RetrievalOptions, table: ModelTable
+) -> dict[str, ShapeModel]:
+    """The shape model of each category to rank.
+
+    A single one is that of the options' category, if there is one.
+
+    Raises
+    ------
+    InputError
+        If there is none, a category is not in the library, or an option does not apply.
+    """
+    from cadalign.datasets.models.categories import require_category
+
+    for name, default in _INAPPLICABLE.items():
+        if getattr(options, name) != default:
+            fix = f"leave it at {default!r}, or rank without shape"
+            what = f"{getattr(options, name)!r} does not apply to a ranking by shape"
+            raise InputError(what, where=name, fix=fix)
+    if isinstance(shape, ShapeModel):
+        shape = {options.category or shape.category: shape}
+    if not isinstance(shape, Mapping) or not shape:
+        what = f"expected a cadalign.ShapeModel, or some by category, got {type(shape).__name__}"
+        raise InputError(what, where="shape")
+    found = {}
+    for category, model in shape.items():
+        if not isinstance(model, ShapeModel):
+            what = f"expected a cadalign.ShapeModel, got {type(model).__name__}"
+            raise InputError(what, where=f"shape[{category!r}]")
+        if any(isinstance(label, str) for label in model.ids):
+            what, fix = "its keypoints have names", "learn it from models with semantic ids"
+            raise InputError(what, where=f"shape[{category!r}]", fix=fix)
+        found[require_category(category, table.categories, where="shape")] = model
+    if options.category is None:
+        return found
+    category = require_category(options.category, table.categories, where="category")
+    if category not in found:
+        fix = f"known are {', '.join(sorted(found))}"
+        raise InputError(f"no shape model of {category!r}", where="shape", fix=fix)
+    return {category: found[category]}
+
+
+def rank_by_shape(
+    table: ModelTable,
+    candidates: CandidateSet,
+    observed: Observed,
+    options: RetrievalOptions,
+    shapes: Mapping[str, ShapeModel],
+) -> Ranking:
+    """Rank a candidate set by the estimated shape; candidates of other categories are left out.
+
+    Raises
+    ------
+    InputError
+        If no shape model has 3 of the image's keypoints.
+    DegenerateError
+        If a shape model cannot be aligned with the keypoints, or no model lies in front of the
+        camera.
+    """
+    parts = []
+    for category, shape in sorted(shapes.items()):
+        own = table.rows_of(category)
+        chosen = (candidates.models >= own.start) & (candidates.models < own.stop)
+        if np.isin(observed.query.ids, shape.ids).sum() >= _LEAST_KEYPOINTS and chosen.any():
+            rows = np.flatnonzero(chosen)
+            models = candidates.models[rows] - own.start
+            known = _shapes_of(table, category, shape)
+            parts.append(_rank_category(rows, models, known, observed, options, shape))
+    if not parts:
+        raise InputError(
+            f"no shape model has {_LEAST_KEYPOINTS} of the keypoints",
+            where="semantic_ids",
+            fix="check them, or rank without shape",
+        )
+    logs = np.concatenate([part.logs for part in parts])
+    if not len(logs):
+        raise DegenerateError(
+            "no model has all keypoints in front of the camera",
+            where="points_2d",
+            fix="check the keypoints, their semantic ids and the camera",
+        )
+    order = np.argsort(-logs, kind="stable")
+    weights = np.exp(logs[order] - logs.max())
+    return Ranking(
+        np.concatenate([part.candidates for part in parts])[order],
+        np.concatenate([part.poses for part in parts])[order],
+        logs[order],
+        weights / weights.sum(),
+        0,
+    )
+
+
+def _rank_category(
+    rows: IntArray,
+    models: IntArray,
+    known: _Shapes,
+    observed: Observed,
+    options: RetrievalOptions,
+    shape: ShapeModel,
+) -> _Ranked:
+    in_image = np.isin(observed.query.ids, shape.ids)
+    view = _view(observed, in_image, options)
+    result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
+    posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
+    estimate = np.concatenate([result.points_3d, result.bounds])
+    weights = _weights(len(estimate))
+    aim = weights @ estimate
+    centred, squares = known.centred[models], known.squares[models]
+    products = np.einsum("nka,ka->na", centred, weights[:, None] * (estimate - aim))
+    placed = centred * _scales(squares, products, "")[:, None] + aim
+    deviation = known.deviation
+    if options.shape_sigma > 0:
+        deviation = options.shape_sigma * _extent(shape)
+    logs = log_likelihoods(
+        placed.reshape(len(models), -1), _widened(posterior, estimate, deviation)
+    )
+    seen = np.isin(shape.ids, observed.query.ids)
+    has = known.has[models]
+    logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
+    logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)
+    logs += has[:, seen].sum(axis=1) * np.log1p(-options.missing_prob)
+    evidence = posterior.log_evidence + float(observed.query.gains[in_image].sum())
+    axes, centres = options.fitting.stretched_axes, known.centres[models]
+    scales = _scales(squares, products, axes)
+    poses = _poses(result, scales, aim - scales * centres, axes, options.max_stretch)
+    # Models share the probability of their category.
+    logs += evidence - np.logaddexp.reduce(logs)
+    kept = _least_depths(poses, centred[:, :-BOX_ROWS], centres) > 0
+    return _Ranked(rows[kept], logs[kept], poses[kept])
+
+
+def _view(observed: Observed, in_image: BoolArray, options: RetrievalOptions) -> View:
+    """The image's keypoints that a shape model has."""
+    sigma = options.sigma
+    assert sigma is not None
+    if np.ndim(sigma):
+        sigma = np.asarray(sigma)[observed.order][in_image]
+    ids = observed.query.ids[in_image].tolist()
+    return View(observed.camera, observed.points_2d[in_image], ids=ids, sigma=sigma)
+
+
+def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) -> Gaussians:
+    """The distribution of what similar models have in place of the object's shape."""
+    centred = estimate - estimate.mean(axis=0)
+    extent = float(np.linalg.norm(np.ptp(estimate, axis=0)))
+    size = _FREE_SIZE * centred.ravel()
+    place = _FREE_PLACE * extent * np.tile(np.eye(3), len(estimate))
+    widening = np.outer(size, size) + place.T @ place + deviation**2 * np.eye(len(size))
+    shapes = posterior.shapes
+    kept = shapes.weights > _NEGLIGIBLE
+    return Gaussians(shapes.weights[kept], shapes.means[kept], shapes.covariances[kept] + widening)
+
+
+def _weights(count: int) -> FloatArray:
+    """Weights (count,) of the keypoints and, as much together, of the box."""
+    weights = np.full(count, 1 / (2 * (count - BOX_ROWS)))
+    weights[-BOX_ROWS:] = 1 / (2 * BOX_ROWS)
+    return weights
+
+
+def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
+    """Scales (n, 3) that bring models closest to a shape, from their moments (n, 3).
+
+    The ``free`` axes have a scale each, the others share one.
+    """
+    total = np.maximum(squares.sum(axis=1), np.finfo(float).tiny)
+    common = np.maximum(products.sum(axis=1) / total, np.finfo(float).eps)
+    scales = np.empty_like(squares)
+    held = [axis for axis, name in enumerate("xyz") if name not in free]
+    for axes in (held, *([axis] for axis in range(3) if axis not in held)):
+        square, product = squares[:, axes].sum(axis=1), products[:, axes].sum(axis=1)
+        # A flat or mirrored model tells nothing of the scale along this axis.
+        known = (square > _FLAT * total) & (product > 0)
+        found = np.where(known, product / np.where(known, square, 1.0), common)
+        scales[:, axes] = found[:, None]
+    return scales
+
+
+def _poses(
+    result: AlignResult, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
+) -> FloatArray:
+    """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
+    pose = result.alignment
+    held = next(axis for axis, name in enumerate("xyz") if name not in free)
+    size = scales[:, [held]]
+    stretch = np.clip(scales / size, 1 / max_stretch, max_stretch)
+    # The image stays the same if everything is scaled about the camera centre.
+    translation = (pose.translation + (shifts * pose.scale) @ pose.rotation.T) / size
+    turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))
+    return np.concatenate([turned, translation, stretch * pose.scale], axis=1)
+
+
+def _least_depths(poses: FloatArray, centred: FloatArray, centres: FloatArray) -> FloatArray:
+    """Depth of the keypoint of each model that is nearest to the camera."""
+    across = poses[:, 6:9] * poses[:, 12:]
+    depths = np.einsum("nka,na->nk", centred, across)
+    return np.asarray(depths.min(axis=1) + (centres * across).sum(axis=1) + poses[:, 11])
+
+
+@lru_cache(maxsize=32)
+def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
+    """All models of a category in the terms of its shape model."""
+    rows = table.rows_of(category)
+    offsets = table.offsets[rows.start : rows.stop + 1]
+    own = slice(int(offsets[0]), int(offsets[-1]))
+    row_of = {label: row for row, label in enumerate(shape.ids)}
+    ids, number = np.unique(table.semantic_ids[own], return_inverse=True)
+    row = np.array([row_of.get(label, -1) for label in ids.tolist()], dtype=np.int64)[number]
+    model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    stacked = np.full((len(offsets) - 1, len(shape.ids) + BOX_ROWS, 3), np.nan)
+    stacked[model[row >= 0], row[row >= 0]] = table.xyz[own][row >= 0]
+    stacked[:, -BOX_ROWS:] = table.bounds[rows]
+    has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
+    prior = gaussians_of(shape).widened(_FLOOR * _extent(shape))
+    flat = _completed(stacked.reshape(len(stacked), -1), prior)
+    weights, full = _weights(stacked.shape[1]), flat.reshape(stacked.shape)
+    centres = weights @ full
+    centred = full - centres[:, None]
+    return _Shapes(centred, centres, weights @ centred**2, has, _deviation(flat, prior))
+
+
+def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
+    """Vectors (n, d) with the expectation of their missing entries under a mixture."""
+    vectors = Vectors(values, np.ones(len(values)))
+    parts = [
+        Gaussians(prior.weights[[g]], prior.means[[g]], prior.covariances[[g]])
+        for g in range(len(prior.weights))
+    ]
+    logs = np.array([log_likelihoods(values, part) for part in parts])
+    shares = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
+    pairs = zip(shares, parts, strict=True)
+    return np.asarray(sum(share[:, None] * vectors.completed(part) for share, part in pairs))
+
+
+def _deviation(values: FloatArray, prior: Gaussians) -> float:
+    """Deviation per coordinate of vectors (n, d) from their nearest ones, the median of all.
+
+    That of the prior if there is only one vector.
+    """
+    values = values[:: -(-len(values) // _MOST_NEIGHBOURS)]
+    floor = float(np.sqrt(prior.covariances.diagonal(axis1=1, axis2=2).min()))
+    if len(values) < 2:
+        variances = prior.weights @ prior.covariances.diagonal(axis1=1, axis2=2)
+        return float(np.sqrt(variances.mean()))
+    centred = values - values.mean(axis=0)
+    norms = (centred**2).sum(axis=1)
+    squares = norms[:, None] + norms - 2 * centred @ centred.T
+    np.fill_diagonal(squares, np.inf)
+    nearest = np.maximum(squares.min(axis=1), 0.0)
+    return max(float(np.sqrt(np.median(nearest) / values.shape[1])), floor)
+
+
+def _extent(shape: ShapeModel) -> float:
+    return float(np.linalg.norm(np.ptp(shape.mean, axis=0)))

@@ -1,0 +1,286 @@
+"""`Library.retrieve(shape=...)`: ranking by the estimated shape, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.refusals import refusal_line
+
+from cadalign import Alignment, Box, Camera, Library, ShapeModel, View, align
+from cadalign.cli import main
+from cadalign.errors import InputError
+from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.io.observation import Observation
+from cadalign.retrieval import LibraryModel
+from cadalign.shapes.examples import Example
+
+CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
+POSE = Alignment.from_packed(
+    np.array([0.8, 0, 0.6, 0.36, -0.8, -0.48, 0.48, 0.6, -0.64, 0.02, -0.01, 2.4, 1, 1, 1])
+)
+
+
+def make_table(number: int, category: str = "table", lack: tuple[int, ...] = ()) -> LibraryModel:
+    """A table of random width, height, depth, overhang and shelf, none a stretch of another."""
+    rng = np.random.default_rng([number, 7])
+    w, h, d = np.array([0.3, 0.25, 0.2]) * rng.uniform(0.6, 1.4, 3)
+    inset, shelf = rng.uniform(0.1, 1.0, 2)
+    signs = [(-1, -1), (-1, 1), (1, 1), (1, -1)]
+    top = [(w * x, h, d * z) for x, z in signs]
+    feet = [(w * x * inset, -h, d * z * inset) for x, z in signs]
+    middle = [(w * x * inset, h * (2 * shelf - 1), d * z * inset) for x, z in signs[:2]]
+    xyz = np.array(top + feet + middle)
+    kept = np.array([row for row in range(len(xyz)) if row not in lack])
+    bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+    return LibraryModel(category, f"{number:03d}", xyz[kept], kept, bounds)
+
+
+def learn(models: list[LibraryModel]) -> ShapeModel:
+    examples = [
+        Example(model.model_id, model.semantic_ids.tolist(), model.xyz, bounds=model.bounds)
+        for model in models
+    ]
+    return ShapeModel.learn(examples, category=models[0].category, components=1, reflection=False)
+
+
+MODELS = [make_table(number) for number in range(150)]
+LIBRARY = Library.from_models(MODELS)
+SHAPE = learn(MODELS)
+OBJECTS = [make_table(number) for number in range(1000, 1012)]
+
+
+def seen(model: LibraryModel, noise_px: float = 0.0) -> np.ndarray:
+    pixels = CAMERA.project(POSE.apply(model.xyz))
+    return pixels + noise_px * np.random.default_rng(3).standard_normal(pixels.shape)
+
+
+def first(model: LibraryModel, library: Library = LIBRARY, **options: Any) -> Any:
+    options = {"shape": SHAPE, "sigma": 1.0, **options}
+    return library.retrieve(seen(model, 1.0), model.semantic_ids, CAMERA, **options)[0]
+
+
+def iou(match: Any, model: LibraryModel) -> float:
+    return box_iou_up_to_scale(est=match.box, gt=Box.from_model(model.bounds, POSE))
+
+
+def test_first_match_of_unseen_objects_overlaps_more_than_by_fits() -> None:
+    by_shape = [iou(first(model), model) for model in OBJECTS]
+    by_fit = [iou(first(model, shape=None), model) for model in OBJECTS]
+    assert np.mean(by_shape) > np.mean(by_fit)
+    assert np.median(by_shape) > 0.85
+
+
+def gap(model: LibraryModel, other: LibraryModel) -> float:
+    """Distance of the keypoints, up to size and place."""
+    one, two = model.xyz - model.xyz.mean(axis=0), other.xyz - other.xyz.mean(axis=0)
+    return float(np.linalg.norm(one - two * (one * two).sum() / (two * two).sum()))
+
+
+def test_unstretched_first_match_is_among_the_most_similar() -> None:
+    places = []
+    for model in OBJECTS:
+        best = first(model, stretch="none")
+        assert best.alignment.scale.tolist() == [1, 1, 1]
+        own = gap(model, LIBRARY[best.category, best.model_id])
+        places.append(sum(gap(model, other) < own for other in MODELS))
+    assert np.median(places) <= len(MODELS) / 30
+
+
+@pytest.mark.parametrize("count", [5, 10])
+def test_models_of_the_library_are_found(count: int) -> None:
+    ranks = []
+    for model in MODELS[::15]:
+        matches = LIBRARY.retrieve(
+            seen(model)[:count], model.semantic_ids[:count], CAMERA, sigma=0.2, shape=SHAPE, top=150
+        )
+        assert len(matches) == len(MODELS)
+        ranks.append([match.model_id for match in matches].index(model.model_id))
+    assert np.median(ranks) <= (1 if count == 10 else 8)
+
+
+def test_size_and_place_of_models_do_not_count() -> None:
+    model = OBJECTS[0]
+    moved = [
+        replace(each, xyz=1.1 * each.xyz + 0.02, bounds=1.1 * each.bounds + 0.02)
+        if row % 2
+        else each
+        for row, each in enumerate(MODELS)
+    ]
+    before = [match.model_id for match in rank_all(LIBRARY, model)]
+    after = [match.model_id for match in rank_all(Library.from_models(moved), model)]
+    assert before[:10] == after[:10]
+
+
+def rank_all(library: Library, model: LibraryModel, **options: Any) -> list[Any]:
+    options = {"shape": SHAPE, "top": len(library), "shape_sigma": 0.05, **options}
+    return library.retrieve(seen(model, 1.0), model.semantic_ids, CAMERA, **options)
+
+
+def test_result_does_not_depend_on_the_order_of_keypoints() -> None:
+    model, order = OBJECTS[1], np.random.default_rng(0).permutation(10)
+    sigma = np.linspace(0.5, 3, 10)
+    one = LIBRARY.retrieve(seen(model), model.semantic_ids, CAMERA, sigma=sigma, shape=SHAPE)
+    other = LIBRARY.retrieve(
+        seen(model)[order], model.semantic_ids[order], CAMERA, sigma=sigma[order], shape=SHAPE
+    )
+    assert [match.model_id for match in one] == [match.model_id for match in other]
+    np.testing.assert_allclose(one[0].alignment.packed, other[0].alignment.packed, atol=1e-6)
+
+
+def test_matches_are_sorted_and_scores_sum_to_one() -> None:
+    matches = rank_all(LIBRARY, OBJECTS[2])
+    scores = [match.score for match in matches]
+    assert scores == sorted(scores, reverse=True)
+    assert sum(scores) == pytest.approx(1)
+
+
+def test_stretched_box_is_close_to_the_estimated_one() -> None:
+    model = OBJECTS[3]
+    estimate = align(SHAPE, View(CAMERA, seen(model, 1.0), ids=model.semantic_ids.tolist()))
+    best = first(model)
+    assert best.alignment.scale[0] == 1
+    assert box_iou_up_to_scale(est=best.box, gt=estimate.box) > 0.9
+    assert best.rms < 20
+
+
+def test_models_that_lack_keypoints_are_ranked_below_the_same_with_them() -> None:
+    model = OBJECTS[4]
+    best = first(model)
+    whole = LIBRARY[best.category, best.model_id]
+    kept = whole.semantic_ids[whole.semantic_ids != 9]
+    part = replace(whole, model_id="part", xyz=whole.xyz[kept], semantic_ids=kept)
+    matches = rank_all(Library.from_models([*MODELS, part]), model)
+    ranks = {match.model_id: rank for rank, match in enumerate(matches)}
+    assert ranks[best.model_id] < ranks["part"]
+    assert next(match for match in matches if match.model_id == "part").missing_ids == (9,)
+
+
+def test_excluded_models_are_left_out() -> None:
+    best = first(OBJECTS[0])
+    other = first(OBJECTS[0], exclude=[(best.category, best.model_id)])
+    assert other.model_id != best.model_id
+
+
+def test_outliers_do_not_count_with_a_robust_loss() -> None:
+    model = OBJECTS[5]
+    pixels = seen(model)
+    pixels[8] += 150
+    robust = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE, loss="cauchy")
+    plain = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE)
+    assert iou(robust[0], model) > iou(plain[0], model)
+    assert iou(robust[0], model) > iou(first(model), model) - 0.1
+
+
+def test_categories_share_the_probability() -> None:
+    tall = [
+        replace(each, category="mast", xyz=each.xyz * [0.2, 2, 0.2], bounds=each.bounds * 1.0)
+        for each in MODELS
+    ]
+    tall = [
+        replace(each, bounds=np.array([each.xyz.min(axis=0), each.xyz.max(axis=0)]))
+        for each in tall
+    ]
+    library = Library.from_models([*MODELS, *tall])
+    shapes = {"table": SHAPE, "mast": learn(tall)}
+    for model in (OBJECTS[0], make_table(2000)):
+        matches = rank_all(library, model, shape=shapes)
+        tables = [match for match in matches if match.category == "table"]
+        assert len(tables) == len(MODELS)
+        assert sum(match.score for match in tables) > 0.99
+    only = rank_all(library, OBJECTS[0], shape=shapes, category="mast")
+    assert {match.category for match in only} == {"mast"}
+    assert {match.category for match in rank_all(library, OBJECTS[0])} == {"table"}
+
+
+NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], names=list("abcdefghij"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"shape": "chair.shape"},
+            "shape: expected a cadalign.ShapeModel, or some by category, got str",
+        ),
+        ({"shape": {}}, "shape: expected a cadalign.ShapeModel, or some by category, got dict"),
+        ({"shape": {"table": 3}}, "shape['table']: expected a cadalign.ShapeModel, got int"),
+        (
+            {"shape": {"mug": SHAPE}},
+            "shape: unknown category 'mug'; known are table",
+        ),
+        (
+            {"shape": {"table": NAMED}},
+            "shape['table']: its keypoints have names; learn it from models with semantic ids",
+        ),
+        (
+            {"symmetries": True},
+            "symmetries: True does not apply to a ranking by shape; "
+            "leave it at False, or rank without shape",
+        ),
+        (
+            {"method": "epnp"},
+            "method: 'epnp' does not apply to a ranking by shape; "
+            "leave it at 'optimal', or rank without shape",
+        ),
+    ],
+)
+def test_bad_input_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        first(OBJECTS[0], **options)
+    assert str(caught.value) == message
+
+
+def test_keypoints_that_the_shape_lacks_are_refused_if_too_few_are_left() -> None:
+    few = ShapeModel.from_basis(MODELS[0].xyz[:2], [MODELS[0].xyz[:2]], [0.1])
+    with pytest.raises(InputError, match="no shape model has 3 of the keypoints"):
+        first(OBJECTS[0], shape=few, category="table")
+
+
+class TestCommand:
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        folder = tmp_path_factory.mktemp("by_shape")
+        LIBRARY.save(folder / "tables.cadalign")
+        SHAPE.save(folder / "table.shape")
+        Observation(
+            points_3d=np.zeros((10, 3)),
+            points_2d=seen(OBJECTS[0], 1.0),
+            camera=CAMERA,
+            semantic_ids=np.arange(10),
+        ).save(folder / "seen.json")
+        return folder
+
+    def test_ranks_as_the_call(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        arguments = ["retrieve", "seen.json", "--library", "tables.cadalign", "--json"]
+        arguments[1], arguments[3] = str(folder / "seen.json"), str(folder / "tables.cadalign")
+        assert main([*arguments, "--shape", str(folder / "table.shape")]) == 0
+        found = [match["model_id"] for match in json.loads(capsys.readouterr().out)]
+        called = LIBRARY.retrieve(seen(OBJECTS[0], 1.0), np.arange(10), CAMERA, shape=SHAPE)
+        assert found == [match.model_id for match in called]
+
+    def test_two_files_of_a_category_are_refused(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        line = refusal_line(
+            capsys,
+            *("retrieve", folder / "seen.json", "--library", folder / "tables.cadalign"),
+            *("--shape", folder / "table.shape", folder / "table.shape"),
+        )
+        assert line == "--shape: two files of the category 'table'"
+
+    def test_an_unknown_category_is_named(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        replace(SHAPE, category="mug").save(folder / "mug.shape")
+        line = refusal_line(
+            capsys,
+            *("retrieve", folder / "seen.json", "--library", folder / "tables.cadalign"),
+            *("--shape", folder / "mug.shape"),
+        )
+        assert line == "--shape: unknown category 'mug'; known are table"

@@ -235,7 +235,7 @@ NOISE = Metric("noise_px", "noise of the keypoints", "px", better=None, log=Fals
 POINTS = Metric("points", "number of points", better=None)
 
 UP_TO_SCALE = (TRANSLATION_UP_TO_SCALE, BOX_IOU_UP_TO_SCALE)
-"""Columns of runs with a method that does not know the object's size."""
+"""Columns of runs over views of models that some runs lack."""
 INSTANCE_METRICS = (
     *(ROTATION, TRANSLATION, SCALE_Y, SCALE_Z, BOX_IOU),
     *(SYM_ROTATION, SYM_TRANSLATION, SYM_BOX_IOU, RMS),

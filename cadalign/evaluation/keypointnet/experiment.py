@@ -13,6 +13,9 @@ rotation_error_deg
     [degrees]
 translation_error
     [diagonals of the model's bounding box]
+translation_error_up_to_scale
+    The same after the estimate was scaled about the camera centre, of which one image does not tell
+    the distance; empty in earlier runs.
 scale_y_error, scale_z_error
     Relative errors, fractions.
 box_iou
@@ -24,8 +27,8 @@ symmetry
 sym_rotation_error_deg, sym_translation_error, sym_box_iou
     The same errors from the nearest truth that looks the same; see
     `cadalign.evaluation.instances.symmetry`. Errors of the scale do not depend on it.
-translation_error_up_to_scale, box_iou_up_to_scale
-    Of runs with learned shapes: after the estimate was scaled about the camera centre.
+box_iou_up_to_scale
+    Of runs with learned shapes only: after the estimate was scaled about the camera centre.
 
 The metrics of failed rows are empty.
 """
@@ -55,11 +58,7 @@ from cadalign.evaluation.instances.symmetry import SymmetryGroup
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
-from cadalign.evaluation.metrics import (
-    BOX_IOU_UP_TO_SCALE,
-    TRANSLATION_UP_TO_SCALE,
-    UP_TO_SCALE,
-)
+from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.outcome import (
     Outcome,
     alignment_errors,
@@ -85,8 +84,11 @@ COLUMNS: Columns = (
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
     *((f"sym_{name}", float) for name in _POSE_ERRORS),
+    ("translation_error_up_to_scale", float),
 )
 """Columns of every run."""
+REQUIRED_COLUMNS: Columns = COLUMNS[:-1]
+"""Those that all runs have; earlier ones lack the last."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,7 @@ class KeypointNetExperiment:
     @property
     def columns(self) -> Columns:
         """The columns of the result table."""
-        more = UP_TO_SCALE if self.shapes.paths else ()
-        return (*COLUMNS, *((metric.key, float) for metric in more))
+        return (*COLUMNS, (BOX_IOU_UP_TO_SCALE.key, float)) if self.shapes.paths else COLUMNS
 
     def methods_for(self, category: str) -> tuple[str, ...]:
         """The methods for the models of a category, that of its learned shape the last."""
@@ -259,10 +260,21 @@ class KeypointNetExperiment:
                 "rms_px": estimate.rms
                 if isinstance(estimate, AlignedShape)
                 else _rms(instance, alignment),
+                "translation_error_up_to_scale": translation_error_up_to_scale(
+                    est=alignment, gt=instance.gt
+                )
+                / instance.diagonal,
                 **{f"sym_{name}": aware[name] for name in _POSE_ERRORS},
-                **(_errors_up_to_scale(alignment, instance) if self.shapes.paths else {}),
+                **self._overlap_up_to_scale(instance, alignment),
             },
         )
+
+    def _overlap_up_to_scale(self, instance: Instance, est: Alignment) -> Row:
+        """The box IoU up to scale by column, which takes longer than most methods."""
+        if not self.shapes.paths:
+            return {}
+        box = Box.from_model(instance.bounds, est)
+        return {BOX_IOU_UP_TO_SCALE.key: overlap_up_to_scale(est=box, gt=instance.gt_box)}
 
 
 # Views of one model come one after another.
@@ -277,16 +289,6 @@ def _errors(
     return {
         **alignment_errors(est=est, gt=gt, length=instance.diagonal),
         "box_iou": overlap(est=box, gt=gt_box),
-    }
-
-
-def _errors_up_to_scale(est: Alignment, instance: Instance) -> dict[str, float | None]:
-    """Errors by column after the estimate was scaled about the camera centre."""
-    box = Box.from_model(instance.bounds, est)
-    shift = translation_error_up_to_scale(est=est, gt=instance.gt)
-    return {
-        TRANSLATION_UP_TO_SCALE.key: shift / instance.diagonal,
-        BOX_IOU_UP_TO_SCALE.key: overlap_up_to_scale(est=box, gt=instance.gt_box),
     }
 
 

@@ -20,8 +20,10 @@ from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of, where
 
-MEDIANS = tuple(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS)
-_UP_TO_SCALE = tuple(metric.key for metric in metrics.UP_TO_SCALE)
+MEDIANS = (
+    *(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS),
+    *(metric.key for metric in metrics.UP_TO_SCALE),
+)
 TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
@@ -69,7 +71,7 @@ def texts(summary: Summary) -> list[str]:
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """The summaries for the console."""
     rest = (metrics.SYM_ROTATION, metrics.SUCCESS_5)
-    if any(name in run.cells for name in _UP_TO_SCALE):  # the table must not be wider
+    if metrics.BOX_IOU_UP_TO_SCALE.key in run.cells:  # the table must not be wider
         rest = metrics.UP_TO_SCALE
     shown = (metrics.INSTANCES, metrics.FAILED, *TABLE, *rest)
     return ConsoleTable(
@@ -90,8 +92,7 @@ def _summarize_method(category: str, method: str, cells: Cells, bound: float) ->
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
     count = int(chosen.sum())
-    known = [name for name in _UP_TO_SCALE if name in solved]
-    medians = {name: median_of(solved[name]) for name in (*MEDIANS, *known)}
+    medians = {name: median_of(solved[name]) for name in MEDIANS if name in solved}
     values = {
         "instances": count,
         "failed": count - len(solved["method"]),

@@ -41,7 +41,8 @@ _SAME_CHORD = 1e-3
 _SAME_FOCAL = 0.01
 _LENS_ROUNDS = 12
 _LENS_TOLERANCE = 1e-10
-_ALL_STEPS = 1000
+_STEPS = 1000
+_STEPS_OF_ALL_POINTS = 20  # from a minimum for some of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,21 +154,24 @@ def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
     local = replace(task, points=(task.points - center) / unit)
     coarse = local.thinned(_COARSE_POINTS)
     starts, iterations, hypotheses = _starts(coarse)
-    minima, used = _distinct_minima(coarse, starts)
+    minima, used = _distinct_minima(coarse, starts, _STEPS)
     iterations += used
     if len(coarse.points) < len(local.points):
-        minima, used = _distinct_minima(local, _likely(minima, len(coarse.points)))
+        likely = _likely(minima, len(coarse.points))
+        minima, used = _distinct_minima(local, likely, _STEPS_OF_ALL_POINTS)
         iterations += used
     minima = [replace(minimum, pose=_uncentered(minimum.pose, center, unit)) for minimum in minima]
     return minima, iterations, hypotheses
 
 
-def _distinct_minima(task: _Task, starts: Sequence[_Minimum]) -> tuple[list[_Minimum], int]:
+def _distinct_minima(
+    task: _Task, starts: Sequence[_Minimum], steps: int
+) -> tuple[list[_Minimum], int]:
     """The minima below starts, the best first, and the iterations they took."""
     minima: list[_Minimum] = []
     iterations = 0
     for start in starts:
-        minimum, used = _descend(task, start)
+        minimum, used = _descend(task, start, steps)
         iterations += used
         if not minimum.cost < np.inf or has_collapsed(minimum.pose):
             continue
@@ -244,7 +248,7 @@ def _with_linear_guess(task: _Task, views: Views) -> Views:
     )
 
 
-def _descend(task: _Task, start: _Minimum) -> tuple[_Minimum, int]:
+def _descend(task: _Task, start: _Minimum, steps: int) -> tuple[_Minimum, int]:
     """The minimum of all 9 unknowns below a start, and the iterations it took."""
     prior = task.prior
     pose, focal, cost = start.pose.copy(), start.focal, np.inf
@@ -258,7 +262,7 @@ def _descend(task: _Task, start: _Minimum) -> tuple[_Minimum, int]:
             task.points_2d, task.camera.with_focal(focal), objective.keypoints.rays
         )
         here = relative_to(prior, math.log(focal))
-        cost, moved, used = refine_focal(objective, slopes, here, _ALL_STEPS, pose, 0.0)
+        cost, moved, used = refine_focal(objective, slopes, here, steps, pose, 0.0)
         iterations += used
         focal *= float(np.exp(moved))
         if abs(moved) < _LENS_TOLERANCE:  # slopes are valid near the focal length of their rays

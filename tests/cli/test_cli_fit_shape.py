@@ -220,8 +220,16 @@ def test_shape_sigma_that_is_no_length(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma: str
 ) -> None:
     assert refusal_line(capsys, "fit", write(tmp_path), f"--shape-sigma={sigma}") == (
-        f"--shape-sigma: {float(sigma)} is not positive; "
-        "give a length in model units, or None for the exact model"
+        f"--shape-sigma: {float(sigma)} is not positive"
+    )
+
+
+@pytest.mark.parametrize("sigma", [1e-200, 1e300])
+def test_shape_sigma_whose_square_is_no_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma: float
+) -> None:
+    assert refusal_line(capsys, "fit", write(tmp_path), "--shape-sigma", sigma) == (
+        f"--shape-sigma: {sigma} is not between 1e-100 and 1e+100"
     )
 
 

@@ -21,14 +21,15 @@ _VALUES = [
 ]  # fmt: skip
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--max-reproj-error", "--focal", "--sigma",
-            "--robust", "--similar", "--json", "--out", "--scale-prior-sigma", "--known-axis"],
+            "--robust", "--similar", "--json", "--out", "--scale-prior-sigma", "--known-axis",
+            "--shape", "--shape-sigma", "--no-scale-prior"],
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--style", "--background", "--keypoints"],
     "report": ["--out", "--format", "--assets"],
     "library": ["build", "show", "--out", "--categories"],
     "evaluate": ["keypointnet", "show", "correspondences", "retrieval", "unseen", "--methods",
-                 "--noise-px"],
+                 "--noise-px", "--shape"],
 }  # fmt: skip
 
 

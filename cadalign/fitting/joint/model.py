@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats, as_points, is_number, read_only
+from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, quote
 from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.geometry.mesh import Mesh
@@ -73,10 +73,9 @@ class Model:
         if (bounds[1] < bounds[0]).any():
             raise InputError("the first row must hold the least coordinates", where="bounds")
         object.__setattr__(self, "bounds", read_only(bounds))
-        sigma = self.shape_sigma
-        if sigma is not None and not (is_number(sigma) and sigma > 0):
-            fix = "give a length in model units, or None for the exact model"
-            raise InputError(f"{quote(sigma)} is not positive", where="shape_sigma", fix=fix)
+        if self.shape_sigma is not None:
+            sigma = as_positive(self.shape_sigma, name="shape_sigma")
+            object.__setattr__(self, "shape_sigma", sigma)
         self.fit_options(1.0)
 
     def fit_options(self, sigma: float) -> FitOptions:

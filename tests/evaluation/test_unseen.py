@@ -308,7 +308,8 @@ def test_of_real_bottles_the_shape_model_is_best(real_data: Path, tmp_path: Path
     options = UnseenOptions(real_data / "keypointnet", categories=("bottle",), max_models=30)
     run(options, folder, workers=-1, dask=None)
     rotation, iou = (
-        {name: np.median(column(folder, key, name)) for name in METHODS}
+        # One of the bottles has no volume.
+        {name: np.nanmedian(column(folder, key, name)) for name in METHODS}
         for key in ("rotation_error_deg", "box_iou_up_to_scale")
     )
     assert rotation["shape"] <= 2.0

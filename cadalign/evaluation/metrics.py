@@ -125,6 +125,12 @@ BOX_IOU_UP_TO_SCALE = replace(
     head="box IoU, up to scale",
     symbol="IoU~",
 )
+STATED_BOX_IOU_UP_TO_SCALE = replace(
+    BOX_IOU_UP_TO_SCALE,
+    key="stated_box_iou_up_to_scale",
+    label="IoU of the stated box, up to scale",
+    head="stated box IoU, up to scale",
+)
 RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
 
 # From the nearest truth that looks the same.
@@ -190,8 +196,15 @@ ROTATION_90 = replace(
     head="R error, 90 %",
     symbol="R90",
 )
+BEST_ROTATION = replace(
+    ROTATION,
+    key="best_rotation_error_deg",
+    label="rotation error of the best alternative",
+    head="R error, best alternative",
+    symbol="best R",
+)
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
-"""Root mean square, in the model's frame, of a method's estimate of all keypoints."""
+"""Root mean square, up to scale, of a method's estimate of all keypoints."""
 # Shares of the truths within regions of a stated probability.
 _COVERED = replace(_RATE, digits=0, better=None)
 ROTATION_IN_68 = replace(

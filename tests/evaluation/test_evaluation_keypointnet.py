@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import cadalign
@@ -18,12 +19,14 @@ from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.keypointnet.spec import SPEC
 from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 from cadalign.evaluation.outcome import FAILED, OK
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.summary import Summary, summary_csv
 from cadalign.geometry.alignment import Alignment
+from cadalign.report import headline_text
 
 METRICS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
 
@@ -205,6 +208,23 @@ def test_show_refuses_what_is_no_evaluation(
         (tmp_path / "run.json").write_text(content)
     assert main(["evaluate", "show", str(tmp_path)]) == 1
     assert "not the folder of an evaluation" in capsys.readouterr().err
+
+
+def test_translation_up_to_scale_is_no_more_than_the_absolute_one(annotated: Path) -> None:
+    table = evaluate(annotated, methods=["optimal", "aepnp"], views_per_model=3)
+    solved = table[table.status == OK]
+    assert len(solved)
+    assert (solved.translation_error_up_to_scale <= solved.translation_error + 1e-12).all()
+
+
+def test_runs_without_translation_up_to_scale_still_open(annotated: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    evaluate(annotated, methods=["optimal"], out=run)
+    table = pq.read_table(run / "results.parquet")
+    pq.write_table(table.drop_columns("translation_error_up_to_scale"), run / "results.parquet")
+    summaries = SPEC.write(SPEC.open(run))
+    assert np.isfinite(summaries[0]["translation_error"])
+    assert "up to scale" not in headline_text([run], format="md")
 
 
 def row(method: str, error: float | None, *, category: str = "chair") -> dict[str, Any]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from cadalign import Box, Library
@@ -25,7 +27,7 @@ from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, re
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.geometry.metrics import box_iou
+from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.shape import distances
 
@@ -167,6 +169,9 @@ class TestRows:
         assert row["rms_px"] == pytest.approx(best.rms)
         truth = Box.from_model(model.bounds, query.gt)
         assert row["box_iou"] == pytest.approx(box_iou(est=best.box, gt=truth))
+        up_to_scale = box_iou_up_to_scale(est=best.box, gt=truth)
+        assert row["box_iou_up_to_scale"] == pytest.approx(up_to_scale)
+        assert up_to_scale >= row["box_iou"]
 
     def test_without_a_view_there_was_nothing_to_ask(self, tmp_path: Path) -> None:
         """Keypoints inside the hull are never all visible."""
@@ -313,6 +318,7 @@ class TestSummaries:
             assert (summary["queries"], summary["failed"]) == (30, 0)
             ious = [row["box_iou"] for row in rows]
             assert summary["box_iou"] == pytest.approx(np.median(ious))
+            assert summary["box_iou_up_to_scale"] >= summary["box_iou"]
             assert summary["mean_box_iou"] == pytest.approx(np.mean(ious))
             assert summary["score"] == pytest.approx(np.mean([row["score"] for row in rows]))
             ranks = [row["rank"] for row in rows]
@@ -328,6 +334,17 @@ class TestSummaries:
             assert summary["reciprocal_rank"] == pytest.approx(
                 np.mean([0.0 if rank is None else 1 / rank for rank in ranks])
             )
+
+    def test_runs_without_boxes_up_to_scale_still_open(
+        self, finished: RunFolder, tmp_path: Path
+    ) -> None:
+        earlier = tmp_path / "run"
+        shutil.copytree(finished.path, earlier)
+        table = read_table(finished.results).drop_columns("box_iou_up_to_scale")
+        pq.write_table(table, earlier / "results.parquet")
+        summaries = SPEC.summarize(SPEC.open(earlier))
+        assert np.isnan([summary["box_iou_up_to_scale"] for summary in summaries]).all()
+        assert np.isfinite([summary["box_iou"] for summary in summaries]).all()
 
     def test_table_and_figures_are_written(self, finished: RunFolder) -> None:
         summaries = SPEC.write(Run.open(finished.path))

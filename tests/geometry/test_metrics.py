@@ -18,10 +18,12 @@ from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import (
     alignment_box_iou,
     box_iou,
+    box_iou_up_to_scale,
     reprojection_error,
     rotation_error,
     scale_error,
     translation_error,
+    translation_error_up_to_scale,
 )
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -53,6 +55,7 @@ def test_perfect_estimate_scores_perfectly(seed: int) -> None:
     # Rounding in the truth's own matrix is all that a perfect estimate may be charged with.
     assert rotation_error(est=est, gt=gt) < 1e-12
     assert translation_error(est=est, gt=gt) == 0.0
+    assert translation_error_up_to_scale(est=est, gt=gt) == 0.0
     assert scale_error(est=est, gt=gt).tolist() == [0.0, 0.0, 0.0]
     assert reprojection_error(est=est, points_3d=points, points_2d=pixels, camera=CAMERA) == 0.0
     assert alignment_box_iou(est=est, gt=gt, bounds=BOUNDS) == pytest.approx(1.0, abs=1e-12)
@@ -291,8 +294,75 @@ def test_box_iou_refuses_flat_boxes(name: str, flat_first: bool) -> None:
 
 
 def test_box_iou_refuses_boxes_without_any_extent() -> None:
-    with pytest.raises(InputError, match="has no volume"):
-        box_iou(est=CUBE, gt=Box([0, 0, 0], np.eye(3), [0, 0, 0]))
+    for metric in (box_iou, box_iou_up_to_scale):
+        with pytest.raises(InputError, match="has no volume"):
+            metric(est=CUBE, gt=Box([0, 0, 0], np.eye(3), [0, 0, 0]))
+
+
+def boxes_before_the_camera(seed: int) -> tuple[Box, Box]:
+    """Two boxes near the optical axis, most of them in nearly the same direction."""
+    rng = np.random.default_rng(seed)
+    gt = Box([*rng.uniform(-0.5, 0.5, 2), 3.0], random_rotation(rng), rng.uniform(0.3, 1.5, 3))
+    factor = np.exp(rng.uniform(-2, 2))
+    center = factor * (gt.center + rng.uniform(-0.5, 0.5, 3))
+    return Box(center, random_rotation(rng), factor * rng.uniform(0.3, 1.5, 3)), gt
+
+
+def scaled_box(box: Box, factor: float) -> Box:
+    return Box(factor * box.center, box.rotation, factor * box.extents)
+
+
+@given(seed=SEEDS)
+def test_box_iou_up_to_scale_is_the_largest_over_all_factors(seed: int) -> None:
+    est, gt = boxes_before_the_camera(seed)
+    found = box_iou_up_to_scale(est=est, gt=gt)
+    factors = np.exp(np.linspace(-4, 4, 161))
+    best = max(box_iou(est=scaled_box(est, float(factor)), gt=gt) for factor in factors)
+    # The grid's next factor is 2.5 % off, which changes volumes by at most 8 %.
+    assert best - 1e-6 <= found <= best + 0.16
+
+
+@given(seed=SEEDS, logarithm=st.floats(-3, 3))
+def test_box_iou_up_to_scale_depends_on_neither_scale_nor_order(
+    seed: int, logarithm: float
+) -> None:
+    est, gt = boxes_before_the_camera(seed)
+    found = box_iou_up_to_scale(est=est, gt=gt)
+    factor = float(np.exp(logarithm))
+    assert box_iou_up_to_scale(est=scaled_box(est, factor), gt=gt) == pytest.approx(found, abs=1e-6)
+    assert box_iou_up_to_scale(est=gt, gt=est) == pytest.approx(found, abs=1e-6)
+    assert box_iou_up_to_scale(est=scaled_box(gt, factor), gt=gt) == pytest.approx(1, abs=1e-9)
+
+
+def test_box_iou_up_to_scale_of_boxes_in_other_directions_is_zero() -> None:
+    ahead, left = Box([0, 0, 5], np.eye(3), [1, 1, 1]), Box([-5, 0, 5], np.eye(3), [1, 1, 1])
+    assert box_iou_up_to_scale(est=ahead, gt=left) == 0.0
+    behind = Box([0, 0, -5], np.eye(3), [1, 1, 1])
+    assert box_iou_up_to_scale(est=behind, gt=ahead) == 0.0
+
+
+def test_box_iou_up_to_scale_around_the_camera_is_that_of_equal_volumes() -> None:
+    room = Box([0, 0, 0], np.eye(3), [2, 3, 4])
+    long = Box([0, 0, 0], np.eye(3), [1, 1, 8])
+    factors = np.exp(np.linspace(-2, 2, 4001))
+    best = max(box_iou(est=scaled_box(long, float(factor)), gt=room) for factor in factors)
+    assert box_iou_up_to_scale(est=long, gt=room) == pytest.approx(best, abs=1e-5)
+    assert box_iou_up_to_scale(est=scaled_box(room, 7), gt=room) == pytest.approx(1, abs=1e-9)
+
+
+@given(first=SEEDS, second=SEEDS)
+def test_translation_error_up_to_scale_is_the_distance_from_the_ray(
+    first: int, second: int
+) -> None:
+    est, gt = random_alignment(first), random_alignment(second)
+    found = translation_error_up_to_scale(est=est, gt=gt)
+    direction = est.translation / np.linalg.norm(est.translation)
+    assert found == pytest.approx(np.linalg.norm(np.cross(direction, gt.translation)), abs=1e-9)
+    nearer = Alignment(est.rotation, 0.3 * est.translation, est.scale)
+    assert translation_error_up_to_scale(est=nearer, gt=gt) == pytest.approx(found, abs=1e-9)
+    turned_away = Alignment(est.rotation, -est.translation, est.scale)
+    whole = np.linalg.norm(gt.translation)
+    assert translation_error_up_to_scale(est=turned_away, gt=gt) == pytest.approx(whole)
 
 
 @given(first=SEEDS, second=SEEDS)

@@ -10,7 +10,7 @@ from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError
 from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
-from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
 from cadalign.evaluation.keypointnet.summary import TABLE
@@ -98,7 +98,7 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
     """Write ``results.csv`` with all rows, the seed and the seconds."""
-    names = [name for name, _ in COLUMNS]
+    names = run.results.column_names
     seconds = ["" if time != time else time for time in run.cells["seconds"].tolist()]
     rows = [
         [*(row[name] for name in names), run.config["seed"], time]

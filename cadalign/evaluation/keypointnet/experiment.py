@@ -13,6 +13,9 @@ rotation_error_deg
     [degrees]
 translation_error
     [diagonals of the model's bounding box]
+translation_error_up_to_scale
+    The same after the estimate was scaled about the camera centre, of which one image does not tell
+    the distance; empty in earlier runs.
 scale_y_error, scale_z_error
     Relative errors, fractions.
 box_iou
@@ -58,6 +61,7 @@ from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import translation_error_up_to_scale
 from cadalign.geometry.projection import perspective
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
@@ -69,7 +73,10 @@ COLUMNS: Columns = (
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
     *((f"sym_{name}", float) for name in _POSE_ERRORS),
+    ("translation_error_up_to_scale", float),
 )
+REQUIRED_COLUMNS: Columns = COLUMNS[:-1]
+"""Those that all runs have; earlier ones lack the last."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +216,10 @@ class KeypointNetExperiment:
                 **_facts(task, instance),
                 **metrics,
                 "rms_px": _rms(instance, alignment),
+                "translation_error_up_to_scale": translation_error_up_to_scale(
+                    est=alignment, gt=instance.gt
+                )
+                / instance.diagonal,
                 **{f"sym_{name}": aware[name] for name in _POSE_ERRORS},
             },
         )

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import REQUIRED_COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.figures import draw_figures
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
@@ -59,7 +59,7 @@ def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
 
 ON_INSTANCES: dict[str, Any] = {
     "columns": HEADLINE,
-    "results": COLUMNS,
+    "results": REQUIRED_COLUMNS,
     "summarize": summarize,
     "lines": lines,
     "table": console_table,

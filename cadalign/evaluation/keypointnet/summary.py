@@ -19,14 +19,18 @@ from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of, where
 
-MEDIANS = tuple(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS)
+MEDIANS = (
+    *(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS),
+    metrics.TRANSLATION_UP_TO_SCALE.key,
+)
 TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
 )
 """Columns of the plain medians."""
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, *TABLE, metrics.SYM_ROTATION),
+    *(metrics.INSTANCES, metrics.FAILED, *TABLE, metrics.TRANSLATION_UP_TO_SCALE),
+    metrics.SYM_ROTATION,
     *(metrics.SUCCESS_5, metrics.SUCCESS_10, metrics.OVER_BOUND),
 )
 
@@ -83,7 +87,7 @@ def _summarize_method(category: str, method: str, cells: Cells, bound: float) ->
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
     count = int(chosen.sum())
-    medians = {name: median_of(solved[name]) for name in MEDIANS}
+    medians = {name: median_of(solved[name]) for name in MEDIANS if name in solved}
     values = {
         "instances": count,
         "failed": count - len(solved["method"]),

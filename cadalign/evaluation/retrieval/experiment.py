@@ -23,6 +23,9 @@ shape_distance
     another category.
 box_iou
     Of its box with the true model's, both posed and stretched; empty for a model without volume.
+box_iou_up_to_scale
+    The same after its box was scaled about the camera centre: one image does not tell the size of
+    an object that is not in the library.
 rotation_error_deg
     [degrees]
 """
@@ -41,7 +44,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.outcome import FAILED, Outcome, overlap, reason_of
+from cadalign.evaluation.outcome import FAILED, Outcome, overlap, overlap_up_to_scale, reason_of
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -74,8 +77,12 @@ COLUMNS: Columns = (
     *(*_NAMES, ("status", str), ("reason", str), ("alike", int), ("rank", int)),
     *(("matched_category", str), ("matched_id", str), ("score", float), ("shared", int)),
     *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
-    ("rotation_error_deg", float),
+    *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
+REQUIRED_COLUMNS: Columns = tuple(
+    column for column in COLUMNS if column[0] != "box_iou_up_to_scale"
+)
+"""Those that all runs have; earlier ones lack the others."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +184,7 @@ def match_values(
     stretch; ``alike`` are the models that count as the true one.
     """
     first = matches[0]
+    boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
     ranks = [
         place
         for place, match in enumerate(matches, start=1)
@@ -191,7 +199,8 @@ def match_values(
         "shared": first.shared,
         "rms_px": first.rms,
         "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
-        "box_iou": overlap(est=first.box, gt=Box.from_model(gt.bounds, placed)),
+        "box_iou": overlap(**boxes),
+        "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
         "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
     }
 

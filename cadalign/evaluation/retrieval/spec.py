@@ -6,7 +6,7 @@ from dataclasses import asdict
 from functools import partial
 
 from cadalign.evaluation.metrics import QUERIES
-from cadalign.evaluation.retrieval.experiment import COLUMNS, RetrievalExperiment
+from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, RetrievalExperiment
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.summary import HEADLINE, console_table, lines, plots, summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, retrieval_tasks
@@ -59,7 +59,7 @@ SPEC = Spec(
     options=RetrievalRunOptions,
     plan=plan,
     columns=HEADLINE,
-    results=COLUMNS,
+    results=REQUIRED_COLUMNS,
     summarize=summarize,
     lines=lines,
     table=console_table,

@@ -5,8 +5,9 @@ keypoints; ``failed``, those without a match; ``rank_1`` and ``rank_5``, the sha
 with the true model, or one that counts as it, first or among the first 5; ``reciprocal_rank``, the
 mean of one over the rank, 0 beyond 50 (these three are NaN in the leave-out protocol); ``score``,
 the mean probability of the best match, which is the rank-1 rate where it is calibrated; of the best
-match the medians ``shape_distance``, ``box_iou``, ``rotation_error_deg`` and the mean
-``mean_box_iou``; ``milliseconds``, the median time of a query on one core.
+match the medians ``shape_distance``, ``box_iou``, ``box_iou_up_to_scale`` (NaN in runs that have
+none), ``rotation_error_deg`` and the mean ``mean_box_iou``; ``milliseconds``, the median time of a
+query on one core.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, med
 
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
-    *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.MATCH_ROTATION),
-    metrics.QUERY_MILLISECONDS,
+    *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
 )
 _KEYPOINTS = replace(metrics.KEYPOINTS, label="keypoints in the image", log=False)
 _PLOTS = (
@@ -67,8 +68,8 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """Rates and medians over all categories for the console."""
     shown = (
         *(metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK, metrics.SCORE),
-        *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.MATCH_ROTATION),
-        metrics.QUERY_MILLISECONDS,
+        *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+        *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
     )
     return ConsoleTable(
         title="Rates over the queries, medians of the best match",
@@ -142,6 +143,7 @@ def _summarize(
     made = chosen & (cells["status"] != NO_VIEW)
     queries = int(made.sum())
     ranks = cells["rank"][made].astype(float)  # NaN beyond 50
+    up_to_scale = cells.get("box_iou_up_to_scale", np.full(len(solved), np.nan))
     ranked = queries and protocol == LEAVE_IN
     values = {
         "queries": queries,
@@ -152,6 +154,7 @@ def _summarize(
         "score": mean_of(cells["score"][solved]),
         "shape_distance": median_of(cells["shape_distance"][solved]),
         "box_iou": median_of(cells["box_iou"][solved]),
+        "box_iou_up_to_scale": median_of(up_to_scale[solved]),
         "mean_box_iou": mean_of(cells["box_iou"][solved]),
         "rotation_error_deg": median_of(cells["rotation_error_deg"][solved]),
         "milliseconds": median_of(1e3 * cells["seconds"][solved]),

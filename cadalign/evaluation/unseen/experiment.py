@@ -7,15 +7,21 @@ keypoints
     Number of keypoints that were given.
 rotation_error_deg
     [degrees]
+best_rotation_error_deg
+    The least of the estimate and its alternatives, which the keypoints cannot tell apart [degrees].
 translation_error, translation_error_up_to_scale
-    [diagonals of the object's bounding box]; the second after the estimate was scaled about the
-    camera centre, since one image does not tell an object's size.
+    Of the centres of the boxes, since models differ in the place of their origin [diagonals of the
+    object's bounding box]; the second after the estimate was scaled about the camera centre, since
+    one image does not tell an object's size.
 box_iou, box_iou_up_to_scale
-    Of the box of the object's keypoints with the estimated one, the second likewise; empty for an
-    object without volume.
+    Of the boxes that the object's keypoints span, in truth and as estimated, the second likewise;
+    empty for an object without volume.
+stated_box_iou_up_to_scale
+    The same of the estimate's own box, which also holds keypoints that the object may lack.
 keypoint_error
-    Root mean square distance, in the model's frame, of all keypoints of the object that the method
-    estimates, also of those not given, from the true ones [diagonals].
+    Root mean square distance of all keypoints of the object that the method estimates, also of
+    those not given, from the true ones, after the estimate was scaled about the camera centre for
+    it to be least [diagonals].
 rotation_level, stretch_level
     Probability that the method gives the smallest region that holds the truth, about its estimate:
     of a chi-square of 3 for the rotation, and of 2 for the ratios of the box's lengths, which are
@@ -36,7 +42,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.arrays import IntArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale, reason_of
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -63,9 +69,10 @@ from cadalign.shapes.model import ShapeModel
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
     *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
-    *(("rotation_error_deg", float), ("translation_error", float)),
-    *(("translation_error_up_to_scale", float), ("box_iou", float)),
-    *(("box_iou_up_to_scale", float), ("keypoint_error", float)),
+    *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
+    *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
+    *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
+    ("keypoint_error", float),
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
@@ -126,26 +133,39 @@ class UnseenExperiment:
 
 def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
     est, gt = found.alignment, sighting.gt
-    boxes = {
-        "est": Box.from_model(found.bounds, est),
-        "gt": Box.from_model(sighting.bounds, gt),
-    }
     ids = sighting.all_ids.tolist()
     row_of = {name: row for row, name in enumerate(found.ids.tolist())}
     known = np.flatnonzero([name in row_of for name in ids])
     rows = np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
-    gaps = found.points_3d[rows] * est.scale - sighting.xyz[known]
+    own = found.points_3d[rows]
+    box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
+    gt_box = Box.from_model(sighting.bounds, gt)
+    boxes = {"est": box, "gt": gt_box}
+    centres = {
+        "est": Alignment(est.rotation, box.center, np.ones(3)),
+        "gt": Alignment(gt.rotation, gt_box.center, np.ones(3)),
+    }
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "translation_error": translation_error(est=est, gt=gt),
-        "translation_error_up_to_scale": translation_error_up_to_scale(est=est, gt=gt),
+        "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in found.poses),
+        "translation_error": translation_error(**centres),
+        "translation_error_up_to_scale": translation_error_up_to_scale(**centres),
         "box_iou": overlap(**boxes),
         "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-        "keypoint_error": float(np.sqrt((gaps**2).sum(axis=1).mean())),
+        "stated_box_iou_up_to_scale": overlap_up_to_scale(
+            est=Box.from_model(found.bounds, est), gt=gt_box
+        ),
+        "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(sighting.xyz[known])),
     }
     if found.result is not None:
         values |= _coverage(found.result, sighting, known, rows)
     return values
+
+
+def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
+    """Root mean square distance of points (n, 3), the estimated ones scaled about the origin."""
+    factor = (est * gt).sum() / (est * est).sum()
+    return float(np.sqrt(((factor * est - gt) ** 2).sum(axis=1).mean()))
 
 
 def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:

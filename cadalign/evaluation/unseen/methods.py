@@ -60,6 +60,12 @@ class ShapeEstimate:
     points_3d: FloatArray
     result: AlignResult | None = None
 
+    @property
+    def poses(self) -> tuple[Alignment, ...]:
+        """The alignment, and the alternatives to it."""
+        others = () if self.result is None else self.result.alternatives
+        return (self.alignment, *(other.alignment for other in others))
+
 
 def estimate_shape(
     method: str, task: UnseenTask, sighting: Sighting, learned: Learned, options: UnseenOptions

@@ -10,7 +10,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec, on_datasets
-from cadalign.evaluation.unseen.experiment import UnseenExperiment
+from cadalign.evaluation.unseen.experiment import COLUMNS, UnseenExperiment
 from cadalign.evaluation.unseen.figures import plots
 from cadalign.evaluation.unseen.learned import learn
 from cadalign.evaluation.unseen.options import UnseenOptions
@@ -50,6 +50,7 @@ def _describe(run: Run) -> str:
 SPEC = Spec(
     options=UnseenOptions,
     plan=plan,
+    results=COLUMNS,
     columns=HEADLINE,
     summarize=summarize,
     table=console_table,

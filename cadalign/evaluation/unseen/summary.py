@@ -30,8 +30,10 @@ from cadalign.evaluation.summary import (
 )
 
 _MEDIANS = (
-    *(metrics.ROTATION, metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
-    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.KEYPOINT_ERROR),
+    *(metrics.ROTATION, metrics.BEST_ROTATION),
+    *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
+    *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE, metrics.STATED_BOX_IOU_UP_TO_SCALE),
+    metrics.KEYPOINT_ERROR,
 )
 _COVERAGE = (
     *(metrics.ROTATION_IN_68, metrics.ROTATION_IN_95),

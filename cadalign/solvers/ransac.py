@@ -41,6 +41,7 @@ from cadalign.solvers.sampling import (
 
 _FEW_POINTS = 24  # so few are always all looked at
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
+_LEAST_SUPPORT = 0.03  # share of the points that a hypothesis is expected to fit, at least
 _REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
@@ -211,9 +212,11 @@ def _score_pose(
     so far are much likelier under a wrong model than under one as good as the best.
     """
     n = order.shape[0]
-    few = n <= _FEW_POINTS or inlier_ratio <= 1.5 * random_support
-    miss = 1.0 if few else (1.0 - random_support) / (1.0 - min(inlier_ratio, 0.99))
-    hit = 1.0 if few else random_support / inlier_ratio
+    few = n <= _FEW_POINTS
+    # Before anything good is found, a hypothesis must look better than chance.
+    sought = min(max(inlier_ratio, _LEAST_SUPPORT, 1.5 * random_support), 0.99)
+    miss = 1.0 if few else (1.0 - random_support) / (1.0 - sought)
+    hit = 1.0 if few else random_support / sought
     scalars = scalars_of(pose)
     score = 0.0
     support = 0

@@ -17,12 +17,14 @@ from support.refusals import refusal_line
 
 import cadalign
 from cadalign.cli import main
+from cadalign.errors import DataError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.options import SweepOptions
 
 SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))
@@ -288,3 +290,11 @@ def test_records_that_are_no_objects_are_refused(
     assert len(line) < 600
     (run / "exhibits.parquet").unlink()
     assert main(["report", str(run), *assets]) == 0
+
+
+def test_column_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "results.parquet"
+    pq.write_table(pa.table({"rotation": [1.0]}), path)
+    path.write_bytes(path.read_bytes().replace(b"rotation", b"r\xfftation"))
+    with pytest.raises(DataError, match="not a table that can be read"):
+        read_table(path)

@@ -50,7 +50,10 @@ def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
     """Read a Parquet file; ``fix`` is what errors advise."""
     with _reading(path, fix):
         # Threads would gain nothing here and cost memory for each.
-        return pq.read_table(path, use_threads=False)
+        table = pq.read_table(path, use_threads=False)
+        str(table.schema)  # names that are no text are noticed when they are looked at
+        table.validate(full=True)
+        return table
 
 
 def uncompressed_bytes(path: Path, *, fix: str) -> int:
@@ -65,7 +68,7 @@ def uncompressed_bytes(path: Path, *, fix: str) -> int:
 def _reading(path: Path, fix: str) -> Iterator[None]:
     try:
         yield
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, UnicodeError, pa.ArrowException) as error:
         reason = " ".join(str(error).split())[:200]
         what = f"not a table that can be read ({reason})"
         raise DataError(what, where=str(path), fix=fix) from None

@@ -70,7 +70,7 @@ def align(
     >>> from cadalign import Alignment, Camera
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-    >>> truth = Alignment(np.diag([1.0, -1.0, -1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], np.ones(3))
     >>> photo = camera.project(truth.apply(corners * [1.0, 1.1, 0.95]))
     >>> result = align(Model(points_3d=corners, shape_sigma=0.05), View(camera, photo))
     >>> result.points_3d.shape, result.warnings

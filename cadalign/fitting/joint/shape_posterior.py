@@ -72,7 +72,7 @@ def shape_posterior(
     >>> corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
     >>> model = ShapeModel.from_basis(corners, [corners * [1, 0, 1]], [0.2], residual_sigma=1e-3)
     >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-    >>> wide = Alignment(np.diag([1.0, -1.0, -1.0]), [0, 0, 9], [1.2, 1, 1.2])
+    >>> wide = Alignment(np.diag([-1.0, -1.0, 1.0]), [0, 0, 9], [1.2, 1, 1.2])
     >>> view = View(camera, camera.project(wide.apply(corners[4:])), ids=[4, 5, 6, 7])
     >>> posterior = shape_posterior(align(model, view), view).shapes
     >>> posterior.means.reshape(10, 3)[0].round(2).tolist()

@@ -19,6 +19,7 @@ from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.fitting.noise import check_sigmas
 from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 from cadalign.fitting.problems import Problems, each_of, pack_many, pack_one
 from cadalign.fitting.result import Alternative, FitResult, FitStats
@@ -305,6 +306,7 @@ def _fit_robustly(
             where="method",
             fix="leave it at 'optimal'; RansacOptions(minimal=...) names the minimal solver",
         )
+    check_sigmas([options.sigma], problems.counts)
     consensus = find_consensus(problems, options, ransac, confidences)
     if not ransac.refine:
         return replace(

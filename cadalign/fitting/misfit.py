@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.options import FitOptions
 from cadalign.fitting.uncertainty import WEAK_SCALE, percent, uncertainty_of
@@ -95,7 +95,10 @@ def find_misfit(result: FitResult, options: FitOptions) -> Misfit | None:
     """
     if options.sigma is None:
         return None
-    tested = _Tested.of(result, options)
+    try:
+        tested = _Tested.of(result, options)
+    except InputError:  # a depth that rounds to zero has no projection
+        return None
     free_scale = _contradicting_scale(tested)
     if free_scale is not None:
         return Misfit(tested.chi_square, tested.redundancy, free_scale)

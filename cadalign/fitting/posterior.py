@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import InputError
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.problems import distinct_rows
 from cadalign.geometry.alignment import Alignment
@@ -55,7 +56,10 @@ def posterior_covariance(result: FitResult, options: FitOptions) -> FloatArray:
     first = _with_noise_times(widening, result.covariance, options)
     if len(points) > MOST_POINTS:
         return first
-    sampled = _sample(result, first, Likelihood.of(result, options), widening)
+    try:
+        sampled = _sample(result, first, Likelihood.of(result, options), widening)
+    except (np.linalg.LinAlgError, InputError):  # coordinates come near the range of numbers
+        return first
     return first if sampled is None else sampled
 
 
@@ -151,7 +155,11 @@ def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptio
     free = np.ix_(options.estimated_unknowns, options.estimated_unknowns)
     prior = np.diag(priors)[free]
     widened = np.zeros_like(covariance)
-    widened[free] = np.linalg.inv((np.linalg.inv(covariance[free]) - prior) / widening + prior)
+    try:
+        of_keypoints = np.linalg.inv(covariance[free]) - prior
+        widened[free] = np.linalg.inv(of_keypoints / widening + prior)
+    except np.linalg.LinAlgError:
+        return covariance * widening
     return widened
 
 
@@ -180,10 +188,7 @@ def _sample(
     rng = np.random.default_rng(_SEED)
     deviations, costs, weights = np.zeros((1, 9)), np.zeros(1), np.ones(1)
     for count in _DRAWS:
-        try:
-            factor = np.linalg.cholesky(proposal)
-        except np.linalg.LinAlgError:
-            return None
+        factor = np.linalg.cholesky(proposal)
         normal = rng.standard_normal((count, len(free)))
         draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
         steps = np.zeros((count, 9))

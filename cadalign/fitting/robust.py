@@ -105,7 +105,7 @@ def find_consensus(
     residuals = residuals_of(problems, alignment, camera)
     errors = np.linalg.norm(residuals[kept], axis=1)
     extent = np.ptp(problems.points_2d, axis=0) + 2 * ransac.max_reproj_error
-    area = min(float(np.prod(extent)), float(camera.width * camera.height))
+    area = min(float(np.prod(extent)), float(camera.width) * float(camera.height))
     size += options.focal == "estimate"  # which half a keypoint determines
     if not np.isfinite(score) or _expected_by_chance(errors, count, size, area) > _CHANCE:
         raise NoConsensusError(

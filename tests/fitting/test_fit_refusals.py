@@ -11,6 +11,7 @@ from support.refusals import refusal
 
 from cadalign import Camera, RansacOptions, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.evaluation.simulation.problems import simulate_problem
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
 METHODS = ["optimal", "aepnp", "aepnp-paper", "epnp"]
@@ -370,3 +371,19 @@ def test_numbers_beyond_the_range_give_a_rotation_or_a_clear_error(
         assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
         assert np.isfinite(result.alignment.translation).all()
         assert np.isfinite(result.rms)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "message"),
+    [
+        (np.ones(7), "sigma: shape (7,), expected (8)"),
+        (np.inf, "sigma: is inf"),
+        (np.ones((2, 2, 8)), "sigma: shape (2, 2, 8), expected (8, 2, 2)"),
+    ],
+)
+def test_sigma_of_an_unrefined_robust_search_is_checked(sigma: Any, message: str) -> None:
+    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
+    ransac = RansacOptions(refine=False)
+    with pytest.raises(InputError) as caught:
+        fit(problem.points_3d, problem.points_2d, problem.camera, sigma=sigma, ransac=ransac)
+    assert str(caught.value).startswith(message)

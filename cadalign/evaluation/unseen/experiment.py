@@ -169,7 +169,7 @@ def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
 
 
 def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:
-    """Where the truth lies in what the result states as probable; metrics by column.
+    """Place of the truth in the stated probabilities; metrics by column.
 
     ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the
     model's keypoints that they are.

@@ -1,4 +1,4 @@
-"""What is learned of the categories: shape models and a library, kept in a run's folder."""
+"""Things learned of the categories: shape models and a library, kept in a run's folder."""
 
 from __future__ import annotations
 

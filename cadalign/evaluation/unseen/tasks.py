@@ -92,7 +92,7 @@ class UnseenTasks(Sequence[UnseenTask]):
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What a view of an object shows, and the truth.
+    """Content of a view of an object, and the truth.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ def similar_model(
 
 
 def view_of(observation: Observation, model: Model | ShapeModel, *, sigma: Sigma) -> View:
-    """What an observation's image tells about a model.
+    """Evidence of an observation's image about a model.
 
     A learned shape's keypoints are found by semantic id or by name, as the shape has them.
 

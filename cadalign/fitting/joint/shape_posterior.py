@@ -29,7 +29,7 @@ _POSE = 6
 
 @dataclass(frozen=True, eq=False)
 class ShapePosterior:
-    """What one image and a shape model tell about an object's shape.
+    """Knowledge of an object's shape from one image and a shape model.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
-"""Array types, and checks of array arguments."""
+"""Array types, and checks of arguments."""
 
 from __future__ import annotations
 
 import math
+import os
 from typing import Any
 
 import numpy as np
@@ -115,6 +116,20 @@ def describe_non_finite(array: FloatArray) -> str:
     rows = np.flatnonzero(bad.reshape(len(array), -1).any(axis=1))
     listed = ", ".join(str(row) for row in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return f"NaN or infinite values in row{'s' if len(rows) > 1 else ''} {listed}"
+
+
+def worker_count(workers: Any) -> int:
+    """Number of workers that an argument ``workers`` asks for: all cores where it is -1.
+
+    Raises
+    ------
+    InputError
+        If it is no whole number, or neither positive nor -1.
+    """
+    if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
+        what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
+        raise InputError(what, where="workers")
+    return (os.cpu_count() or 1) if workers == -1 else int(workers)
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:

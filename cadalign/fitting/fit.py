@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
+from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.batch import BatchResult
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.noise import check_sigmas
@@ -224,12 +223,7 @@ def fit_batch(
     _check_ransac(ransac, confidences)
     if confidences is not None:
         confidences = each_of(confidences, "confidences", len(problems), "sets")
-    if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
-        what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
-        raise InputError(what, where="workers")
-    if workers == -1:
-        workers = os.cpu_count() or 1
-    bounds = np.linspace(0, len(problems), workers + 1).astype(int).tolist()
+    bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
     @np.errstate(all="ignore")  # holds for one thread only

@@ -12,7 +12,6 @@ the number of threads.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,8 +19,8 @@ from functools import partial
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import DegenerateError, InputError
+from cadalign.arrays import FloatArray, IntArray, worker_count
+from cadalign.errors import DegenerateError
 from cadalign.fitting.fit import fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -70,15 +69,12 @@ def rank(
     candidates: CandidateSet, observed: Observed, options: RetrievalOptions, workers: int
 ) -> Ranking:
     """Rank the models of a candidate set."""
-    if workers == -1:
-        workers = os.cpu_count() or 1
-    if workers < 1:
-        raise InputError(f"must be >= 1, or -1 for all cores, not {workers}", where="workers")
+    threads = worker_count(workers)
     found = _SearchState(candidates)
     if options.method == "epnp":
         _search_in_order(found, options, partial(_search_unstretched, candidates, observed))
         return found.ranking()
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         search = partial(_search_in_pieces, pool, observed.query, candidates.keypoints)
         effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
         _search_in_order(found, options, partial(search, effort))

@@ -9,8 +9,8 @@ from typing import cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.arrays import FloatArray, worker_count
+from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.fitting.joint.assemble import Minimum, assemble
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.pack import evidence_of
@@ -140,9 +140,7 @@ def align_batch(
     InputError
         If workers is invalid.
     """
-    if not isinstance(workers, int | np.integer) or (workers < 1 and workers != -1):
-        what = f"must be >= 1, or -1 for all cores, not {quote(workers)}"
-        raise InputError(what, where="workers")
+    threads = worker_count(workers)
 
     def one(views: View | Sequence[View]) -> AlignResult | CadalignError:
         try:
@@ -150,9 +148,9 @@ def align_batch(
         except CadalignError as error:
             return error
 
-    if workers == 1:
+    if threads == 1:
         return [one(views) for views in objects]
-    with ThreadPoolExecutor(None if workers == -1 else int(workers)) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, objects))
 
 

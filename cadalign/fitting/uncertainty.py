@@ -13,8 +13,8 @@ WEAK_SCALE = 0.1
 """Relative standard deviation of a scale that is worth a warning."""
 _WEAK_FOCAL = 0.02
 _SHALLOW = 0.5  # differences of depth over the distance
-_WEAK_ROTATION_DEG = 10.0
-_WEAK_DISTANCE = 0.1  # standard deviation of the translation over its length
+WEAK_ROTATION_DEG = 10.0
+WEAK_DISTANCE = 0.1  # standard deviation of the translation over its length
 _THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
 _END_ON_DEG = 15.0
 
@@ -95,11 +95,11 @@ def warnings_of(
                 f"s_{'xyz'[axis]} is known only to +-{percent(relative)}: "
                 f"{_why_scale_is_weak(points_3d, alignment, axis)}"
             )
-    if std.rotation_deg > _WEAK_ROTATION_DEG:
+    if std.rotation_deg > WEAK_ROTATION_DEG:
         warnings.append(f"the rotation is known only to +-{std.rotation_deg:.2g} deg")
     distance = float(np.linalg.norm(alignment.translation))
     spread = float(np.linalg.norm(std.translation))
-    if spread > _WEAK_DISTANCE * distance:
+    if spread > WEAK_DISTANCE * distance:
         direction = "xyz"[int(np.argmax(std.translation))]
         share = f" ({percent(spread / distance)} of the distance)" if distance > 0 else ""
         warnings.append(

@@ -8,6 +8,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.fitting.fit import LEAST_LIKELIHOOD
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
 from cadalign.fitting.joint.result import AlignAlternative, AlignResult
@@ -20,7 +21,6 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.joint.search import joint_covariance
 
-_LEAST_LIKELIHOOD = 1e-3
 _SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
 
 
@@ -64,10 +64,11 @@ def assemble(
     likely = [
         _estimate(each, likelihood)
         for each, likelihood in zip(minima, likelihoods, strict=True)
-        if likelihood >= _LEAST_LIKELIHOOD
+        if likelihood >= LEAST_LIKELIHOOD
     ]
     best, minimum = likely[0], minima[0]
-    covariance, of_points, of_seen = _moments(likely)
+    steps = [_step(best, each) for each in likely]
+    covariance, of_points, of_seen = _moments(likely, steps)
     residuals = []
     for view, pose in zip(views, best.poses, strict=True):
         rows = prior.rows_of(view.keypoint_ids, "ids")
@@ -77,8 +78,8 @@ def assemble(
     stretch = np.where(prior.lengths > 0, stretch, 1.0)
     alternatives = tuple(
         AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
-        for each in likely[1:]
-        if _differs(each, best)
+        for each, step in zip(likely[1:], steps[1:], strict=True)
+        if _differs(step, best)
     )
     return AlignResult(
         alignment=best.poses[0],
@@ -95,7 +96,7 @@ def assemble(
         component=minimum.component,
         model=model,
         alternatives=alternatives,
-        warnings=warnings_of(minimum.evidence, minimum.cost, best.poses, stretch, covariance),
+        warnings=warnings_of(minimum.evidence, minimum.cost, best.poses, covariance),
         stats=stats,
     )
 
@@ -120,15 +121,19 @@ def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
     )
 
 
-def _moments(likely: Sequence[_Estimate]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second moments (9, 9) and twice (m + 2, 3, 3) of a mixture of estimates about the first."""
+def _moments(
+    likely: Sequence[_Estimate], steps: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Second moments (9, 9) and twice (m + 2, 3, 3) of a mixture of estimates about the first.
+
+    ``steps`` lead from the first to each.
+    """
     total = sum(each.likelihood for each in likely)
     best = likely[0]
     covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
     of_seen = np.zeros_like(best.of_seen)
-    for each in likely:
+    for each, step in zip(likely, steps, strict=True):
         weight = each.likelihood / total
-        step = _step(best, each)
         covariance += weight * (each.covariance + np.outer(step, step))
         moved = each.points * each.scale - best.points * best.scale
         of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
@@ -147,10 +152,10 @@ def _step(best: _Estimate, other: _Estimate) -> FloatArray:
     return np.concatenate([turn, second.translation - first.translation, logs])
 
 
-def _differs(other: _Estimate, best: _Estimate) -> bool:
-    """True for a pose that is not within the deviations of the best one."""
-    step = _step(best, other)[:3]
-    return bool(step @ np.linalg.pinv(best.covariance[:3, :3]) @ step > _SAME)
+def _differs(step: FloatArray, best: _Estimate) -> bool:
+    """True for a step that turns the best estimate by more than its deviations."""
+    turn = step[:3]
+    return bool(turn @ np.linalg.pinv(best.covariance[:3, :3]) @ turn > _SAME)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:

@@ -22,6 +22,9 @@ from cadalign.solvers.joint.evidence import (
 )
 
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+_NO_LENGTHS = Lengths(
+    np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
+)
 _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that views or depth determine
 _SAME_SCALE_SIGMA = 1e-4
 
@@ -45,7 +48,7 @@ def evidence_of(
         _sightings(prior, views, loss, loss_scale),
         _rig(views),
         _directions(prior, views),
-        Lengths(*_no_rows((0, 2)), np.empty(0), np.empty(0)),
+        _NO_LENGTHS,
         _scales(prior, views),
     )
 
@@ -138,7 +141,3 @@ def _directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
         np.array(numbers, dtype=np.int64),
         np.array(weight, dtype=np.float64),
     )
-
-
-def _no_rows(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    return np.empty(shape, dtype=np.int64), np.empty(shape[:1], dtype=np.int64)

@@ -12,7 +12,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.result import FitStats
-from cadalign.fitting.uncertainty import Uncertainty, uncertainty_of
+from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh
@@ -120,10 +120,10 @@ class AlignResult:
     @property
     def std(self) -> Uncertainty:
         """Standard deviations of rotation, translation and stretch."""
-        full = np.maximum(self.covariance.diagonal(), 0.0)
-        first = uncertainty_of(np.diag(full[:8]), "x")
-        x, y, z = np.sqrt(full[6:]).tolist()
-        return Uncertainty(first.rotation_deg, first.translation, (x, y, z), 0.0)
+        variance = np.maximum(self.covariance.diagonal(), 0.0)
+        tx, ty, tz, sx, sy, sz = np.sqrt(variance[3:]).tolist()
+        rotation_deg = float(np.degrees(np.sqrt(variance[:3].sum())))
+        return Uncertainty(rotation_deg, (tx, ty, tz), (sx, sy, sz), focal=0.0)
 
     @property
     def box(self) -> Box:

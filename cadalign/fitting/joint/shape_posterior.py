@@ -20,9 +20,11 @@ from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import LOSSES
+from cadalign.geometry.projection import perspective
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.evidence import loss_and_root
+from cadalign.solvers.projection import ray_derivatives
 
 _POSE = 6
 
@@ -115,17 +117,14 @@ def _linearised(
     whitening = np.zeros((len(names), 2, 2))
     whitening[:, 0, 0], whitening[:, 0, 1], whitening[:, 1, 1] = weights.T
     pose = result.alignment
-    turned = (result.points_3d[names] * pose.scale) @ pose.rotation.T
-    x, y, z = (turned + pose.translation).T
-    of_rays = np.zeros((len(names), 2, 3))
-    of_rays[:, 0, 0] = of_rays[:, 1, 1] = 1 / z
-    of_rays[:, 0, 2], of_rays[:, 1, 2] = -x / z**2, -y / z**2
-    errors = np.stack([x / z, y / z], axis=1) - rays[kept]
+    points = result.points_3d[names]
+    errors = perspective(pose.apply(points)) - rays[kept]
     residuals = np.einsum("nij,nj->ni", whitening, errors)
     squares = (residuals**2).sum(axis=1).tolist()
     roots = np.array([loss_and_root(loss, loss_scale, square)[1] for square in squares])
-    by_point = roots[:, None, None] * (whitening @ of_rays)
-    by_pose = np.concatenate([np.cross(turned[:, None], by_point), by_point], axis=2)
+    derivatives = ray_derivatives(points, pose.packed)[:, :, :_POSE]
+    by_pose = roots[:, None, None] * (whitening @ derivatives)
+    by_point = by_pose[:, :, 3:]  # a translation moves every point alike
     by_shape = np.zeros((len(names), 2, len(result.points_3d) + len(result.bounds), 3))
     by_shape[np.arange(len(names)), :, names] = by_point @ (pose.rotation * pose.scale)
     count = 2 * len(names)

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.fitting.uncertainty import WEAK_DISTANCE, WEAK_ROTATION_DEG, WEAK_SCALE
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.joint.evidence import Evidence
 
-_WEAK_ROTATION_DEG = 10.0
-_WEAK_LENGTH = 0.1
-_WEAK_DISTANCE = 0.1
 _LEAST_PROBABILITY = 0.005  # of residuals as large as these by chance
 
 
@@ -20,24 +18,23 @@ def warnings_of(
     evidence: Evidence,
     cost: float,
     poses: Sequence[Alignment],
-    stretch: FloatArray,
     covariance: FloatArray,
 ) -> tuple[str, ...]:
     """Warnings about rotation, lengths and distance, and about residuals beyond their sigma."""
     deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     warnings = []
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))
-    if rotation > _WEAK_ROTATION_DEG:
+    if rotation > WEAK_ROTATION_DEG:
         warnings.append(f"the rotation is known only to +-{rotation:.2g} deg")
     for axis in range(3):
-        if deviations[6 + axis] > _WEAK_LENGTH:
+        if deviations[6 + axis] > WEAK_SCALE:
             warnings.append(
                 f"the length along {'xyz'[axis]} is known only to "
                 f"+-{100 * deviations[6 + axis]:.0f} %"
             )
     distance = float(np.linalg.norm(poses[0].translation))
     spread = float(np.linalg.norm(deviations[3:6]))
-    if spread > _WEAK_DISTANCE * distance > 0:
+    if spread > WEAK_DISTANCE * distance > 0:
         warnings.append(f"the distance is known only to +-{100 * spread / distance:.0f} %")
     misfit = _misfit(evidence, cost)
     if misfit is not None:

@@ -8,7 +8,8 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
 from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
-from cadalign.solvers.linalg import cholesky, polish_rotation, solve_cholesky
+from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.unknowns import orthonormalize
 
 _FIRST_DAMPING = 1e-4
 _LARGEST_DAMPING = 1e12
@@ -129,7 +130,4 @@ def _copy_into(source: State, target: State) -> None:
     target.coefficients[:] = source.coefficients
     target.displacements[:] = source.displacements
     for p in range(target.poses.shape[0]):
-        rotation = target.poses[p, :9].copy().reshape(3, 3)
-        polish_rotation(rotation.copy(), rotation)
-        for k in range(9):
-            target.poses[p, k] = rotation[k // 3, k % 3]
+        orthonormalize(target.poses[p])

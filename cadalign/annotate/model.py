@@ -14,7 +14,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import simplify
 from cadalign.render.drawing.color import bytes_from_linear
-from cadalign.render.raycast.caster import FaceArray
+from cadalign.geometry.raycaster import FaceArray
 from cadalign.render.scene import Scene
 
 MOST_FACES = 150_000  # that are displayed

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
-from cadalign.render.raycast.caster import FaceArray
+from cadalign.geometry.raycaster import FaceArray
 
 
 class Surface:

@@ -64,6 +64,13 @@ class EmbreeEngine:
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
 
+def face_normals(triangles: FloatArray) -> FloatArray:
+    """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for one without area."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.where(length > 0, length, 1.0))
+
+
 class RayCaster:
     """A bounding volume hierarchy over a mesh, then only read; safe in several threads."""
 

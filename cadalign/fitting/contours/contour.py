@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 
 SPACING = 2.0
 """Distance of neighbouring samples along the contour [px]."""
@@ -19,6 +20,9 @@ _LEAST_AREA = 0.003  # of a piece or hole, relative to the largest piece
 _LEAST_PIXELS = 12
 _REACH = 2.0  # [px], between a boundary pixel and the level line
 _STEP = 0.25
+
+
+Image = npt.NDArray[np.float32]
 
 
 class Contour(NamedTuple):
@@ -33,8 +37,12 @@ class Contour(NamedTuple):
     normals: FloatArray
     curve: IntArray
 
+    def taken(self, chosen: BoolArray | IntArray) -> Contour:
+        """The samples that a mask or numbers choose."""
+        return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])
 
-def contour_of(probability: FloatArray) -> Contour:
+
+def contour_of(probability: FloatArray | BoolArray) -> Contour:
     """Samples of the contour of a mask (h, w) of probabilities.
 
     The contour is the level line 0.5 of the smoothed mask: smoothing takes the stairs of a binary
@@ -44,8 +52,8 @@ def contour_of(probability: FloatArray) -> Contour:
     image = np.ascontiguousarray(probability, dtype=np.float32)
     level = _blurred(image, _SMOOTHING)
     soft = _blurred(image, _NORMAL_SMOOTHING)
-    slope_x = cv2.Sobel(soft, cv2.CV_32F, 1, 0, ksize=3)
-    slope_y = cv2.Sobel(soft, cv2.CV_32F, 0, 1, ksize=3)
+    slope_x: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 0, ksize=3), dtype=np.float32)
+    slope_y: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 0, 1, ksize=3), dtype=np.float32)
     points, normals, curves = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0, dtype=int)]
     count = 0
     for chain in _chains(level):
@@ -58,11 +66,13 @@ def contour_of(probability: FloatArray) -> Contour:
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
 
 
-def _blurred(image: FloatArray, sigma: float) -> FloatArray:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))
+def _blurred(image: Image, sigma: float) -> Image:
+    return np.asarray(
+        cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
+    )
 
 
-def _chains(level: FloatArray) -> list[FloatArray]:
+def _chains(level: Image) -> list[FloatArray]:
     """Boundary pixels (n, 2) of all pieces and holes that are large enough, in their order."""
     found, _ = cv2.findContours(
         (level >= 0.5).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
@@ -79,7 +89,7 @@ def _chains(level: FloatArray) -> list[FloatArray]:
 
 
 def _on_level(
-    chain: FloatArray, level: FloatArray, slope_x: FloatArray, slope_y: FloatArray
+    chain: FloatArray, level: Image, slope_x: Image, slope_y: Image
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) of the level line next to boundary pixels (n, 2), and outward normals."""
     normals = -np.column_stack([_sampled(slope_x, chain), _sampled(slope_y, chain)])
@@ -100,7 +110,7 @@ def _on_level(
     return points, outwards
 
 
-def _sampled(image: FloatArray, points: FloatArray) -> FloatArray:
+def _sampled(image: Image, points: FloatArray) -> FloatArray:
     """Values (n,) of an image at points (n, 2), bilinear."""
     single = points.astype(np.float32)
     blocks = [
@@ -140,11 +150,11 @@ def _inside(
     if not len(points):
         return []
     size = np.array([shape[1], shape[0]]) - 1
-    kept = ((points > _BORDER) & (points < size - _BORDER)).all(axis=1)
+    off_border = (points > _BORDER) & (points < size - _BORDER)
+    kept: BoolArray = np.asarray(off_border.all(axis=1))
     if kept.all():
         return [(points, normals)]
     shift = -int(np.argmin(kept))  # begin outside, so that no stretch is cut in two
-    points, normals, kept = (np.roll(each, shift, axis=0) for each in (points, normals, kept))
-    ends = np.flatnonzero(np.diff(kept.astype(int))) + 1
-    parts = np.split(np.arange(len(kept)), ends)
-    return [(points[part], normals[part]) for part in parts if kept[part[0]]]
+    order = np.roll(np.arange(len(points)), shift)
+    ends = np.flatnonzero(np.diff(kept[order].astype(int))) + 1
+    return [(points[part], normals[part]) for part in np.split(order, ends) if kept[part[0]]]

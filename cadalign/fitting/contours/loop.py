@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.fitting.contours.contour import Contour
 from cadalign.fitting.contours.deviation import correlation_length, robust_deviation
 from cadalign.fitting.contours.rims import Rims, find_rims
 from cadalign.fitting.contours.stack import RimRows, with_rims, with_room, without_rims
-from cadalign.fitting.contours.surface import Surface
+from cadalign.fitting.contours.surface import PosedSurface, Surface
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY
@@ -84,12 +84,10 @@ class Settled(NamedTuple):
     rounds: int
 
 
-def contour_view(
-    image: int, camera: Camera, contour: Contour, sigma: float | None
-) -> ViewContour:
+def contour_view(image: int, camera: Camera, contour: Contour, sigma: float | None) -> ViewContour:
     """The contour with what the sightings need of the camera; samples outside its lens dropped."""
     rays, valid = camera.normalize_where_valid(contour.points)
-    kept = Contour(*(each[valid] for each in contour))
+    kept = contour.taken(valid)
     rays = rays[valid]
     slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays)
     across = np.einsum("ni,nij->nj", kept.normals, slopes)
@@ -110,16 +108,15 @@ def settle(
     """
     offsets = np.zeros(len(views))
     reach = _FIRST_REACH if noises is None else _reach_of(max(noise.sigma for noise in noises))
-    current = noises or [
-        Noise(view.sigma or reach / 3, 1.0, _FIRST_OFFSET) for view in views
-    ]
+    current = noises or [Noise(view.sigma or reach / 3, 1.0, _FIRST_OFFSET) for view in views]
     fine = 0
     last: list[Rims] = []
     for number in range(_COARSE_ROUNDS):
-        caster = surface.caster(evidence, state)
+        posed = surface.at(evidence.shape, state)
         poses = poses_of(evidence, state)
         rims = [
-            find_rims(caster, view.camera, poses[view.image], view.contour, reach) for view in views
+            find_rims(posed.caster, view.camera, poses[view.image], view.contour, reach)
+            for view in views
         ]
         moved = _change(last, rims)
         residuals = [
@@ -132,13 +129,11 @@ def settle(
             before = current
             current = [
                 _noise(view, each, residual, noise, correlated=fine > 0)
-                for view, each, residual, noise in zip(
-                    views, rims, residuals, current, strict=True
-                )
+                for view, each, residual, noise in zip(views, rims, residuals, current, strict=True)
             ]
             reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
         rows = [
-            _rows(evidence, state, view, each, noise, surface, poses[view.image])
+            _rows(view, each, noise, posed, poses[view.image])
             for view, each, noise in zip(views, rims, current, strict=True)
         ]
         if not any(len(each.mean) for each in rows):
@@ -226,17 +221,11 @@ def _relearned(
 
 
 def _rows(
-    evidence: Evidence,
-    state: State,
-    view: ViewContour,
-    rims: Rims,
-    noise: Noise,
-    surface: Surface,
-    pose: Alignment,
+    view: ViewContour, rims: Rims, noise: Noise, surface: PosedSurface, pose: Alignment
 ) -> RimRows:
     kept = np.flatnonzero(rims.found)
     points = rims.points[kept]
-    mean, modes = surface.rows(evidence, state, points, rims.face[kept])
+    mean, modes = surface.rows(points, rims.face[kept])
     count = len(kept)
     across = view.across[kept]
     depth = pose.apply(points)[:, 2]

@@ -11,8 +11,7 @@ from cadalign.fitting.contours.contour import SPACING, Contour
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays
-from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.raycaster import RayCaster
 
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _PRECISION = 0.01  # [px], of a rim
@@ -32,11 +31,6 @@ class Rims(NamedTuple):
     face: IntArray
 
 
-def caster_of(mesh: Mesh) -> RayCaster:
-    """The ray hierarchy of a mesh."""
-    return RayCaster(mesh, face_normals(mesh.triangles), engine=EmbreeEngine)
-
-
 def find_rims(
     caster: RayCaster, camera: Camera, pose: Alignment, contour: Contour, reach: float
 ) -> Rims:
@@ -48,44 +42,60 @@ def find_rims(
     count = len(contour.points)
     intervals = 2 * int(np.ceil(reach / _LONGEST_STEP))
     steps = np.linspace(-reach, reach, intervals + 1)
-    covered = _cast(caster, camera, pose, contour, steps[:, None] + np.zeros(count))[0] >= 0
+    sight = _Sight(caster, camera, pose)
+    covered = sight.covered(contour, steps[:, None] + np.zeros(count))
     leaves = covered[:-1] & ~covered[1:]
     middle = (steps[:-1] + steps[1:]) / 2
     distance = np.where(leaves, np.abs(middle)[:, None], np.inf)
     nearest = distance.argmin(axis=0)
     found = np.isfinite(distance[nearest, np.arange(count)])
     rows = np.flatnonzero(found)
-    some = Contour(*(each[rows] for each in contour))
+    some = contour.taken(rows)
     inner, outer = steps[nearest[rows]], steps[nearest[rows] + 1]
     for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
         half = (inner + outer) / 2
-        inside = _cast(caster, camera, pose, some, half[None])[0][0] >= 0
+        inside = sight.covered(some, half)
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)
-    face, points = _cast(caster, camera, pose, some, inner[None])
-    hit = face[0] >= 0  # a ray beside the bisection's may slip through
+    face, points = sight.hits(some, inner)
+    hit = face >= 0  # a ray beside the bisection's may slip through
     found[rows[~hit]] = False
     rows = rows[hit]
     offset, surface = np.zeros(count), np.zeros((count, 3))
     faces = np.full(count, -1)
     offset[rows] = ((inner + outer) / 2)[hit]
-    surface[rows] = points[0][hit]
-    faces[rows] = face[0][hit]
+    surface[rows] = points[hit]
+    faces[rows] = face[hit]
     found &= ~_is_steep(contour, found, offset)
     return Rims(found, offset, surface, faces)
 
 
-def _cast(
-    caster: RayCaster, camera: Camera, pose: Alignment, contour: Contour, places: FloatArray
-) -> tuple[IntArray, FloatArray]:
-    """Triangles (k, S), -1 for none, and points (k, S, 3) at ``places`` (k, S) on the normals."""
-    pixels = contour.points + places[:, :, None] * contour.normals
-    rays, valid = camera.normalize_where_valid(pixels.reshape(-1, 2))
-    origin, model_from_ray = model_rays(pose)
-    directions = rays @ model_from_ray[:, :2].T + model_from_ray[:, 2]
-    face, depth = caster.first_hits(origin, directions)
-    face = np.where(valid & (depth > 0), face, -1)
-    points = origin + np.where(face >= 0, depth, 0.0)[:, None] * directions
-    return face.reshape(places.shape), points.reshape(*places.shape, 3)
+class _Sight(NamedTuple):
+    """A posed surface as a camera sees it."""
+
+    caster: RayCaster
+    camera: Camera
+    pose: Alignment
+
+    def covered(self, contour: Contour, places: FloatArray) -> BoolArray:
+        """Tell if the object is seen at ``places`` (S,) or (k, S) on the contour's normals."""
+        origin, directions, valid = self._directions(contour, places)
+        return np.asarray((self.caster.covered(origin, directions) & valid).reshape(places.shape))
+
+    def hits(self, contour: Contour, places: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangles (S,), -1 for none, and points (S, 3) seen at ``places`` (S,)."""
+        origin, directions, valid = self._directions(contour, places)
+        face, depth = self.caster.first_hits(origin, directions)
+        seen = valid & (face >= 0)
+        points = origin + np.where(seen, depth, 0.0)[:, None] * directions
+        return np.where(seen, face, -1), points
+
+    def _directions(
+        self, contour: Contour, places: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        pixels = contour.points + places[..., None] * contour.normals
+        rays, valid = self.camera.normalize_where_valid(pixels.reshape(-1, 2))
+        origin, model_from_ray = model_rays(self.pose)
+        return origin, rays @ model_from_ray[:, :2].T + model_from_ray[:, 2], valid
 
 
 def _is_steep(contour: Contour, found: BoolArray, offset: FloatArray) -> BoolArray:

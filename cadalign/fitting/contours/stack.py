@@ -43,11 +43,13 @@ def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Eviden
     start = keypoints
     for number, each in enumerate(rims):
         end = start + counts[number]
-        modes[:own, start:end] = each.modes
+        modes[: len(each.modes), start:end] = each.modes  # none for a rigid surface
         modes[own + number, start:end] = each.offset_mode
         start = end
     extended = Shape(
-        np.concatenate([shape.mean[:keypoints], *(each.mean for each in rims), shape.mean[keypoints:]]),
+        np.concatenate(
+            [shape.mean[:keypoints], *(each.mean for each in rims), shape.mean[keypoints:]]
+        ),
         modes,
         np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]),
     )

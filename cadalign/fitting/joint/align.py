@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -119,7 +120,13 @@ def align(
         )
     minima.sort(key=lambda minimum: minimum.score)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    return assemble(model, prior, given, minima, stats)
+    if all(view.mask is None for view in given):
+        return assemble(model, prior, given, minima, stats)
+    from cadalign.fitting.contours.fit import fit_masks  # with OpenCV and embree
+
+    masks = fit_masks(model, prior, given, minima)
+    stats = replace(stats, seconds=time.perf_counter() - start)
+    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
 
 
 def align_batch(
@@ -216,6 +223,6 @@ def _refuse_unsupported(views: Sequence[View], size: Size | None, init: Alignmen
     if size is not None or init is not None:
         raise InputError("not supported yet", where="size" if init is None else "init")
     for number, view in enumerate(views):
-        for name in ("mask", "camera_height", "depth_image"):
+        for name in ("camera_height", "depth_image"):
             if getattr(view, name) is not None:
                 raise InputError("not supported yet", where=f"views[{number}].{name}")

@@ -88,7 +88,8 @@ def fit_masks(
     model, prior, views
         Those of `cadalign.align`; without a mask the minima stay as they are.
     minima : sequence of Minimum
-        Estimates without masks, the likeliest first, or starts with infinite ``cost``.
+        Estimates without masks, the likeliest first; their scores are infinite where nothing but
+        the masks determines the unknowns.
 
     Raises
     ------
@@ -113,16 +114,16 @@ def fit_masks(
     first = minima[0]
     points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
     surfaces = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
-    likely = [each for each in minima if each.score < first.score + _UNLIKELY][:_MOST_STARTS]
+    likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
     used, left_out, warnings = list(contours), [], []
     best: list[_Candidate] = []
     while used:
-        best = _settled(likely, keypoints, used, surfaces)
+        best = _settled(likely[:_MOST_STARTS], keypoints, used, surfaces)
         wrong = _contradicting(best, used)
         if wrong is None:
             break
         contour, reason = wrong
-        if len(used) == 1 and not np.isfinite(first.cost):
+        if len(used) == 1 and not np.isfinite(first.score):
             if not best:
                 raise _no_rim(contour)
             warnings.append(f"views[{contour.image}].mask: {reason}")
@@ -210,11 +211,11 @@ def _tension(candidate: _Candidate) -> str | None:
     from scipy.special import chdtri  # takes longer to import than all that is compiled
 
     start = candidate.start
-    if not np.isfinite(start.cost):
-        return None
     alone, joint = start.cost, _cost(start.evidence, candidate.settled.bare)
     equations = 2 * len(start.evidence.sightings.point)
     free = 6 * len(start.state.poses) + int(start.evidence.scales.free.sum())
+    if not equations:
+        return None
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
     unknowns = min(free + len(start.state.coefficients), equations)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.solvers.joint.evidence import Evidence, Lengths, Shape, Sightings, State
+from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State
 
 
 class RimRows(NamedTuple):
@@ -63,12 +63,17 @@ def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Eviden
         np.concatenate([old.loss, *(each.loss for each in rims)]),
         np.concatenate([old.loss_scale, *(each.loss_scale for each in rims)]),
     )
-    moved = np.where(lengths.points >= keypoints, lengths.points + total, lengths.points)
     return evidence._replace(
         shape=extended,
         sightings=sightings,
-        lengths=Lengths(moved, lengths.axis, lengths.value, lengths.weight),
+        lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
+        heights=evidence.heights._replace(point=_moved(evidence.heights.point, keypoints, total)),
     )
+
+
+def _moved(rows: IntArray, keypoints: int, total: int) -> IntArray:
+    """Numbers of points when others are put behind the keypoints."""
+    return np.where(rows >= keypoints, rows + total, rows)
 
 
 def with_room(state: State, keypoints: int, rims: list[RimRows], offsets: FloatArray) -> State:

@@ -128,12 +128,12 @@ def settle(
         if noises is None:
             before = current
             current = [
-                _noise(view, each, residual, noise, correlated=fine > 0)
+                noise_of(view, each, residual, noise, correlated=fine > 0)
                 for view, each, residual, noise in zip(views, rims, residuals, current, strict=True)
             ]
             reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
         rows = [
-            _rows(view, each, noise, posed, poses[view.image])
+            rim_rows(view, each, noise, posed, poses[view.image])
             for view, each, noise in zip(views, rims, current, strict=True)
         ]
         if not any(len(each.mean) for each in rows):
@@ -189,7 +189,7 @@ def _residuals(view: ViewContour, rims: Rims, offset: float) -> FloatArray:
     return np.where(rims.found, rims.offset + offset, np.nan)
 
 
-def _noise(
+def noise_of(
     view: ViewContour, rims: Rims, residuals: FloatArray, noise: Noise, *, correlated: bool
 ) -> Noise:
     """Deviation and correlation that the residuals show."""
@@ -220,9 +220,10 @@ def _relearned(
     return learned, np.array(coefficients)
 
 
-def _rows(
+def rim_rows(
     view: ViewContour, rims: Rims, noise: Noise, surface: PosedSurface, pose: Alignment
 ) -> RimRows:
+    """The rims that were found, in the form of the evidence."""
     kept = np.flatnonzero(rims.found)
     points = rims.points[kept]
     mean, modes = surface.rows(points, rims.face[kept])

@@ -35,7 +35,7 @@ from cadalign.render.views.camera_files import read_camera_views
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 MANY_DIGITS = "9" * 5000
-LONGEST_REFUSAL = 0.5  # seconds
+LONGEST_REFUSAL = 1.0  # seconds
 
 
 def gltf(**changes: Any) -> str:
@@ -112,8 +112,9 @@ def test_time_for_continued_lines_grows_with_the_file(tmp_path: Path) -> None:
         assert len(load_mesh(path).faces) == count
         return timed(lambda: load_mesh(path))
 
-    # Eight times the lines; with the square of their number it would be 64 times the time.
-    assert ratio(loading(400_000), loading(50_000), below=16) < 16
+    # Eight times the lines, which leave the caches: 8 to 12 times the time. With the square of
+    # their number it would be 64 times.
+    assert ratio(loading(400_000), loading(50_000), below=24) < 24
     assert reference_seconds(loading(400_000), below=1) < 1
 
 

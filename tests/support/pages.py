@@ -86,7 +86,7 @@ _USUAL_WORK = """() => {
 def page_yardstick(context: BrowserContext) -> Yardstick:
     """Work of the kinds that a page does, in an empty one of its own: objects, text, layout."""
     page = context.new_page()
-    return Yardstick(lambda: float(page.evaluate(_USUAL_WORK)), 0.05)
+    return Yardstick(lambda: float(page.evaluate(_USUAL_WORK)), 0.2)
 
 
 def scroll_through(page: Page) -> None:

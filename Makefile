@@ -17,7 +17,7 @@ paper: $(VENV)/.installed  ## make every table and figure of the AEPnP paper ane
 	$(BIN)/python scripts/reproduce_paper.py --out paper$(if $(QUICK),-quick --quick) $(if $(CADALIGN_DATA),--root $(CADALIGN_DATA)/keypointnet)
 
 # The modules of tests are shared out among processes; what measures times runs alone, after them.
-PARALLEL := -n $(or $(WORKERS),logical) --maxprocesses 8 --dist loadfile
+PARALLEL := -n $(or $(WORKERS),logical) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.installed-dev  ## run the whole test suite (WORKERS=2)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not timing" --durations=20; status=$$?; \

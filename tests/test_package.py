@@ -143,9 +143,9 @@ def test_command_line_brings_nothing_heavy_before_it_runs() -> None:
 
 @pytest.mark.timing
 def test_import_is_quick() -> None:
-    # NumPy is nearly all of it; SciPy or Numba would make it two to five times as long.
+    # NumPy is two thirds of it; SciPy would make it 5 times NumPy.
     ours, theirs = timed_process("import cadalign"), timed_process("import numpy")
-    assert ratio(ours, theirs, below=1.6) < 1.6
+    assert ratio(ours, theirs, below=2.0) < 2.0
 
 
 FIRST_FIT = (
@@ -166,8 +166,8 @@ def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled(tmp_path:
     plain = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import plain; plain.twice(1.0)"
     for code in (FIRST_FIT, plain):  # compiles what is not yet on disk
         python(code)
-    # The fit reads more kernels and is 1.25 times that. To compile a single small one, or to import
-    # pandas, trimesh or OpenCV, makes it 1.6 times or more.
+    # The fit reads more kernels and takes 1.25 times as long. Compiling a single small one would
+    # add 0.6 to that, importing trimesh the same, pandas 0.35.
     assert ratio(timed_process(FIRST_FIT), timed_process(plain), below=1.5) < 1.5
 
 

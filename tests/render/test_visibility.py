@@ -158,7 +158,7 @@ def test_twenty_keypoints_take_about_a_millisecond():
     view = look_at(azimuth=20, elevation=20, distance=4)
     points = np.array(shape.vertices)[::500][:20]
     testing = timed(lambda: visible_keypoints(scene, points, CAMERA, view), calls=20)
-    assert reference_seconds(testing, below=1.5e-3) < 1.5e-3
+    assert reference_seconds(testing, below=2e-3) < 2e-3
 
 
 @needs_data

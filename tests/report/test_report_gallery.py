@@ -256,7 +256,7 @@ def test_ten_thousand_instances_with_assets_open_and_scroll(opened: Opened, tmp_
     payload |= {"mesh_files": {"m0": "mesh_0.js"}}
     del payload["exhibits"], payload["meshes"]
     page = opened(write_page(tmp_path / "report.html", Recipe(instances=0), **payload))
-    assert reference_seconds(opening_of(page), below=6, by=page_yardstick(page.context)) < 6
+    assert reference_seconds(opening_of(page), below=3, by=page_yardstick(page.context)) < 3
     expect(page.locator("#gallery .found")).to_have_text("10,000 instances")
     assert page.locator(".card").count() < 100
     page.locator("#gallery").scroll_into_view_if_needed()

@@ -33,23 +33,24 @@ class Yardstick:
     seconds: float
 
 
-def ratio(ours: Measure, theirs: Measure, *, below: float, rounds: int = 3) -> float:
-    """The least duration of ours over the least of theirs, both measured in turns.
+def ratio(ours: Measure, theirs: Measure, *, below: float, rounds: int = 5) -> float:
+    """The median duration of ours over that of theirs, both measured in turns.
 
-    The least ones are those that the rest of the machine disturbed least. While their ratio is not
-    below its limit, there are more rounds, for a minute.
+    While it is not below its limit, it is measured anew, for a minute; one good measurement
+    decides.
     """
-    pairs = [(ours(), theirs()) for _ in range(rounds)]
     end = time.monotonic() + _PATIENCE
-    while (found := _quotient_of_least(pairs)) >= below and time.monotonic() < end:
+    found = _ratio_of_medians(ours, theirs, rounds)
+    while found >= below and time.monotonic() < end:
         time.sleep(0.2)
-        pairs.append((ours(), theirs()))
+        found = min(found, _ratio_of_medians(ours, theirs, rounds))
     return found
 
 
-def _quotient_of_least(pairs: list[tuple[float, float]]) -> float:
-    ours, theirs = zip(*pairs, strict=True)
-    return min(ours) / min(theirs)
+def _ratio_of_medians(ours: Measure, theirs: Measure, rounds: int) -> float:
+    pairs = [(ours(), theirs()) for _ in range(rounds)]
+    own, other = zip(*pairs, strict=True)
+    return statistics.median(own) / statistics.median(other)
 
 
 def timed(work: Callable[[], object], *, calls: int = 1) -> Measure:
@@ -106,7 +107,7 @@ USUAL = Yardstick(timed(_usual_work), 0.05)
 
 
 def reference_seconds(
-    measure: Measure, *, below: float, by: Yardstick = USUAL, rounds: int = 3
+    measure: Measure, *, below: float, by: Yardstick = USUAL, rounds: int = 5
 ) -> float:
     """The duration [s] on the machine that limits are stated for, judging by the yardstick here."""
     return by.seconds * ratio(measure, by.measure, below=below / by.seconds, rounds=rounds)

@@ -33,7 +33,7 @@ class Yardstick:
     seconds: float
 
 
-def ratio(ours: Measure, theirs: Measure, *, below: float, rounds: int = 5) -> float:
+def ratio(ours: Measure, theirs: Measure, *, below: float, rounds: int = 3) -> float:
     """The median duration of ours over that of theirs, both measured in turns.
 
     While it is not below its limit, it is measured anew, for a minute; one good measurement
@@ -107,7 +107,7 @@ USUAL = Yardstick(timed(_usual_work), 0.05)
 
 
 def reference_seconds(
-    measure: Measure, *, below: float, by: Yardstick = USUAL, rounds: int = 5
+    measure: Measure, *, below: float, by: Yardstick = USUAL, rounds: int = 3
 ) -> float:
     """The duration [s] on the machine that limits are stated for, judging by the yardstick here."""
     return by.seconds * ratio(measure, by.measure, below=below / by.seconds, rounds=rounds)

@@ -18,10 +18,12 @@ from cadalign.fitting.joint.plain import align_plain, is_plain
 from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.robust import Consensus, find_consensus, state_of
+from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.starts import starts_of
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.options import LOSSES, FitOptions, RansacOptions
 from cadalign.fitting.result import FitStats
+from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.search import search_joint
@@ -32,6 +34,8 @@ def align(
     model: Model | ShapeModel,
     views: View | Sequence[View],
     *,
+    size: Size | None = None,
+    init: Alignment | None = None,
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
@@ -46,6 +50,12 @@ def align(
     views : View or sequence of View
         What the images tell. Views with ``cam_from_rig`` share one pose and determine the object's
         size; views without it have a pose each and share the stretch and the shape.
+    size : Size, optional
+        Known lengths of the object.
+    init : Alignment, optional
+        A start beside those that the keypoints suggest, needed where these are too few: the
+        alignment in the rig's frame or, where the views have no ``cam_from_rig``, in the first
+        camera's.
     loss, loss_scale
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
@@ -79,10 +89,12 @@ def align(
     start = time.perf_counter()
     given = [views] if isinstance(views, View) else list(views)
     _check_views(given)
+    _check_start(size, init)
     options = FitOptions(loss=loss, loss_scale=loss_scale)
-    if is_plain(model, given):
+    if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
+    _refuse_unsupported(given, size, init)
     prior = prior_of(model)
     minima: list[Minimum] = []
     iterations = hypotheses = 0
@@ -189,3 +201,21 @@ def _check_views(views: Sequence[object]) -> None:
         if not isinstance(view, View):
             what = f"expected a cadalign.View, got {type(view).__name__}"
             raise InputError(what, where=f"views[{number}]")
+
+
+def _check_start(size: object, init: object) -> None:
+    if size is not None and not isinstance(size, Size):
+        what = f"expected a cadalign.Size, got {type(size).__name__}"
+        raise InputError(what, where="size")
+    if init is not None and not isinstance(init, Alignment):
+        what = f"expected a cadalign.Alignment, got {type(init).__name__}"
+        raise InputError(what, where="init")
+
+
+def _refuse_unsupported(views: Sequence[View], size: Size | None, init: Alignment | None) -> None:
+    if size is not None or init is not None:
+        raise InputError("not supported yet", where="size" if init is None else "init")
+    for number, view in enumerate(views):
+        for name in ("mask", "camera_height", "depth_image"):
+            if getattr(view, name) is not None:
+                raise InputError("not supported yet", where=f"views[{number}].{name}")

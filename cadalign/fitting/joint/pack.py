@@ -55,7 +55,8 @@ def evidence_of(
 
 def is_metric(views: Sequence[View]) -> bool:
     """True if the views tell the object's size: by depth, or by several known camera poses."""
-    if any(view.depth is not None and np.isfinite(view.depth).any() for view in views):
+    depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
+    if any(np.isfinite(depth).any() for depth in depths):
         return True
     return len(views) > 1 and views[0].cam_from_rig is not None
 

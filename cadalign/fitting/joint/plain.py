@@ -23,7 +23,8 @@ def is_plain(model: object, views: Sequence[View]) -> bool:
     if not isinstance(model, Model) or model.shape_sigma is not None or len(views) != 1:
         return False
     view = views[0]
-    return view.depth is None and view.up is None and view.cam_from_rig is None
+    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
+    return all(each is None for each in others)
 
 
 def align_plain(

@@ -11,6 +11,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.summary import EvidenceSummary
 from cadalign.fitting.result import FitStats
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
@@ -91,6 +92,10 @@ class AlignResult:
     warnings : tuple of str
         What the evidence leaves undetermined, and what contradicts the rest.
     stats : FitStats
+    evidence : tuple of EvidenceSummary
+        Agreement of every piece of evidence with the estimate.
+    rig_from_model : Alignment, optional
+        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
     """
 
     alignment: Alignment
@@ -109,6 +114,8 @@ class AlignResult:
     alternatives: tuple[AlignAlternative, ...]
     warnings: tuple[str, ...]
     stats: FitStats
+    evidence: tuple[EvidenceSummary, ...] = ()
+    rig_from_model: Alignment | None = None
 
     @property
     def rms(self) -> float:

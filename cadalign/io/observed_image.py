@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_positive
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 
@@ -19,6 +19,8 @@ _REFINES = {
     "up_sigma_deg": "up",
     "camera_height_sigma": "camera_height",
 }
+
+_NUMBERS = (*_REFINES, "depth_sigma", "camera_height")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +53,8 @@ class ImageEvidence:
     Raises
     ------
     InputError
-        If a deviation or scale is given without what it is of, or an array's shape is wrong.
+        If a number is not positive, a deviation or scale is given without what it is of, or an
+        array has a wrong shape.
     """
 
     mask: Path | None = None
@@ -69,6 +72,9 @@ class ImageEvidence:
         for name, of in _REFINES.items():
             if getattr(self, name) is not None and getattr(self, of) is None:
                 raise InputError(f"given without {of}", where=name, fix=f"give {of}, too")
+        for name in _NUMBERS:
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_positive(value, name=name))
         for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_floats(value, name=name, shape=shape))

@@ -32,6 +32,9 @@ def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -
         factor = _FILE_SCALE if factor is None else factor
     else:
         depth = np.asarray(given)
+        if depth.ndim == 2 and depth.dtype.kind in "iu" and factor is None:
+            fix = "give `depth_scale`, 0.001 for millimetres where metres are wanted"
+            raise InputError("whole numbers have no unit", where="depth", fix=fix)
         shape = (None,) if depth.ndim == 1 else (None, None)
         depth = as_floats(depth, name="depth", shape=shape, finite=False)
     wanted = (count,) if depth.ndim == 1 else (camera.height, camera.width)

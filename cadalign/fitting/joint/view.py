@@ -50,7 +50,7 @@ class View:
         Standard deviation of the depths, relative (0.005 is 0.5 %).
     depth_scale : float, optional
         Units per count of a depth image; by default 0.001 for a file (millimetres to metres), 1 for
-        an array.
+        an array of floats.
     up : (3,) float, optional
         The direction of the model's up axis in the camera's frame (OpenCV's: y points down), of any
         length; `cadalign.geometry.gravity` computes it from gravity, pitch and roll, a phone's

@@ -214,7 +214,9 @@ def read_each(
             each = read(number, record)
         except CadalignError as error:
             place = f"{where}, object {number}"
-            place += f": {error.where}" if error.where else ""
+            if error.where:
+                has_file = error.where.startswith(where)
+                place = error.where if has_file else f"{place}: {error.where}"
             problems.append(DataError(error.what, where=place, fix=error.fix))
             continue
         if each is not None:

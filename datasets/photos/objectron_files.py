@@ -126,11 +126,15 @@ class Sequence:
         DataError
             If it is no valid frame.
         """
-        return self._convert(self.frames[number], _FRAME, Frame, f"frame_annotations[{number}]")
+        where = f"frame_annotations[{number}]"
+        found: Frame = self._convert(self.frames[number], _FRAME, Frame, where)
+        return found
 
     def object(self, number: int) -> WorldObject:
         """Decode an object; see `frame`."""
-        return self._convert(self.objects[number], _OBJECT, WorldObject, f"objects[{number}]")
+        where = f"objects[{number}]"
+        found: WorldObject = self._convert(self.objects[number], _OBJECT, WorldObject, where)
+        return found
 
     def _convert(self, message: Any, fields: dict[int, Field], kind: Any, where: str) -> Any:
         with in_file(self.path):
@@ -161,16 +165,16 @@ def read_sequence(path: Path) -> Sequence:
         )
     with reading(path):
         content = path.read_bytes()
-    objects, frames = [], []
+    messages: dict[int, list[bytes]] = {_OBJECTS: [], _FRAMES: []}
     try:
         for number, _, value in entries(content):
-            if isinstance(value, bytes):
-                {_OBJECTS: objects, _FRAMES: frames}.get(number, []).append(value)
+            if number in messages and isinstance(value, bytes):
+                messages[number].append(value)
     except InputError as error:
         raise DataError(error.what, where=str(path), fix="get it again") from None
-    if not frames:
+    if not messages[_FRAMES]:
         raise DataError("there are no frame_annotations", where=str(path))
-    return Sequence(path, tuple(objects), tuple(frames))
+    return Sequence(path, tuple(messages[_OBJECTS]), tuple(messages[_FRAMES]))
 
 
 def _snake_case(value: Any) -> Any:

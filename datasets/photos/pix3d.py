@@ -171,7 +171,7 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     if len(counts) != 1:
         raise InputError("annotators have different numbers of points", where="2d_keypoints")
     given = np.array(entry.keypoints_2d, dtype=float).reshape(len(entry.keypoints_2d), -1, 2)
-    is_marked = (given >= 0).all(axis=2)
+    is_marked = np.asarray((given >= 0).all(axis=2))
     rows = np.flatnonzero(is_marked.any(axis=0))
     if not len(rows):
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def _load(path: Path) -> Mesh:
     import trimesh  # takes long to import
 
     try:
-        loaded = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        loaded: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
         return Mesh(loaded.vertices, loaded.faces, source=str(path))
     except CadalignError:
         raise

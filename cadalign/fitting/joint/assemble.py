@@ -18,8 +18,8 @@ from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.joint.search import joint_covariance
 
 _SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
 

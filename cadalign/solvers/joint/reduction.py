@@ -1,0 +1,106 @@
+"""Fewer modes: those that the evidence tells apart.
+
+Modes move the s points that the evidence names in at most 3 s directions. In an orthonormal basis
+of these, coefficients ``c = basis @ reduced`` plus a rest that moves no such point: the rest keeps
+its standard normal prior, and the reduced coefficients have one, too. Estimates, costs and
+determinants are those of all modes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.compile import fast_sums, kernel
+from cadalign.solvers.joint.evidence import Evidence, Shape
+
+_LEAST_NORM = 1e-10  # of a direction, over the largest
+
+
+@kernel
+def reduce_modes(evidence: Evidence) -> tuple[Evidence, FloatArray]:
+    """The evidence with modes in the directions that it tells apart, and their basis (K, r)."""
+    shape = evidence.shape
+    modes, points = shape.modes.shape[0], shape.modes.shape[1]
+    used = used_points(evidence)
+    if 3 * used.sum() >= modes:
+        return evidence, np.eye(modes)
+    directions = np.empty((3 * used.sum(), modes))
+    row = 0
+    for i in range(points):
+        if used[i]:
+            for a in range(3):
+                for k in range(modes):
+                    directions[row, k] = shape.modes[k, i, a]
+                row += 1
+    basis = directions[: _orthonormalize(directions)]
+    flat = np.ascontiguousarray(shape.modes).reshape((modes, 3 * points))
+    reduced = (basis @ flat).reshape((basis.shape[0], points, 3))
+    return Evidence(
+        Shape(shape.mean, reduced, shape.spread),
+        evidence.sightings,
+        evidence.rig,
+        evidence.directions,
+        evidence.lengths,
+        evidence.scales,
+    ), np.ascontiguousarray(basis.T)
+
+
+@kernel
+def used_points(evidence: Evidence) -> BoolArray:
+    """True for the points (m,) that a piece of evidence names."""
+    used = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
+    for n in range(evidence.sightings.point.shape[0]):
+        used[evidence.sightings.point[n]] = True
+    for j in range(evidence.lengths.axis.shape[0]):
+        used[evidence.lengths.points[j, 0]] = True
+        used[evidence.lengths.points[j, 1]] = True
+    return used
+
+
+@fast_sums
+def _orthonormalize(rows: FloatArray) -> int:
+    """Turn the first rows of a matrix into an orthonormal basis of them all; returns its rank.
+
+    Gram and Schmidt's method, the longest rest first, with a second pass for each row taken.
+    """
+    count, size = rows.shape
+    squares = np.empty(count)
+    for i in range(count):
+        square = 0.0
+        for k in range(size):
+            square += rows[i, k] * rows[i, k]
+        squares[i] = square
+    least = _LEAST_NORM * _LEAST_NORM * squares.max() if count else 0.0
+    for rank in range(count):
+        best = rank
+        for i in range(rank + 1, count):
+            if squares[i] > squares[best]:
+                best = i
+        if not squares[best] > least:
+            return rank
+        for k in range(size):
+            rows[rank, k], rows[best, k] = rows[best, k], rows[rank, k]
+        squares[best] = squares[rank]
+        for i in range(rank):
+            product = 0.0
+            for k in range(size):
+                product += rows[i, k] * rows[rank, k]
+            for k in range(size):
+                rows[rank, k] -= product * rows[i, k]
+        square = 0.0
+        for k in range(size):
+            square += rows[rank, k] * rows[rank, k]
+        factor = 1.0 / np.sqrt(square)
+        for k in range(size):
+            rows[rank, k] *= factor
+        for i in range(rank + 1, count):
+            product = 0.0
+            for k in range(size):
+                product += rows[rank, k] * rows[i, k]
+            square = 0.0
+            for k in range(size):
+                rows[i, k] -= product * rows[rank, k]
+                square += rows[i, k] * rows[i, k]
+            squares[i] = square
+    return count

@@ -14,7 +14,8 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.joint.evidence import Evidence, Shape
 
-_LEAST_NORM = 1e-10  # of a direction, over the largest
+_LEAST_SQUARE = 1e-14  # of a direction's rest, over the largest
+_LOST = 0.01  # of a direction's square: less asks for a second pass
 
 
 @kernel
@@ -59,19 +60,37 @@ def used_points(evidence: Evidence) -> BoolArray:
 
 
 @fast_sums
+def _squared(row: FloatArray) -> float:
+    total = 0.0
+    for k in range(row.shape[0]):
+        total += row[k] * row[k]
+    return total
+
+
+@fast_sums
+def _subtract(unit: FloatArray, row: FloatArray) -> float:
+    """Take the part along a unit vector off a row; returns its length."""
+    product = 0.0
+    for k in range(row.shape[0]):
+        product += unit[k] * row[k]
+    for k in range(row.shape[0]):
+        row[k] -= product * unit[k]
+    return product
+
+
+@fast_sums
 def _orthonormalize(rows: FloatArray) -> int:
     """Turn the first rows of a matrix into an orthonormal basis of them all; returns its rank.
 
-    Gram and Schmidt's method, the longest rest first, with a second pass for each row taken.
+    Gram and Schmidt's method, the longest rest first, with a second pass for rows that lost most of
+    their length.
     """
     count, size = rows.shape
     squares = np.empty(count)
     for i in range(count):
-        square = 0.0
-        for k in range(size):
-            square += rows[i, k] * rows[i, k]
-        squares[i] = square
-    least = _LEAST_NORM * _LEAST_NORM * squares.max() if count else 0.0
+        squares[i] = _squared(rows[i])
+    wholes = squares.copy()
+    least = _LEAST_SQUARE * squares.max() if count else 0.0
     for rank in range(count):
         best = rank
         for i in range(rank + 1, count):
@@ -81,26 +100,16 @@ def _orthonormalize(rows: FloatArray) -> int:
             return rank
         for k in range(size):
             rows[rank, k], rows[best, k] = rows[best, k], rows[rank, k]
-        squares[best] = squares[rank]
-        for i in range(rank):
-            product = 0.0
-            for k in range(size):
-                product += rows[i, k] * rows[rank, k]
-            for k in range(size):
-                rows[rank, k] -= product * rows[i, k]
-        square = 0.0
-        for k in range(size):
-            square += rows[rank, k] * rows[rank, k]
+        whole = wholes[best]
+        squares[best], wholes[best] = squares[rank], wholes[rank]
+        square = _squared(rows[rank])
+        if square < _LOST * whole:
+            for i in range(rank):
+                _subtract(rows[i], rows[rank])
+            square = _squared(rows[rank])
         factor = 1.0 / np.sqrt(square)
         for k in range(size):
             rows[rank, k] *= factor
         for i in range(rank + 1, count):
-            product = 0.0
-            for k in range(size):
-                product += rows[rank, k] * rows[i, k]
-            square = 0.0
-            for k in range(size):
-                rows[i, k] -= product * rows[rank, k]
-                square += rows[i, k] * rows[i, k]
-            squares[i] = square
+            squares[i] -= _subtract(rows[rank], rows[i]) ** 2
     return count

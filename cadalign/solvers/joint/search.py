@@ -74,10 +74,10 @@ def _search(
     found = 0
     iterations = 0
     system = empty_system(evidence)
-    probed = np.full(starts, np.inf)
+    probed, converged = np.full(starts, np.inf), np.zeros(starts, dtype=np.bool_)
     states = [_start(poses[s], log_scales[s], modes, points) for s in range(starts)]
     for s in range(starts):
-        probed[s], used, _ = refine_joint(evidence, _PROBE_ITERATIONS, states[s])
+        probed[s], used, converged[s] = refine_joint(evidence, _PROBE_ITERATIONS, states[s])
         iterations += used
     best = np.inf
     for s in np.argsort(probed):
@@ -86,8 +86,10 @@ def _search(
         state = states[s]
         if _find(state, minima, found) >= 0:
             continue
-        cost, used, _ = refine_joint(evidence, _MAX_ITERATIONS, state)
-        iterations += used
+        cost = probed[s]
+        if not converged[s]:
+            cost, used, _ = refine_joint(evidence, _MAX_ITERATIONS, state)
+            iterations += used
         if not cost < np.inf or _find(state, minima, found) >= 0:
             continue
         best = min(best, cost)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
     from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.joint.size import Size
+    from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
     from cadalign.fitting.joint.view import View
     from cadalign.fitting.options import RansacOptions
     from cadalign.retrieval.library import Library
@@ -34,6 +36,8 @@ __all__ = [
     "Box",
     "CadalignError",
     "Camera",
+    "Contribution",
+    "EvidenceSummary",
     "FitResult",
     "FocalPrior",
     "Library",
@@ -43,6 +47,7 @@ __all__ = [
     "Model",
     "RansacOptions",
     "ShapeModel",
+    "Size",
     "View",
     "align",
     "align_batch",
@@ -62,6 +67,9 @@ __all__ = [
 _NAMES = {
     "AlignResult": "cadalign.fitting.joint.result",
     "Model": "cadalign.fitting.joint.model",
+    "Contribution": "cadalign.fitting.joint.summary",
+    "EvidenceSummary": "cadalign.fitting.joint.summary",
+    "Size": "cadalign.fitting.joint.size",
     "View": "cadalign.fitting.joint.view",
     "align": "cadalign.fitting.joint.align",
     "align_batch": "cadalign.fitting.joint.align",

@@ -9,6 +9,9 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.fitting.fit import LEAST_LIKELIHOOD
+from cadalign.fitting.joint.agreement import summaries_of
+from cadalign.fitting.joint.contributions import Basis
+from cadalign.fitting.joint.deviations import pose_and_lengths
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
 from cadalign.fitting.joint.result import AlignAlternative, AlignResult
@@ -97,8 +100,11 @@ def assemble(
         component=minimum.component,
         model=model,
         alternatives=alternatives,
-        warnings=warnings_of(minimum.evidence, minimum.cost, best.poses, covariance),
+        warnings=warnings_of(minimum.evidence, minimum.state, minimum.cost, best.poses, covariance),
         stats=stats,
+        evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
+        rig_from_model=_in_rig(views, minimum, best.scale),
+        basis=Basis(minimum.evidence, minimum.state),
     )
 
 
@@ -115,11 +121,19 @@ def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
         scale,
         _poses(minimum, scale),
         stretched[-1] - stretched[-2],
-        _pose_and_lengths(minimum, unknowns),
+        pose_and_lengths(minimum.evidence, minimum.state, unknowns),
         of_points,
         of_seen,
         likelihood,
     )
+
+
+def _in_rig(views: Sequence[View], minimum: Minimum, scale: FloatArray) -> Alignment | None:
+    """The alignment in the frame that the views share."""
+    if views[0].cam_from_rig is None:
+        return None
+    pose = minimum.state.poses[0]
+    return Alignment(pose[:9].reshape(3, 3), pose[9:], scale)
 
 
 def _moments(
@@ -173,24 +187,3 @@ def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
         shift = rotation @ pose[9:] + camera[9:]
         poses.append(Alignment(turned, shift, scale, is_valid=True))
     return tuple(poses)
-
-
-def _pose_and_lengths(minimum: Minimum, unknowns: FloatArray) -> FloatArray:
-    """Covariance (9, 9) of the first camera's pose and the log lengths of the box."""
-    shape, state = minimum.evidence.shape, minimum.state
-    rig = minimum.evidence.rig
-    rotation = rig.cam_from_rig[0][:9].reshape(3, 3)
-    first = 6 * int(rig.pose.max() + 1)
-    rows = np.zeros((9, len(unknowns)))
-    pose = 6 * int(rig.pose[0])
-    rows[:3, pose : pose + 3] = rotation
-    rows[3:6, pose + 3 : pose + 6] = rotation
-    modes = shape.modes[:, -1] - shape.modes[:, -2]
-    extent = shape.mean[-1] - shape.mean[-2] + state.coefficients @ modes
-    safe = np.where(extent > 0, extent, np.inf)
-    own = np.zeros(9)
-    for axis in range(3):
-        rows[6 + axis, first + axis] = 1.0
-        rows[6 + axis, first + 3 :] = modes[:, axis] / safe[axis]
-        own[6 + axis] = (shape.spread[-2:] ** 2).sum() / safe[axis] ** 2
-    return np.asarray(rows @ unknowns @ rows.T + np.diag(own))

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.fitting.joint.metric_starts import metric_starts
 from cadalign.solvers.joint.evidence import Evidence
-from cadalign.solvers.joint.starts import view_starts
+from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 
 _MOST = 24
 
 
-def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray, FloatArray]:
     """Poses (S, P, 12) and log scales (S, 3); none where every view has too few keypoints.
 
     Where every view has a pose of its own, the likeliest ones are taken together, and then one of
     them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
-    the size of its image, widens the keypoints' own.
+    the size of its image, widens the keypoints' own. A start that is given comes first.
     """
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
@@ -26,12 +29,20 @@ def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
         found = zip(*view_starts(evidence, view), strict=True)
         moved = [(in_rig(pose, camera), scales) for pose, scales in found]
         per_pose[rig.pose[view]].extend(moved)
+    is_metric = bool(evidence.scales.free.all())
+    if init is not None:
+        per_pose[0].insert(0, (init.pose, init.log_scales))
+    elif is_metric and poses == 1:
+        rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
+        placed = metric_starts(evidence, rotations)
+        if len(placed[0]):
+            return placed
     if not all(per_pose):
         return np.empty((0, poses, 12)), np.empty((0, 3))
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
-        for rank in range(1, max(map(len, per_pose)))
+        for rank in range(1, MOST_PER_VIEW)
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
@@ -39,7 +50,56 @@ def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
     chosen = [[per_pose[p][k] for p, k in enumerate(ranks)] for ranks in combinations]
     stacked = np.array([[pose for pose, _ in each] for each in chosen]).reshape(-1, poses, 12)
     scales = np.array([each[0][1] for each in chosen]).reshape(-1, 3)
+    if is_metric and init is None:
+        return _sized(evidence, stacked, scales)
     return stacked, scales
+
+
+class Start(NamedTuple):
+    """A pose (12,) of the rig, and log scales (3,)."""
+
+    pose: FloatArray
+    log_scales: FloatArray
+
+
+def _sized(
+    evidence: Evidence, poses: FloatArray, log_scales: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Starts enlarged about each view's camera such that depths, lengths and heights agree."""
+    poses, log_scales = poses.copy(), log_scales.copy()
+    for pose, logs in zip(poses, log_scales, strict=True):
+        factor = _size_factor(evidence, pose, np.exp(logs))
+        if np.isfinite(factor) and factor > 0:
+            pose[:, 9:] *= factor
+            logs += np.log(factor)
+    return poses, log_scales
+
+
+def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
+    """Median of measured over predicted lengths, where every view has a pose of its own."""
+    sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
+    lengths, heights = evidence.lengths, evidence.heights
+
+    def seen(point: IntArray, image: IntArray) -> FloatArray:
+        turns = poses[evidence.rig.pose[image]]
+        turned = np.einsum("nij,nj->ni", turns[:, :9].reshape(-1, 3, 3), mean[point] * scale)
+        return np.asarray(turned + turns[:, 9:])
+
+    has_depth = sightings.depths[:, 1] > 0
+    depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
+    distances = (seen(planes.point, planes.image) * planes.normal).sum(axis=1)
+    box = mean[lengths.points[:, 1]] - mean[lengths.points[:, 0]]
+    extents = (box * scale)[np.arange(len(box)), lengths.axis]
+    turns = poses[evidence.rig.pose[heights.image]][:, :9].reshape(-1, 3, 3)
+    ups = np.einsum("nij,nj->ni", turns, heights.direction)
+    below = -(seen(heights.point, heights.image) * ups).sum(axis=1)
+    ratios = [
+        sightings.depths[has_depth, 0] / depths,
+        planes.offset / distances,
+        lengths.value / extents,
+        heights.value / below,
+    ]
+    return float(np.median(np.concatenate(ratios)))
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

@@ -43,6 +43,8 @@ def reduce_modes(evidence: Evidence) -> tuple[Evidence, FloatArray]:
         evidence.rig,
         evidence.directions,
         evidence.lengths,
+        evidence.heights,
+        evidence.planes,
         evidence.scales,
     ), np.ascontiguousarray(basis.T)
 
@@ -51,11 +53,12 @@ def reduce_modes(evidence: Evidence) -> tuple[Evidence, FloatArray]:
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
     used = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
-    for n in range(evidence.sightings.point.shape[0]):
-        used[evidence.sightings.point[n]] = True
-    for j in range(evidence.lengths.axis.shape[0]):
-        used[evidence.lengths.points[j, 0]] = True
-        used[evidence.lengths.points[j, 1]] = True
+    lengths = evidence.lengths.points
+    for named in (evidence.sightings.point, evidence.heights.point, evidence.planes.point):
+        for i in named:
+            used[i] = True
+    for j in range(lengths.shape[0]):
+        used[lengths[j, 0]] = used[lengths[j, 1]] = True
     return used
 
 

@@ -12,7 +12,7 @@ from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.optimal import optimal_batch
 
-_MOST_PER_VIEW = 8
+MOST_PER_VIEW = 8
 _LEAST_POINTS = 3
 _UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
 _LEAST_DEPTH = 1e-9
@@ -89,7 +89,7 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         _LEAST_POINTS,
     )
     count = 0
-    while count < min(info[0, 0], _MOST_PER_VIEW) and costs[0, count] < costs[0, 0] + _UNLIKELY:
+    while count < min(info[0, 0], MOST_PER_VIEW) and costs[0, count] < costs[0, 0] + _UNLIKELY:
         count += 1
     poses, logs = np.empty((count, 12)), np.empty((count, 3))
     for k in range(count):

@@ -33,6 +33,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, rendere
 	$(BIN)/python scripts/benchmark_calibration.py
 	$(BIN)/python scripts/benchmark_render.py
 ifneq ($(CADALIGN_DATA),)
+	$(BIN)/python scripts/benchmark_align.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello
 endif

@@ -77,8 +77,8 @@ def assemble(
         rows = prior.rows_of(view.keypoint_ids, "ids")
         seen = view.camera.project(pose.apply(best.points[rows]))
         residuals.append(seen - cast(FloatArray, view.points_2d))
-    stretch = best.lengths / np.where(prior.lengths > 0, prior.lengths, 1.0)
-    stretch = np.where(prior.lengths > 0, stretch, 1.0)
+    of_mean = prior.lengths
+    stretch = np.where(of_mean > 0, best.lengths / np.where(of_mean > 0, of_mean, 1.0), 1.0)
     information = np.linalg.pinv(best.covariance[:3, :3]) if len(likely) > 1 else np.zeros((3, 3))
     alternatives = tuple(
         AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)

@@ -115,4 +115,4 @@ def _orthonormalize(rows: FloatArray) -> int:
             rows[rank, k] *= factor
         for i in range(rank + 1, count):
             squares[i] -= _subtract(rows[rank], rows[i]) ** 2
-    return count
+    return int(count)

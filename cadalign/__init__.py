@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
     from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.joint.sfm_views import views_from
     from cadalign.fitting.joint.size import Size
     from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
     from cadalign.fitting.joint.view import View
@@ -61,6 +62,7 @@ __all__ = [
     "retrieval",
     "simulate",
     "solvers",
+    "views_from",
 ]
 
 # Imported when first asked for, so that `import cadalign` stays quick.
@@ -71,6 +73,7 @@ _NAMES = {
     "EvidenceSummary": "cadalign.fitting.joint.summary",
     "Size": "cadalign.fitting.joint.size",
     "View": "cadalign.fitting.joint.view",
+    "views_from": "cadalign.fitting.joint.sfm_views",
     "align": "cadalign.fitting.joint.align",
     "align_batch": "cadalign.fitting.joint.align",
     "RansacOptions": "cadalign.fitting.options",

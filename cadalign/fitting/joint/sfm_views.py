@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import CadalignError, InputError, quote
+from cadalign.fitting.joint.view import View
 
 if TYPE_CHECKING:
-    from cadalign.fitting.joint.view import View
+    from cadalign.datasets import CorrespondenceSet
 
 Keypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
 
@@ -54,8 +54,6 @@ def views_from(
     >>> views = views_from(images, {"00.jpg": (clicks, ["seat", "leg"])})  # doctest: +SKIP
     >>> cadalign.align(chair, views).rig_from_model  # doctest: +SKIP
     """
-    from cadalign.fitting.joint.view import View  # loads what the readers do without
-
     views = []
     for name, pair in keypoints.items():
         given: Any = pair

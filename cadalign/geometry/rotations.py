@@ -34,6 +34,28 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
+def nearest_rotation(matrix: FloatArray, *, tolerance: float = 1e-2) -> FloatArray:
+    """The rotation nearest to a matrix (3, 3) that a file holds with few digits.
+
+    Raises
+    ------
+    InputError
+        If an entry of ``matrix @ matrix.T`` is more than the tolerance off the identity, or the
+        matrix is a reflection.
+
+    Examples
+    --------
+    >>> nearest_rotation(np.diag([1.0001, 0.9999, 1.0])).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not error <= tolerance or np.linalg.det(matrix) < 0:
+        raise InputError("not a rotation matrix", where="rotation")
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right)
+
+
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
 

@@ -106,11 +106,13 @@ def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
 
 
 def write_image(path: Path, image: ByteImage) -> None:
-    """Write an RGB image (h, w, 3) uint8, or RGBA (h, w, 4), as PNG, whole or not at all."""
+    """Write an image as PNG, whole or not at all: RGB (h, w, 3) uint8, RGBA (h, w, 4) or grey."""
     import cv2  # on first use: it takes longer to import than all the rest
 
-    colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, colors))
+    if image.ndim == 3:
+        colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        image = np.asarray(cv2.cvtColor(image, colors), dtype=np.uint8)
+    encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise DataError("the picture cannot be encoded as PNG", where=str(path))
     write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))

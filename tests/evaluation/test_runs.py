@@ -323,6 +323,7 @@ def test_a_chunk_with_a_failing_task_keeps_its_order() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timing
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs Linux's /proc")
 def test_workers_end_soon_after_their_run_is_killed(tmp_path: Path) -> None:
     write_annotations(tmp_path / "data", models=120)

@@ -111,14 +111,14 @@ def _settled(
 ) -> Minimum:
     """Rounds from one minimum until the cost changes little."""
     state, last = start.state, np.inf
-    result = start
+    result, bare = start, _without_keypoints(start.evidence, samples)
     for _ in range(_ROUNDS):
         posed = surface.at(
             _without_extras(start.evidence.shape, keypoints), _bare(state, keypoints)
         )
-        poses = poses_of(start.evidence, state)
+        poses = poses_of(bare, state)
         rows = [_rows(posed, poses[each.image], each) for each in samples]
-        full = _with_rows(start.evidence, keypoints, rows)
+        full = _with_rows(bare, keypoints, rows)
         room = _with_room(state, keypoints, sum(len(each.mean) for each in rows))
         cost, _, _ = refine_joint(full, _ITERATIONS, room)
         if not cost < np.inf:
@@ -132,6 +132,13 @@ def _settled(
             break
         last = cost
     return result
+
+
+def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:
+    """The evidence without depths at keypoints, which may be hidden, where the surface has them."""
+    planes = evidence.planes
+    kept = ~np.isin(planes.image, [each.image for each in samples])
+    return evidence._replace(planes=Planes(*(column[kept] for column in planes)))
 
 
 def _without_extras(shape: Shape, keypoints: int) -> Shape:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from cadalign.fitting.fit import fit, fit_batch
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
+    from cadalign.fitting.joint.reconstruction import views_from
     from cadalign.fitting.joint.result import AlignResult
-    from cadalign.fitting.joint.sfm_views import views_from
     from cadalign.fitting.joint.size import Size
     from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
     from cadalign.fitting.joint.view import View
@@ -71,9 +71,9 @@ _NAMES = {
     "Model": "cadalign.fitting.joint.model",
     "Contribution": "cadalign.fitting.joint.summary",
     "EvidenceSummary": "cadalign.fitting.joint.summary",
+    "views_from": "cadalign.fitting.joint.reconstruction",
     "Size": "cadalign.fitting.joint.size",
     "View": "cadalign.fitting.joint.view",
-    "views_from": "cadalign.fitting.joint.sfm_views",
     "align": "cadalign.fitting.joint.align",
     "align_batch": "cadalign.fitting.joint.align",
     "RansacOptions": "cadalign.fitting.options",

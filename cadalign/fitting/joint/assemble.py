@@ -21,10 +21,10 @@ from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.joint.search import joint_covariance
 
-_SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
+_SAME = 9.0  # squared distance of rotations, in the best one's deviations, of equal estimates
 
 
 class Minimum(NamedTuple):
@@ -77,12 +77,13 @@ def assemble(
         rows = prior.rows_of(view.keypoint_ids, "ids")
         seen = view.camera.project(pose.apply(best.points[rows]))
         residuals.append(seen - cast(FloatArray, view.points_2d))
-    stretch = best.lengths / np.where(prior.lengths > 0, prior.lengths, 1.0)
-    stretch = np.where(prior.lengths > 0, stretch, 1.0)
+    of_mean = prior.lengths
+    stretch = np.where(of_mean > 0, best.lengths / np.where(of_mean > 0, of_mean, 1.0), 1.0)
+    information = np.linalg.pinv(best.covariance[:3, :3]) if len(likely) > 1 else np.zeros((3, 3))
     alternatives = tuple(
         AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
         for each, step in zip(likely[1:], steps[1:], strict=True)
-        if _differs(step, best)
+        if float(step[:3] @ information @ step[:3]) > _SAME
     )
     return AlignResult(
         alignment=best.poses[0],
@@ -144,13 +145,13 @@ def _moments(
 
     ``steps`` lead from the first to each.
     """
-    total = sum(each.likelihood for each in likely)
     best = likely[0]
-    covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
-    of_seen = np.zeros_like(best.of_seen)
-    for each, step in zip(likely, steps, strict=True):
-        weight = each.likelihood / total
-        covariance += weight * (each.covariance + np.outer(step, step))
+    share = 1.0 / sum(each.likelihood for each in likely)
+    covariance = share * best.covariance
+    of_points, of_seen = share * best.of_points, share * best.of_seen
+    for each, step in zip(likely[1:], steps[1:], strict=True):
+        weight = share * each.likelihood
+        covariance += weight * (each.covariance + step[:, None] * step)
         moved = each.points * each.scale - best.points * best.scale
         of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
         moved = each.poses[0].apply(each.points) - best.poses[0].apply(best.points)
@@ -166,12 +167,6 @@ def _step(best: _Estimate, other: _Estimate) -> FloatArray:
     logs[safe] = np.log(other.lengths[safe] / best.lengths[safe])
     turn = vector_from_rotation(second.rotation @ first.rotation.T)
     return np.concatenate([turn, second.translation - first.translation, logs])
-
-
-def _differs(step: FloatArray, best: _Estimate) -> bool:
-    """True for a step that turns the best estimate by more than its deviations."""
-    turn = step[:3]
-    return bool(turn @ np.linalg.pinv(best.covariance[:3, :3]) @ turn > _SAME)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
@@ -191,5 +186,6 @@ def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
         pose = minimum.state.poses[p]
         rotation = camera[:9].reshape(3, 3)
         turned = rotation @ pose[:9].reshape(3, 3)
-        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
+        shift = rotation @ pose[9:] + camera[9:]
+        poses.append(Alignment(turned, shift, scale, is_valid=True))
     return tuple(poses)

@@ -61,11 +61,11 @@ def assemble(
     """The result of minima, the likeliest first.
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely minima are.
+    the likely minima are, each with the shape's deviations widened by the inflation.
     """
     likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
     likely = [
-        _estimate(each, likelihood, len(prior.ids))
+        _estimate(_widened(each, prior.inflation), likelihood, len(prior.ids))
         for each, likelihood in zip(minima, likelihoods, strict=True)
         if likelihood >= LEAST_LIKELIHOOD
     ]
@@ -105,6 +105,18 @@ def assemble(
         evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
         rig_from_model=_in_rig(views, minimum, best.scale),
         basis=Basis(minimum.evidence, minimum.state),
+    )
+
+
+def _widened(minimum: Minimum, factor: float) -> Minimum:
+    """The same points under a prior of wider deviations."""
+    if factor == 1:
+        return minimum
+    shape, state = minimum.evidence.shape, minimum.state
+    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
+    return minimum._replace(
+        evidence=minimum.evidence._replace(shape=wide),
+        state=state._replace(coefficients=state.coefficients / factor),
     )
 
 

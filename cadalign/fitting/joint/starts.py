@@ -73,7 +73,7 @@ def _with_rig(
     placed, log_scales = metric_starts(_of_pose(evidence, main), rotations)
     starts = []
     for k, (own, logs) in enumerate(zip(placed[:, 0], log_scales, strict=True)):
-        for rank in range(_MOST_PER_VIEW if k == 0 else 1):
+        for rank in range(MOST_PER_VIEW if k == 0 else 1):
             start = []
             for p, found in enumerate(per_pose):
                 pose, scales = found[min(rank, len(found) - 1)]

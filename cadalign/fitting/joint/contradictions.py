@@ -18,6 +18,7 @@ from cadalign.fitting.joint.pieces import Piece, pieces_of, without
 from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.fitting.joint.summary import name_of
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
+from cadalign.solvers.joint.reduction import reduce_modes
 from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
@@ -61,6 +62,8 @@ def contradictions(
     pieces = pieces_of(evidence)
     if len(pieces) < 2:
         return ()
+    evidence, basis = reduce_modes(evidence)
+    state = state._replace(coefficients=state.coefficients @ basis)
     whole = _determined(evidence, state)
     trials = []
     for piece in pieces:

@@ -24,6 +24,7 @@ from cadalign.solvers.joint.evidence import (
     Sightings,
 )
 
+_NONE = np.empty(0, dtype=np.int64)
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 
 
@@ -163,11 +164,12 @@ def _whitening_of_up(view: View) -> FloatArray:
 
 
 def _lengths(prior: ShapePrior, size: Size | None) -> Lengths:
+    if size is None:
+        return Lengths(np.empty((0, 2), dtype=np.int64), _NONE, np.empty(0), np.empty(0))
     shape = prior.components[0]
-    axes = np.flatnonzero([] if size is None else np.isfinite(size.lengths))
+    axes = np.flatnonzero(np.isfinite(size.lengths))
     count = len(shape.mean)
-    values = np.array([] if size is None else size.lengths[axes])
-    sigmas = np.array([] if size is None else size.deviations[axes])
+    values, sigmas = size.lengths[axes], size.deviations[axes]
     for axis in axes:
         if not prior.lengths[axis] > 0:
             name = ("width", "height", "length")[axis]

@@ -8,15 +8,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.fitting.joint.metric_starts import metric_starts
-from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence
-from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 
-_MOST_PER_VIEW = 8
 _MOST = 24
-_LEAST_POINTS = 3
-_UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
-_LEAST_DEPTH = 1e-9
 
 
 def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray, FloatArray]:
@@ -30,8 +25,8 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(poses)]
     for view in range(len(rig.pose)):
-        found = _of_view(evidence, view)
         camera = rig.cam_from_rig[view]
+        found = zip(*view_starts(evidence, view), strict=True)
         moved = [(in_rig(pose, camera), scales) for pose, scales in found]
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
@@ -49,7 +44,7 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
-        for rank in range(1, _MOST_PER_VIEW)
+        for rank in range(1, MOST_PER_VIEW)
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
@@ -143,80 +138,6 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
         heights.value / below,
     ]
     return float(np.median(np.concatenate(ratios)))
-
-
-class ViewRays(NamedTuple):
-    """Keypoints of one view: points (n, 3) of the mean, rays (n, 2), and whitening (n, 3)."""
-
-    points: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
-    rows: IntArray
-
-
-def rays_in(evidence: Evidence, view: int) -> ViewRays:
-    """One view's keypoints, the shape's uncertainty in their whitening."""
-    sightings = evidence.sightings
-    rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
-    names = sightings.point[rows]
-    points = np.ascontiguousarray(evidence.shape.mean[names])
-    rays = np.ascontiguousarray(sightings.rays[rows])
-    if not len(rows):
-        return ViewRays(points, rays, np.empty((0, 3)), rows)
-    return ViewRays(points, rays, _widened(evidence, points, rays, rows, names), rows)
-
-
-def _of_view(evidence: Evidence, view: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Camera poses (12,) and log scales (3,) from one view's keypoints, the likeliest first."""
-    given = rays_in(evidence, view)
-    if len(given.rows) < _LEAST_POINTS:
-        return []
-    sightings, scales = evidence.sightings, evidence.scales
-    order = _axis_order(scales.free)
-    free = np.ones(UNKNOWNS)
-    free[6:] = scales.free[order[1:]]
-    found, costs, _, _, info = optimal_batch(
-        np.ascontiguousarray(given.points[:, order]),
-        given.rays,
-        given.whitening,
-        np.array([0, len(given.rows)]),
-        int(sightings.loss[given.rows[0]]),
-        np.array([float(sightings.loss_scale[given.rows[0]])]),
-        np.array([float(scales.precision[order[1], order[1]])]),
-        free,
-        _LEAST_POINTS,
-    )
-    count = min(int(info[0, 0]), _MOST_PER_VIEW)
-    kept = [k for k in range(count) if costs[0, k] < costs[0, 0] + _UNLIKELY]
-    place = np.argsort(order)
-    columns = np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])
-    return [(found[0, k, columns[:12]], np.log(found[0, k, columns[12:]])) for k in kept]
-
-
-def _axis_order(free: FloatArray) -> IntArray:
-    """The model's axes in the solvers' order: one whose scale is known first, no reflection."""
-    first = int(np.argmin(free))
-    return np.array([first, (first + 1) % 3, (first + 2) % 3])
-
-
-def _widened(
-    evidence: Evidence, points: FloatArray, rays: FloatArray, rows: IntArray, names: IntArray
-) -> FloatArray:
-    """Whitening (n, 3) of the rays with the shape's own variance in it."""
-    shape, whitening = evidence.shape, evidence.sightings.whitening[rows]
-    variance = (shape.modes[:, names] ** 2).sum(axis=(0, 2)) / 3 + shape.spread[names] ** 2
-    extent = points.std(axis=0)
-    seen = rays.std(axis=0)
-    depth = np.sqrt((extent**2).sum() * 2 / 3 / max((seen**2).sum(), 1e-30))
-    of_rays = variance / max(depth, _LEAST_DEPTH) ** 2
-    if not of_rays.any():
-        return np.ascontiguousarray(whitening)
-    # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-    widened = (
-        whitening
-        / np.sqrt(1 + of_rays * (whitening[:, 0] ** 2 + whitening[:, 2] ** 2) / 2)[:, None]
-    )
-    return np.ascontiguousarray(widened)
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

@@ -127,10 +127,9 @@ def align(
     from cadalign.fitting.contours.depth import fit_depths
     from cadalign.fitting.contours.fit import fit_masks  # with OpenCV and embree
 
-    masks = fit_masks(model, prior, given, minima)
-    refined = fit_depths(model, prior, given, masks.minima)
+    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
     stats = replace(stats, seconds=time.perf_counter() - start)
-    return masks.noted_in(assemble(model, prior, given, refined, stats))
+    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
 
 
 def align_batch(

@@ -77,12 +77,18 @@ def _with_rig(
             start = []
             for p, found in enumerate(per_pose):
                 pose, scales = found[min(rank, len(found) - 1)]
-                enlarged = pose[9:] * np.exp((logs - scales).mean())
+                centre = _centre(evidence.rig.cam_from_rig[evidence.rig.pose == p][0])
+                enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
                 start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
             starts.append((np.array(start), logs))
     kept = starts[:_MOST]
     poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
     return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
+
+
+def _centre(camera: FloatArray) -> FloatArray:
+    """A camera's place (3,) in the rig's frame."""
+    return np.asarray(-camera[:9].reshape(3, 3).T @ camera[9:])
 
 
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:

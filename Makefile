@@ -36,6 +36,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, rendere
 	$(BIN)/python scripts/benchmark_focal.py
 	$(BIN)/python scripts/benchmark_calibration.py
 	$(BIN)/python scripts/benchmark_render.py
+	$(BIN)/python scripts/benchmark_masks.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
 ifneq ($(CADALIGN_DATA),)
 	$(BIN)/python scripts/benchmark_align.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet

@@ -172,15 +172,12 @@ def test_no_readable_file_is_refused(tmp_path):
         Objectron(tmp_path)
 
 
-def test_every_truncation_of_a_file_is_told_or_read(tmp_path):
+def test_every_truncation_of_a_file_is_told(tmp_path):
     good = sequence_bytes(frames=1)
     for length in range(0, len(good), 7):
         path = write_bytes(tmp_path / "x.pbdata", good[:length])
-        try:
-            sequence = read_sequence(path)
-            sequence.frame(0)
-        except DataError as error:
-            assert "x.pbdata" in str(error)
+        with pytest.raises(DataError, match=r"x\.pbdata"):
+            read_sequence(path).frame(0)
 
 
 def test_decoding_follows_the_wire_format():
@@ -193,4 +190,4 @@ def test_decoding_follows_the_wire_format():
     with pytest.raises(InputError, match="cut short"):
         decode(bytes.fromhex("12077465"), fields)
     with pytest.raises(InputError):
-        decode(bytes.fromhex("0a0101"), fields)
+        decode(bytes.fromhex("0b01"), fields)

@@ -153,8 +153,7 @@ def test_bad_objects_and_files_do_not_stop_the_others(root):
 
 def test_cad_files_are_checked_when_they_are_read(root):
     chair = Pascal3D(root)[0].objects[0]
-    savemat(root / "CAD" / "other.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
-    (root / "CAD" / "other.mat").rename(root / "CAD" / "bad" if False else root / "CAD" / "x.mat")
+    savemat(root / "CAD" / "x.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
     model = type(chair.model.source)(root / "CAD" / "x.mat", "chair", 2)
     with pytest.raises(DataError, match="no model 2, only 1"):
         model.load_mesh()

@@ -110,6 +110,7 @@ def test_damaged_files_are_told(root):
         Pix3D(root)
 
 
+@pytest.mark.slow
 def test_ten_thousand_records_take_little_memory_and_time(root):
     """One record at a time is parsed: what grows with their number is the file itself."""
     count = 10_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -94,7 +95,6 @@ def align(
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
-    _refuse_masks(given)
     prior = prior_of(model)
     minima: list[Minimum] = []
     iterations = hypotheses = 0
@@ -122,7 +122,14 @@ def align(
         )
     minima.sort(key=lambda minimum: minimum.score)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    return assemble(model, prior, given, minima, stats)
+    if all(view.mask is None for view in given):
+        return assemble(model, prior, given, minima, stats)
+    from cadalign.fitting.contours.depth import fit_depths
+    from cadalign.fitting.contours.fit import fit_masks  # with OpenCV and embree
+
+    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
+    stats = replace(stats, seconds=time.perf_counter() - start)
+    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
 
 
 def align_batch(
@@ -223,9 +230,3 @@ def _check_start(size: object, init: object) -> None:
     if init is not None and not isinstance(init, Alignment):
         what = f"expected a cadalign.Alignment, got {type(init).__name__}"
         raise InputError(what, where="init")
-
-
-def _refuse_masks(views: Sequence[View]) -> None:
-    for number, view in enumerate(views):
-        if view.mask is not None:
-            raise InputError("not supported yet", where=f"views[{number}].mask")

@@ -61,11 +61,11 @@ def assemble(
     """The result of minima, the likeliest first.
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely minima are.
+    the likely minima are, each with the shape's deviations widened by the inflation.
     """
     likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
     likely = [
-        _estimate(each, likelihood)
+        _estimate(_widened(each, prior.inflation), likelihood, len(prior.ids))
         for each, likelihood in zip(minima, likelihoods, strict=True)
         if likelihood >= LEAST_LIKELIHOOD
     ]
@@ -108,10 +108,24 @@ def assemble(
     )
 
 
-def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
+def _widened(minimum: Minimum, factor: float) -> Minimum:
+    """The same points under a prior of wider deviations."""
+    if factor == 1:
+        return minimum
+    shape, state = minimum.evidence.shape, minimum.state
+    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
+    return minimum._replace(
+        evidence=minimum.evidence._replace(shape=wide),
+        state=state._replace(coefficients=state.coefficients / factor),
+    )
+
+
+def _estimate(minimum: Minimum, likelihood: float, keypoints: int) -> _Estimate:
     scale = np.exp(minimum.state.log_scales)
-    stretched = points_of(minimum.evidence.shape, minimum.state)
-    seen = stretched[np.unique(minimum.evidence.sightings.point)]
+    rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
+    stretched = points_of(minimum.evidence.shape, minimum.state)[rows]
+    sighted = np.unique(minimum.evidence.sightings.point)
+    seen = stretched[sighted[sighted < keypoints]]
     if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
@@ -122,8 +136,8 @@ def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
         _poses(minimum, scale),
         stretched[-1] - stretched[-2],
         pose_and_lengths(minimum.evidence, minimum.state, unknowns),
-        of_points,
-        of_seen,
+        of_points[rows],
+        of_seen[rows],
         likelihood,
     )
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.fitting.contours.residuals import MaskResiduals
 from cadalign.fitting.joint.contributions import Basis, contributions_of
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
@@ -95,6 +96,8 @@ class AlignResult:
     stats : FitStats
     evidence : tuple of EvidenceSummary
         Agreement of every piece of evidence with the estimate.
+    mask_residuals : tuple of MaskResiduals or None
+        Agreement of the contour of every view's mask with the estimate; empty without masks.
     rig_from_model : Alignment, optional
         The alignment in the frame that views with ``cam_from_rig`` share; None without them.
     basis : Basis, optional
@@ -118,6 +121,7 @@ class AlignResult:
     warnings: tuple[str, ...]
     stats: FitStats
     evidence: tuple[EvidenceSummary, ...] = ()
+    mask_residuals: tuple[MaskResiduals | None, ...] = ()
     rig_from_model: Alignment | None = None
     basis: Basis | None = field(default=None, repr=False)
 
@@ -206,8 +210,8 @@ class AlignResult:
         >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], [1.2, 1.1, 0.9])
         >>> view = View(camera, camera.project(truth.apply(corners)))
         >>> result = align(Model(points_3d=corners), view, size=Size(width=1.2))
-        >>> [(each.name, each.without.scale[0]) for each in result.contributions()]
-        [('views[0].points_2d', inf), ('size', inf)]
+        >>> [(each.name, round(each.without.scale[0], 3)) for each in result.contributions()]
+        [('views[0].points_2d', 0.01), ('size', inf)]
         """
         if self.basis is None:
             if self.model is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,8 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
             return placed
     if not all(per_pose):
         return np.empty((0, poses, 12)), np.empty((0, 3))
+    if is_metric and init is None and (np.bincount(rig.pose) > 1).any():
+        return _with_rig(evidence, per_pose)
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
@@ -60,6 +62,48 @@ class Start(NamedTuple):
 
     pose: FloatArray
     log_scales: FloatArray
+
+
+def _with_rig(
+    evidence: Evidence, per_pose: list[list[tuple[FloatArray, FloatArray]]]
+) -> tuple[FloatArray, FloatArray]:
+    """Starts whose scales are those of the rig with the most views; the other poses follow."""
+    main = int(np.argmax(np.bincount(evidence.rig.pose)))
+    rotations = np.array([pose[:9] for pose, _ in per_pose[main]]).reshape(-1, 3, 3)
+    placed, log_scales = metric_starts(_of_pose(evidence, main), rotations)
+    starts = []
+    for k, (own, logs) in enumerate(zip(placed[:, 0], log_scales, strict=True)):
+        for rank in range(MOST_PER_VIEW if k == 0 else 1):
+            start = []
+            for p, found in enumerate(per_pose):
+                pose, scales = found[min(rank, len(found) - 1)]
+                centre = _centre(evidence.rig.cam_from_rig[evidence.rig.pose == p][0])
+                enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
+                start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
+            starts.append((np.array(start), logs))
+    kept = starts[:_MOST]
+    poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
+    return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
+
+
+def _centre(camera: FloatArray) -> FloatArray:
+    """A camera's place (3,) in the rig's frame."""
+    return np.asarray(-camera[:9].reshape(3, 3).T @ camera[9:])
+
+
+def _of_pose(evidence: Evidence, pose: int) -> Evidence:
+    """The evidence of the views that share a pose."""
+    chosen = evidence.rig.pose == pose
+    columns: dict[str, Any] = {
+        name: type(rows)(*(column[chosen[rows.image]] for column in rows))
+        for name, rows in (
+            ("sightings", evidence.sightings),
+            ("directions", evidence.directions),
+            ("heights", evidence.heights),
+            ("planes", evidence.planes),
+        )
+    }
+    return evidence._replace(**columns)
 
 
 def _sized(

@@ -92,12 +92,13 @@ class Fit(ObservationCommand):
         console = new_console()
         status = console.status("fitting (the first time after an installation takes a minute)")
         result: FitResult | AlignResult
-        if self.shape is None and self.shape_sigma is None:
+        command = self._with_stored_shape()
+        if command.shape is None and command.shape_sigma is None:
             result, picture = self._fit(console, status)
         else:
             from cadalign.cli.fit_shape import fit_shape
 
-            result, picture = fit_shape(self, status)
+            result, picture = fit_shape(command, status)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
         make_folder(out)
         text = json.dumps(result.to_dict(), indent=2) + "\n"
@@ -109,6 +110,16 @@ class Fit(ObservationCommand):
             new_console(stderr=False).print(str(result), markup=False)
             console.print(f"Picture: {out / 'overlay.png'}", markup=False)
         return 0
+
+    def _with_stored_shape(self) -> Fit:
+        """The command with the shape that the file names, unless a flag gives one."""
+        if not self.stored or self.shape is not None or self.shape_sigma is not None:
+            return self
+        from cadalign.io.observation import Observation
+
+        observation = Observation.load(self.observation, needs_xyz=False)
+        sigma = observation.fit_options.get("shape_sigma")
+        return replace(self, shape=observation.shape, shape_sigma=sigma)
 
     def _fit(self, console: Console, status: Status) -> tuple[FitResult, ByteImage]:
         """Fit the stretched model; returns the result and its picture."""
@@ -138,7 +149,8 @@ class Fit(ObservationCommand):
         """Options of the fit: those of the flags, otherwise those of the file."""
         from cadalign.io.documents import in_file, within
 
-        given = observation.fit_options if self.stored else {}
+        given = dict(observation.fit_options) if self.stored else {}
+        given.pop("shape_sigma", None)
         with in_file(self.observation), within("fit"):
             stored = FitOptions(**given)
         set_by_flags = {

@@ -12,6 +12,7 @@ The file holds one object::
       ],
       "image": "photo.png",
       "model": "chair.obj",
+      "shape": "chair.shape",
       "fit": {"sigma": null, "loss": "linear"}
     }
 
@@ -23,7 +24,9 @@ with integers at pixel centres, of the photo as it is seen: turned upright where
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``; and
+``shape_sigma``, that of `cadalign.Model`. ``shape``, optional, is a file of `cadalign shape learn`,
+which takes the model's place.
 """
 
 from __future__ import annotations
@@ -79,6 +82,7 @@ class _FitFields(Document):
     scale_prior_sigma: Positive | UnsetType | None = UNSET
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
+    shape_sigma: Positive | UnsetType = UNSET
 
 
 class _ObservationFile(Document):
@@ -89,6 +93,7 @@ class _ObservationFile(Document):
     image: PathText | None = None
     model: PathText | None = None
     fit: _FitFields = msgspec.field(default_factory=_FitFields)
+    shape: PathText | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +118,9 @@ class Observation:
     image, model : Path, optional
         The photo and the CAD model.
     fit_options : mapping
-        Keyword arguments for `cadalign.fit` where they are not its defaults; see the module.
+        Options of a fit where they are not the defaults of `cadalign.fit`; see the module.
+    shape : Path, optional
+        File of the learned shape that takes the model's place.
     """
 
     points_3d: FloatArray
@@ -126,6 +133,7 @@ class Observation:
     image: Path | None = None
     model: Path | None = None
     fit_options: Mapping[str, Any] = field(default_factory=dict)
+    shape: Path | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
@@ -181,6 +189,7 @@ class Observation:
             image=None if read.image is None else path_from(read.image, folder),
             model=None if read.model is None else path_from(read.model, folder),
             fit_options=msgspec.to_builtins(read.fit),
+            shape=None if read.shape is None else path_from(read.shape, folder),
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
@@ -200,7 +209,7 @@ class Observation:
                 for keypoint, value in zip(keypoints, listed, strict=True):
                     keypoint[name] = value
         data: dict[str, Any] = {"camera": self.camera.to_dict(), "keypoints": keypoints}
-        for name, path in (("image", self.image), ("model", self.model)):
+        for name, path in (("image", self.image), ("model", self.model), ("shape", self.shape)):
             if path is not None:
                 data[name] = written_path(path, folder=folder)
         if self.fit_options:

@@ -128,7 +128,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             DATA | {"cameras": 3},
             "{path}: top level: unknown field 'cameras'; "
-            "known are camera, fit, image, keypoints, model",
+            "known are camera, fit, image, keypoints, model, shape",
         ),
         (
             DATA | {"x` - at `$.y": 3},

@@ -48,7 +48,8 @@ class AlignedShape:
     ----------
     alignment : Alignment
         Takes the box of the model that other methods are given to the estimated one.
-    std : Uncertainty
+    std : Uncertainty, optional
+        None for a method that states none.
     rms : float
         Of the residuals [px].
     sigma : float
@@ -60,7 +61,7 @@ class AlignedShape:
     """
 
     alignment: Alignment
-    std: Uncertainty
+    std: Uncertainty | None
     rms: float
     sigma: float
     warnings: tuple[str, ...]

@@ -19,12 +19,12 @@ A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON 
     }
 
 ``bounds`` and ``points_3d`` are those of the model that the methods were given, which is the
-dataset's times ``stretch``. The estimate of the method ``shape``, which is not given that model,
-takes the model's box to the estimated one; its ``std`` is that of lengths relative to the mean
-shape. It and its alternatives have, besides, ``"warp": {"from": [[3], ...], "to": [[3], ...]}``:
-keypoints of that model, and their places on the estimated object in the coordinates of the model,
-by which the model is warped before the pose. ``std`` and ``sigma`` are null for methods that have
-none.
+dataset's times ``stretch``. Estimates of the object's own shape take the model's box to the
+estimated one; their ``std`` is that of lengths relative to the mean shape, or the model that was
+stretched. They and their alternatives have, besides,
+``"warp": {"from": [[3], ...], "to": [[3], ...]}``: keypoints of that model, and their places on the
+estimated object in the coordinates of the model, by which the model is warped before the pose.
+``std`` and ``sigma`` are null for methods that have none.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
         "method": method,
         **_pose(pose_of(estimate)),
         **_warp(estimate),
-        "rms_px": round(outcome.values["rms_px"], _PIXEL_DIGITS),
+        "rms_px": _rms_px(outcome, estimate),
         "sigma": None if fit is None else fit.sigma,
         "std": None if fit is None or fit.std is None else vars(fit.std),
         "warnings": () if fit is None else fit.warnings,
@@ -136,6 +136,14 @@ def _pose(alignment: Alignment) -> dict[str, Any]:
     packed = [alignment.rotation.ravel(), alignment.translation, alignment.scale]
     values = _rounded(np.concatenate(packed))
     return {"rotation": values[:9], "translation": values[9:12], "scale": values[12:]}
+
+
+def _rms_px(outcome: Outcome, estimate: object) -> float | None:
+    """The residual of the result table, or else the estimate's own."""
+    rms = outcome.values.get("rms_px")
+    if rms is None and isinstance(estimate, AlignedShape):
+        rms = estimate.rms
+    return None if rms is None or not np.isfinite(rms) else round(rms, _PIXEL_DIGITS)
 
 
 def _warp(estimate: object) -> dict[str, Any]:

@@ -92,7 +92,7 @@ export class Panel {
     if (!suggestion) {
       const text =
         alignment.status === "done"
-          ? "No other visible point would help."
+          ? nothingLeft(shape)
           : `Mark the same place in the photo and on the model; either comes first. ${shape ? "Three" : "Four"} pairs give the first alignment.`;
       this.advice.replaceChildren(h("p", { class: "soft" }, text));
       return;
@@ -204,6 +204,13 @@ export class Panel {
       onchange: (event) => this.handlers.act({ do: "rename", pair: pair.pair, name: event.target.value }),
     });
   }
+}
+
+/** Why no point is suggested. */
+function nothingLeft(shape) {
+  if (!shape) return "No other visible point would help.";
+  if (!shape.category) return "Every further pair helps; best far from the others.";
+  return `All visible keypoints of ${shape.category} that this model has are marked.`;
 }
 
 function wrong(pair) {

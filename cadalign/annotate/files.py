@@ -190,6 +190,12 @@ class AnnotationFiles:
             observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=model)
         else:
             observation = Observation.load(self.observation)
+        if not observation.is_plain:
+            raise DataError(
+                "has evidence beyond keypoints in one image, which the annotator would not keep",
+                where=str(self.observation),
+                fix="give another --observation",
+            )
         refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
 

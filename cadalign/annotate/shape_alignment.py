@@ -16,7 +16,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.fitting.joint.align import align
 from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.observed import view_of
+from cadalign.fitting.joint.observed import views_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.options import RansacOptions
 from cadalign.geometry.camera import Camera
@@ -94,11 +94,10 @@ def align_shape(
     missing = LEAST_SHAPE_PAIRS - int(counts.sum())
     if observation is None or missing > 0:
         return LiveShape(None, _missing(missing, shape, all_count=bool(counts.all())))
-    sigma = LEAST_SIGMA if observation.sigma is None else observation.sigma
     mesh = wireframe.scene.mesh
     try:
         model = shape.model_with(anchors.values(), mesh)
-        view = view_of(observation, model, sigma=sigma)
+        (view,) = views_of(observation, model)
         result = align(model, view)
     except CadalignError as error:
         return LiveShape(None, f"No alignment: {error}.")

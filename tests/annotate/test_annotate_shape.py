@@ -19,6 +19,7 @@ from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence
 from cadalign.shapes.examples import Example
 
 LACKING = 2  # keypoints of the model that the learned shape does not know
@@ -248,3 +249,15 @@ def test_bad_options_are_refused(
     with pytest.raises(CadalignError) as refused:
         case.open(**options(shape_file))
     assert words in str(refused.value)
+
+
+def test_evidence_that_would_be_lost_is_refused(case: Case) -> None:
+    instance = case.instance
+    Observation(
+        instance.points_3d,
+        instance.points_2d,
+        instance.camera,
+        evidence=ImageEvidence(up=np.array([0.0, -1.0, 0.0])),
+    ).save(case.observation)
+    with pytest.raises(CadalignError, match="evidence beyond keypoints"):
+        case.open()

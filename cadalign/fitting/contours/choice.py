@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -52,10 +51,13 @@ def _nearest_with_mesh(
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
         raise InputError("no training model has a mesh, which a mask wants", where=where, fix=fix)
-    each = [_only(training, row) for row in rows]
-    distances = [replace(model, training=alone).nearest(points_3d).distance for alone in each]
+    gaps = training.points_3d[rows].astype(np.float64) - points_3d
+    squares = (gaps**2).sum(axis=2)
+    known = np.isfinite(squares)
+    sums = np.where(known, squares, 0.0).sum(axis=1)
+    distances = np.where(known.any(axis=1), sums / np.maximum(known.sum(axis=1), 1), np.inf)
     order = np.argsort(distances, kind="stable")[:_MOST_MESHES]
-    return [each[k] for k in order]
+    return [_only(training, rows[k]) for k in order]
 
 
 def _only(training: TrainingShapes, row: int) -> TrainingShapes:

@@ -25,8 +25,8 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.evaluation.accuracy.masks import DAMAGES, damaged_mask
 from cadalign.fitting.contours.bound import contour_bound
-from cadalign.fitting.joint.result import AlignResult
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 
@@ -35,7 +35,7 @@ NOISE_PX = 1.0
 STRETCH = 2.0
 LEAST_KEYPOINTS = 4
 KINDS = (*DAMAGES, "border")
-BOUND_DRAWS = 200
+BOUND_DRAWS = 20
 
 
 @dataclass
@@ -84,7 +84,7 @@ def main(arguments: Arguments) -> None:
         if arguments.keypointnet is not None:
             models.extend(m for m in KeypointNet(arguments.keypointnet) if _has_obj(m))
         cases = list(draw_cases(models, arguments.views, arguments.seed))
-    console = Console()
+    console = Console(width=220)
     results = {}
     table = new_table(f"masks, {len(cases)} views: medians", *COLUMNS)
     for kind in arguments.kinds:
@@ -109,6 +109,7 @@ COLUMNS = (
     "stretch_bound",
     "iou_keypoints",
     "iou",
+    "iou_bound",
     "iou_bottles",
     "sigma",
     "left_out",
@@ -174,9 +175,9 @@ def cut_by_border(case: Case, rng: np.random.Generator) -> Case:
     return case_of(case.annotated, case.scene, camera, case.truth, visible, rng)
 
 
-def errors(result: AlignResult, case: Case) -> list[float]:
+def errors(est: Alignment, case: Case) -> list[float]:
     """Rotation [deg], larger stretch error [%], box IoU."""
-    est, gt = result.alignment, case.truth
+    gt = case.truth
     iou = alignment_box_iou(est=est, gt=gt, bounds=case.scene.bounds)
     stretch = 100 * float(np.abs(est.scale / gt.scale - 1)[1:].max())
     return [rotation_error(est=est, gt=gt), stretch, iou]
@@ -198,15 +199,15 @@ def measure(cases: list[Case], kind: str, arguments: Arguments) -> dict[str, flo
             print(kind, case.annotated.model_id, error)
             continue
         seconds.append(time.perf_counter() - start)
-        alone.append(errors(without, case))
-        joint.append(errors(result, case))
+        alone.append(errors(without.alignment, case))
+        joint.append(errors(result.alignment, case))
         bottles.append(case.annotated.category.endswith("bottle"))
         (residuals,) = result.mask_residuals
         assert residuals is not None
         left_out += not residuals.is_used
         sigmas.append(residuals.sigma)
         bound = contour_bound(model, case.view(mask), case.truth)
-        bounds.append(ideal(bound, rng))
+        bounds.append(ideal(bound, case, rng))
         if arguments.verbose:
             a, b = alone[-1], joint[-1]
             print(
@@ -232,6 +233,7 @@ def measure(cases: list[Case], kind: str, arguments: Arguments) -> dict[str, flo
         "stretch_bound": float(np.median(draws[1])),
         "iou_keypoints": float(iou_alone),
         "iou": float(iou),
+        "iou_bound": float(np.median(draws[2])),
         "iou_bottles": float(np.median(of_bottles)) if len(of_bottles) else float("nan"),
         "sigma": float(np.nanmedian(sigmas)),
         "left_out": float(left_out),
@@ -239,11 +241,16 @@ def measure(cases: list[Case], kind: str, arguments: Arguments) -> dict[str, flo
     }
 
 
-def ideal(bound: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Rotation [deg] and larger stretch error [%] of an ideal estimator, (2, draws)."""
+def ideal(bound: np.ndarray, case: Case, rng: np.random.Generator) -> np.ndarray:
+    """Errors as of `errors` of an ideal estimator, (3, draws)."""
     drawn = rng.multivariate_normal(np.zeros(9), bound, size=BOUND_DRAWS, method="eigh")
-    rotation = np.degrees(np.linalg.norm(drawn[:, :3], axis=1))
-    return np.array([rotation, 100 * np.abs(np.expm1(drawn[:, 6:])).max(axis=1)])
+    found = []
+    for turn, shift, logs in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6:], strict=True):
+        rotation = rotation_from_vector(turn) @ case.truth.rotation
+        scale = case.truth.scale * np.exp(logs)
+        estimate = Alignment(rotation, case.truth.translation + shift, scale)
+        found.append(errors(estimate, case))
+    return np.array(found).T
 
 
 def neighbours(cases: list[Case], arguments: Arguments) -> dict[str, float]:
@@ -255,10 +262,10 @@ def neighbours(cases: list[Case], arguments: Arguments) -> dict[str, float]:
         mask = beside(other.mask, case.mask, rng)
         if mask is None:
             continue
-        alone = errors(align(case.model, case.view(None)), case)
+        alone = errors(align(case.model, case.view(None)).alignment, case)
         result = align(case.model, case.view(mask))
         named.append(any("views[0].mask" in text for text in result.warnings))
-        ratios.append(errors(result, case)[0] / alone[0])
+        ratios.append(errors(result.alignment, case)[0] / alone[0])
         if arguments.verbose:
             print(case.annotated.category, other.annotated.category, named[-1], f"{ratios[-1]:.2f}")
     return {

@@ -28,7 +28,7 @@ from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.search import joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance
 
 _LEAST_FREE = 3  # keypoints of a view that moved in an unknown way
 _OF_FIT = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns of keypoints in one view: x has the scale 1

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import CadalignError, DataError, InputError, brief
 from cadalign.fitting.contours.surface import RigidSurface, Surface, WarpedSurface
 from cadalign.fitting.joint.model import Model
 from cadalign.geometry.mesh import Mesh
@@ -71,6 +71,13 @@ def _of_training(alone: TrainingShapes) -> Surface:
 
 
 def _load(path: Path) -> Mesh:
-    from cadalign.datasets import load_mesh  # its readers take long to import
+    """The triangles of a mesh file; their order and look don't matter to a silhouette."""
+    import trimesh  # takes long to import
 
-    return load_mesh(path)
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        return Mesh(loaded.vertices, loaded.faces, source=str(path))
+    except CadalignError:
+        raise
+    except Exception as error:  # trimesh's readers raise all kinds
+        raise DataError(f"the mesh cannot be read ({brief(error)})", where=str(path)) from None

@@ -180,7 +180,11 @@ def list_cars(path: Path) -> Iterator[KeypointFrame | DataError]:
         return
     for number, raw in enumerate(entries):
         place = f"[{number}]"
-        entry = parse(raw, Any, path=path, where=place)
+        try:
+            entry = parse(raw, Any, path=path, where=place)
+        except DataError as error:
+            yield error
+            continue
         image = entry.get("image") if isinstance(entry, dict) else None
         stem = Path(image).stem if isinstance(image, str) and "\0" not in image else str(number)
         yield KeypointFrame(f"{stem}#{number}", path, place, entry)

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance
+from cadalign.shapes.calibration import find_inflation
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -36,13 +37,15 @@ _UNLIKE = 0.01  # share of models
 _TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
 _MODE_TOLERANCE = 0.1  # modes cost next to nothing
 _FOLDS = 3
+_MOST_CALIBRATED = 100  # models of a fold
 _LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
 _MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
-_CLUSTERINGS = 5
+_CLUSTERINGS = 3  # in each space
+_PROBE_ROUNDS = 5
 _STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
@@ -69,6 +72,7 @@ class Learned:
 
     components: tuple[ShapeComponent, ...]
     reflection: Reflection | None
+    inflation: float
 
 
 @dataclass(frozen=True)
@@ -114,14 +118,15 @@ class _Models:
         common = learn_gaussian(vectors, strength=recipe.strength, floor=floor, rounds=_ROUNDS)
         if recipe.components == 1:
             return common
-        return learn_mixture(
-            vectors,
-            _clusters(vectors, common, recipe.components),
-            common,
-            strength=_MIXTURE_STRENGTH,
-            floor=floor,
-            rounds=_ROUNDS,
-        )
+
+        def learn(labels: IntArray, rounds: int) -> Gaussians:
+            return learn_mixture(
+                vectors, labels, common, strength=_MIXTURE_STRENGTH, floor=floor, rounds=rounds
+            )
+
+        clusterings = _clusterings(vectors, common, recipe.components)
+        scores = [self.log_likelihoods(learn(each, _PROBE_ROUNDS)).sum() for each in clusterings]
+        return learn(clusterings[int(np.argmax(scores))], _ROUNDS)
 
     def log_likelihoods(self, mixture: Gaussians) -> FloatArray:
         """Log-likelihood of each model at the resolution of images, (N,) float.
@@ -165,13 +170,14 @@ class _CrossValidation:
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
         self._on_progress, self._done = on_progress, 0
 
-    def choose(self, options: LearnOptions) -> tuple[_Recipe, int]:
-        """Choose a recipe and the number of modes."""
+    def choose(self, options: LearnOptions) -> tuple[_Recipe, int, float]:
+        """Choose a recipe, the number of modes, and the factor of stated deviations."""
         best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
         if options.reflection:
             best = self._with_reflection(best)
         best = self._with_components(best, options.components)
-        return best.recipe, options.modes or self._modes(best)
+        modes = options.modes or self._modes(best)
+        return best.recipe, modes, self._inflation(best, modes)
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -193,6 +199,14 @@ class _CrossValidation:
         counts = [*(count for count in _MODES if count < full), full]
         parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
         return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
+
+    def _inflation(self, trial: _Trial, modes: int) -> float:
+        held_out = [
+            (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
+            for fold, mixture in enumerate(trial.learned)
+        ]
+        sigma = _RESOLUTION * self._models.size
+        return find_inflation(held_out, sigma=sigma, rng=np.random.default_rng(0))
 
     def _try(self, recipe: _Recipe) -> _Trial:
         learned = []
@@ -226,12 +240,12 @@ def learn_components(
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
             recipe = _Recipe(components=options.components or 1)
-            modes = options.modes
+            modes, inflation = options.modes, 1.0
         else:
-            recipe, modes = _CrossValidation(models, on_progress).choose(options)
+            recipe, modes, inflation = _CrossValidation(models, on_progress).choose(options)
         mixture = models.mixture(recipe)
     on_progress(_STEPS, _STEPS)
-    return Learned(_components(mixture, modes), recipe.reflection)
+    return Learned(_components(mixture, modes), recipe.reflection, inflation)
 
 
 def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:
@@ -243,19 +257,26 @@ def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[Keyp
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 
 
-def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
-    """Cluster the completed vectors by their main coefficients."""
-    _, directions = np.linalg.eigh(common.covariances[0])
-    coefficients = (vectors.completed(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
-    tries = []
-    for seed in range(_CLUSTERINGS):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
-            centres, labels = kmeans2(coefficients, count, minit="++", seed=seed)
-        tries.append((float(((coefficients - centres[labels]) ** 2).sum()), seed, labels))
-    labels = min(tries)[2].astype(np.int64)
-    labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
-    return np.asarray(labels)
+def _clusterings(vectors: Vectors, common: Gaussians, count: int) -> list[IntArray]:
+    """Cluster the completed vectors by their main coefficients, in several ways.
+
+    Distances are those in space or, since kinds of objects may differ in what varies little, those
+    of coefficients of unit variance.
+    """
+    values, directions = np.linalg.eigh(common.covariances[0])
+    directions = directions[:, -_CLUSTER_MODES:]
+    coefficients = (vectors.completed(common) - common.means[0]) @ directions
+    spaces = [coefficients, coefficients / np.sqrt(values[-_CLUSTER_MODES:])]
+    found = []
+    for space in spaces:
+        for seed in range(_CLUSTERINGS):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
+                _, labels = kmeans2(space, count, minit="++", seed=seed)
+            labels = labels.astype(np.int64)
+            labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
+            found.append(labels)
+    return found
 
 
 def _components(mixture: Gaussians, modes: int | None) -> tuple[ShapeComponent, ...]:

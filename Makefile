@@ -38,6 +38,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, rendere
 	$(BIN)/python scripts/benchmark_render.py
 	$(BIN)/python scripts/benchmark_masks.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
 ifneq ($(CADALIGN_DATA),)
+	$(BIN)/python scripts/benchmark_align.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello
 endif

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cadalign.fitting.fit import fit, fit_batch
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
+    from cadalign.fitting.joint.reconstruction import views_from
     from cadalign.fitting.joint.result import AlignResult
     from cadalign.fitting.joint.size import Size
     from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
@@ -61,6 +62,7 @@ __all__ = [
     "retrieval",
     "simulate",
     "solvers",
+    "views_from",
 ]
 
 # Imported when first asked for, so that `import cadalign` stays quick.
@@ -69,6 +71,7 @@ _NAMES = {
     "Model": "cadalign.fitting.joint.model",
     "Contribution": "cadalign.fitting.joint.summary",
     "EvidenceSummary": "cadalign.fitting.joint.summary",
+    "views_from": "cadalign.fitting.joint.reconstruction",
     "Size": "cadalign.fitting.joint.size",
     "View": "cadalign.fitting.joint.view",
     "align": "cadalign.fitting.joint.align",

@@ -30,7 +30,6 @@ from cadalign.datasets.sfm.bundler import Bundler
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
 from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
-from cadalign.datasets.sfm.views import views_from
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",
@@ -76,6 +75,5 @@ __all__ = [
     "open_photos",
     "read_image_keypoints",
     "sample_models",
-    "views_from",
     "write_sample_dataset",
 ]

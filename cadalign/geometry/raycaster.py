@@ -94,6 +94,10 @@ class RayCaster:
         face = self._first_faces(origin, directions, start)
         return face, self._distances(origin, directions, face)
 
+    def normals(self, face: FaceArray | npt.NDArray[np.int64]) -> FloatArray:
+        """Unit normals (n, 3) of triangles (n,)."""
+        return self._normals[face]
+
     def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
         return np.asarray(self._first_faces(origin, directions, None) >= 0)

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance
+from cadalign.shapes.calibration import find_inflation
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -36,6 +37,7 @@ _UNLIKE = 0.01  # share of models
 _TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
 _MODE_TOLERANCE = 0.1  # modes cost next to nothing
 _FOLDS = 3
+_MOST_CALIBRATED = 100  # models of a fold
 _LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
@@ -70,6 +72,7 @@ class Learned:
 
     components: tuple[ShapeComponent, ...]
     reflection: Reflection | None
+    inflation: float
 
 
 @dataclass(frozen=True)
@@ -167,13 +170,14 @@ class _CrossValidation:
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
         self._on_progress, self._done = on_progress, 0
 
-    def choose(self, options: LearnOptions) -> tuple[_Recipe, int]:
-        """Choose a recipe and the number of modes."""
+    def choose(self, options: LearnOptions) -> tuple[_Recipe, int, float]:
+        """Choose a recipe, the number of modes, and the factor of stated deviations."""
         best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
         if options.reflection:
             best = self._with_reflection(best)
         best = self._with_components(best, options.components)
-        return best.recipe, options.modes or self._modes(best)
+        modes = options.modes or self._modes(best)
+        return best.recipe, modes, self._inflation(best, modes)
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -195,6 +199,14 @@ class _CrossValidation:
         counts = [*(count for count in _MODES if count < full), full]
         parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
         return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
+
+    def _inflation(self, trial: _Trial, modes: int) -> float:
+        held_out = [
+            (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
+            for fold, mixture in enumerate(trial.learned)
+        ]
+        sigma = _RESOLUTION * self._models.size
+        return find_inflation(held_out, sigma=sigma, rng=np.random.default_rng(0))
 
     def _try(self, recipe: _Recipe) -> _Trial:
         learned = []
@@ -228,12 +240,12 @@ def learn_components(
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
             recipe = _Recipe(components=options.components or 1)
-            modes = options.modes
+            modes, inflation = options.modes, 1.0
         else:
-            recipe, modes = _CrossValidation(models, on_progress).choose(options)
+            recipe, modes, inflation = _CrossValidation(models, on_progress).choose(options)
         mixture = models.mixture(recipe)
     on_progress(_STEPS, _STEPS)
-    return Learned(_components(mixture, modes), recipe.reflection)
+    return Learned(_components(mixture, modes), recipe.reflection, inflation)
 
 
 def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:

@@ -82,6 +82,7 @@ class _Shape(Document):
     reflection: _Reflection | None
     training: _Training | None
     unit: str
+    inflation: Positive = 1.0  # files of before have none
 
 
 class ShapeFields(NamedTuple):
@@ -95,6 +96,7 @@ class ShapeFields(NamedTuple):
     reflection: Reflection | None
     training: TrainingShapes | None
     unit: str
+    inflation: float
 
 
 def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
@@ -122,6 +124,7 @@ def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
             [None if each is None else str(each) for each in training.mesh_paths],
         ),
         unit=model.unit,
+        inflation=model.inflation,
     )
     SEAL.write(Path(path), msgspec.msgpack.encode(document))
 
@@ -166,4 +169,5 @@ def _fields(read: _Shape) -> ShapeFields:
             tuple(None if each is None else Path(each) for each in training.mesh_paths),
         ),
         unit=read.unit,
+        inflation=read.inflation,
     )

@@ -46,6 +46,8 @@ _OBJECT = {
     6: Field("scale", "float", repeated=True),
 }
 _OBJECTS, _FRAMES = 1, 2
+# MessageToJson's name of a field whose name has a digit after an underscore.
+_JSON_NAMES = {"point2d": "point_2d"}
 _CAPITAL = re.compile(r"(?<=[a-z0-9])([A-Z])")
 
 _Three = Annotated[list[Finite], Meta(min_length=3, max_length=3)]
@@ -183,9 +185,11 @@ def _snake_case(value: Any) -> Any:
         return [_snake_case(each) for each in value]
     if isinstance(value, dict):
         return {
-            _CAPITAL.sub(lambda found: f"_{found[1].lower()}", name).replace(
-                "point2_d", "point_2d"
-            ): _snake_case(each)
+            _JSON_NAMES.get(name, _CAPITAL.sub(_lower, name)): _snake_case(each)
             for name, each in value.items()
         }
     return value
+
+
+def _lower(found: re.Match[str]) -> str:
+    return f"_{found[1].lower()}"

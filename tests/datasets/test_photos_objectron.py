@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.files import write_json
-from support.photo_data import message, rigid, write_photo, write_text
+from support.photo_data import assert_damage_is_told, message, rigid, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Objectron
@@ -172,15 +172,19 @@ def test_no_readable_file_is_refused(tmp_path):
         Objectron(tmp_path)
 
 
-def test_every_truncation_of_a_file_is_told_or_read(tmp_path):
+def test_every_truncation_of_a_file_is_told(tmp_path):
     good = sequence_bytes(frames=1)
     for length in range(0, len(good), 7):
         path = write_bytes(tmp_path / "x.pbdata", good[:length])
-        try:
-            sequence = read_sequence(path)
-            sequence.frame(0)
-        except DataError as error:
-            assert "x.pbdata" in str(error)
+        with pytest.raises(DataError, match=r"x\.pbdata"):
+            read_sequence(path).frame(0)
+
+
+def test_damaged_files_are_told(tmp_path):
+    write_bytes(tmp_path / "annotations" / "cup" / "batch-1" / "3.pbdata", sequence_bytes())
+    write_json(tmp_path / "annotations" / "cup" / "batch-1" / "4.json", sequence_json())
+    write_photo(tmp_path / "annotations" / "cup" / "batch-1" / "3" / "3.jpg", 48, 64)
+    assert_damage_is_told(tmp_path)
 
 
 def test_decoding_follows_the_wire_format():
@@ -193,4 +197,4 @@ def test_decoding_follows_the_wire_format():
     with pytest.raises(InputError, match="cut short"):
         decode(bytes.fromhex("12077465"), fields)
     with pytest.raises(InputError):
-        decode(bytes.fromhex("0a0101"), fields)
+        decode(bytes.fromhex("0b01"), fields)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from support.files import write_json
-from support.photo_data import write_photo, write_text
+from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Pascal3D, Pascal3DDetections
@@ -153,13 +153,16 @@ def test_bad_objects_and_files_do_not_stop_the_others(root):
 
 def test_cad_files_are_checked_when_they_are_read(root):
     chair = Pascal3D(root)[0].objects[0]
-    savemat(root / "CAD" / "other.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
-    (root / "CAD" / "other.mat").rename(root / "CAD" / "bad" if False else root / "CAD" / "x.mat")
+    savemat(root / "CAD" / "x.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
     model = type(chair.model.source)(root / "CAD" / "x.mat", "chair", 2)
     with pytest.raises(DataError, match="no model 2, only 1"):
         model.load_mesh()
     with pytest.raises(DataError, match="faces"):
         type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
+
+
+def test_damaged_files_are_told(root):
+    assert_damage_is_told(root)
 
 
 def test_nothing_there_is_told(tmp_path):

@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from support.files import TETRAHEDRON, write_json
-from support.photo_data import rigid, write_photo, write_text
+from support.photo_data import assert_damage_is_told, rigid, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Pix3D
@@ -110,6 +110,11 @@ def test_damaged_files_are_told(root):
         Pix3D(root)
 
 
+def test_any_damage_is_told(root):
+    assert_damage_is_told(root)
+
+
+@pytest.mark.slow
 def test_ten_thousand_records_take_little_memory_and_time(root):
     """One record at a time is parsed: what grows with their number is the file itself."""
     count = 10_000

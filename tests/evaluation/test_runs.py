@@ -388,7 +388,7 @@ def test_a_real_run_killed_ten_times_ends_with_the_same_bytes(tmp_path: Path) ->
 def wait_for_part(run: Path, process: subprocess.Popen[bytes], *, more: bool) -> None:
     """Wait for one more finished chunk, or only for a moment."""
     before = len(list((run / "parts").glob("*")))
-    end = time.monotonic() + (30 if more else 0.7)
+    end = time.monotonic() + (120 if more else 0.7)
     while time.monotonic() < end and process.poll() is None:
         if len(list((run / "parts").glob("*"))) > before and more:
             return

@@ -189,9 +189,10 @@ def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
 
 
 def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
+    learned = replace(learned, inflation=1.25)
     learned.save(tmp_path / "table.shape")
     opened = cadalign.ShapeModel.open(tmp_path / "table.shape")
-    for name in ("category", "ids", "has_box", "up_axis", "reflection", "unit"):
+    for name in ("category", "ids", "has_box", "up_axis", "reflection", "unit", "inflation"):
         assert getattr(opened, name) == getattr(learned, name)
     for mine, other in zip(learned.components, opened.components, strict=True):
         assert mine.weight == other.weight
@@ -202,6 +203,21 @@ def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
     assert learned.training is not None
     assert opened.training.model_ids == learned.training.model_ids
     assert opened.training.points_3d.tobytes() == learned.training.points_3d.tobytes()
+
+
+def test_a_file_without_inflation_is_read(learned: ShapeModel, tmp_path: Path) -> None:
+    file = tmp_path / "table.shape"
+    learned.save(file)
+    document = msgspec.msgpack.decode(SEAL.unwrap(file.read_bytes(), "table.shape"))
+    del document["inflation"]
+    SEAL.write(file, msgspec.msgpack.encode(document))
+    assert ShapeModel.open(file).inflation == 1
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_an_inflation_that_is_no_factor_is_refused(learned: ShapeModel, value: float) -> None:
+    with pytest.raises(InputError, match="inflation"):
+        replace(learned, inflation=value)
 
 
 @pytest.fixture(scope="module")

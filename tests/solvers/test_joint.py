@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
@@ -24,7 +25,6 @@ from cadalign.solvers.joint.evidence import (
     points_of,
 )
 from cadalign.solvers.joint.refine import move_state, refine_joint
-from cadalign.solvers.joint.search import joint_covariance
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
 POINTS, MODES, VIEWS = 7, 3, 2

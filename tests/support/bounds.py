@@ -10,8 +10,8 @@ from cadalign import Alignment
 from cadalign.fitting.joint.deviations import pose_and_lengths
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.search import joint_covariance
 
 
 def bound_of(result: AlignResult, truths: Sequence[Alignment]) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from cadalign import Alignment, Camera, View
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
-LOOK = np.array([[0.8, 0.0, 0.6], [0.36, -0.8, -0.48], [0.48, 0.6, -0.64]])
+LOOK = np.array([[0.8, 0.0, 0.6], [-0.36, -0.8, 0.48], [0.48, -0.6, -0.64]])
 DISTANCE = 5.0
 
 

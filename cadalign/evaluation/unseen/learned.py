@@ -41,8 +41,9 @@ class Learned:
         """Hash of the shape models and the library."""
         digest = hashlib.sha256(self.opened_library().fingerprint.encode())
         for category, path in self.shapes:
-            digest.update(f"{category}\0".encode())
-            for part in _open_shape(path).components:
+            shape = _open_shape(path)
+            digest.update(f"{category}\0{shape.inflation!r}\0".encode())
+            for part in shape.components:
                 numbers = [part.weight, *part.mean.ravel(), *part.modes.ravel()]
                 digest.update(np.append(numbers, part.residual_sigma).tobytes())
         return digest.hexdigest()[:16]

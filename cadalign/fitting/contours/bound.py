@@ -18,8 +18,8 @@ from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.search import joint_covariance
 
 _REACH = 8.0  # [px]
 _INLIER = 3.5  # in deviations

@@ -68,6 +68,7 @@ def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Eviden
         sightings=sightings,
         lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
         heights=evidence.heights._replace(point=_moved(evidence.heights.point, keypoints, total)),
+        planes=evidence.planes._replace(point=_moved(evidence.planes.point, keypoints, total)),
     )
 
 

@@ -12,6 +12,8 @@ from cadalign.fitting.joint.summary import EvidenceSummary
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 
+_OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
+
 
 def summaries_of(
     evidence: Evidence, state: State, cameras: Sequence[Camera]
@@ -64,7 +66,10 @@ def _of_depths(
         return []
     expected, measured, weights = _depths(evidence, state, points, view)
     errors = expected - measured
-    return [_summary("depth", view, errors, errors * weights, "")]
+    counted = np.abs(errors * weights) < _OUTLIER
+    if not counted.any():
+        counted[:] = True
+    return [_summary("depth", view, errors[counted], (errors * weights)[counted], "")]
 
 
 def depth_factor(evidence: Evidence, state: State, view: int) -> float:

@@ -124,9 +124,10 @@ def align(
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     if all(view.mask is None for view in given):
         return assemble(model, prior, given, minima, stats)
+    from cadalign.fitting.contours.depth import fit_depths
     from cadalign.fitting.contours.fit import fit_masks  # with OpenCV and embree
 
-    masks = fit_masks(model, prior, given, minima)
+    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
     stats = replace(stats, seconds=time.perf_counter() - start)
     return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
 

@@ -21,10 +21,10 @@ from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.joint.search import joint_covariance
 
-_SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
+_SAME = 9.0  # squared distance of rotations, in the best one's deviations, of equal estimates
 
 
 class Minimum(NamedTuple):
@@ -61,11 +61,11 @@ def assemble(
     """The result of minima, the likeliest first.
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely minima are.
+    the likely minima are, each with the shape's deviations widened by the inflation.
     """
     likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
     likely = [
-        _estimate(each, likelihood, len(prior.ids))
+        _estimate(_widened(each, prior.inflation), likelihood, len(prior.ids))
         for each, likelihood in zip(minima, likelihoods, strict=True)
         if likelihood >= LEAST_LIKELIHOOD
     ]
@@ -77,12 +77,13 @@ def assemble(
         rows = prior.rows_of(view.keypoint_ids, "ids")
         seen = view.camera.project(pose.apply(best.points[rows]))
         residuals.append(seen - cast(FloatArray, view.points_2d))
-    stretch = best.lengths / np.where(prior.lengths > 0, prior.lengths, 1.0)
-    stretch = np.where(prior.lengths > 0, stretch, 1.0)
+    of_mean = prior.lengths
+    stretch = np.where(of_mean > 0, best.lengths / np.where(of_mean > 0, of_mean, 1.0), 1.0)
+    information = np.linalg.pinv(best.covariance[:3, :3]) if len(likely) > 1 else np.zeros((3, 3))
     alternatives = tuple(
         AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
         for each, step in zip(likely[1:], steps[1:], strict=True)
-        if _differs(step, best)
+        if float(step[:3] @ information @ step[:3]) > _SAME
     )
     return AlignResult(
         alignment=best.poses[0],
@@ -104,6 +105,18 @@ def assemble(
         evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
         rig_from_model=_in_rig(views, minimum, best.scale),
         basis=Basis(minimum.evidence, minimum.state),
+    )
+
+
+def _widened(minimum: Minimum, factor: float) -> Minimum:
+    """The same points under a prior of wider deviations."""
+    if factor == 1:
+        return minimum
+    shape, state = minimum.evidence.shape, minimum.state
+    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
+    return minimum._replace(
+        evidence=minimum.evidence._replace(shape=wide),
+        state=state._replace(coefficients=state.coefficients / factor),
     )
 
 
@@ -144,13 +157,13 @@ def _moments(
 
     ``steps`` lead from the first to each.
     """
-    total = sum(each.likelihood for each in likely)
     best = likely[0]
-    covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
-    of_seen = np.zeros_like(best.of_seen)
-    for each, step in zip(likely, steps, strict=True):
-        weight = each.likelihood / total
-        covariance += weight * (each.covariance + np.outer(step, step))
+    share = 1.0 / sum(each.likelihood for each in likely)
+    covariance = share * best.covariance
+    of_points, of_seen = share * best.of_points, share * best.of_seen
+    for each, step in zip(likely[1:], steps[1:], strict=True):
+        weight = share * each.likelihood
+        covariance += weight * (each.covariance + step[:, None] * step)
         moved = each.points * each.scale - best.points * best.scale
         of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
         moved = each.poses[0].apply(each.points) - best.poses[0].apply(best.points)
@@ -166,12 +179,6 @@ def _step(best: _Estimate, other: _Estimate) -> FloatArray:
     logs[safe] = np.log(other.lengths[safe] / best.lengths[safe])
     turn = vector_from_rotation(second.rotation @ first.rotation.T)
     return np.concatenate([turn, second.translation - first.translation, logs])
-
-
-def _differs(step: FloatArray, best: _Estimate) -> bool:
-    """True for a step that turns the best estimate by more than its deviations."""
-    turn = step[:3]
-    return bool(turn @ np.linalg.pinv(best.covariance[:3, :3]) @ turn > _SAME)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
@@ -191,5 +198,6 @@ def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
         pose = minimum.state.poses[p]
         rotation = camera[:9].reshape(3, 3)
         turned = rotation @ pose[:9].reshape(3, 3)
-        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
+        shift = rotation @ pose[9:] + camera[9:]
+        poses.append(Alignment(turned, shift, scale, is_valid=True))
     return tuple(poses)

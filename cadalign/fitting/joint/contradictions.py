@@ -7,7 +7,7 @@ degrees as the piece has redundant equations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +15,10 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.fitting.joint.agreement import depth_factor
 from cadalign.fitting.joint.pieces import Piece, pieces_of, without
+from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.fitting.joint.summary import name_of
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
+from cadalign.solvers.joint.reduction import reduce_modes
 from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
@@ -24,7 +26,8 @@ _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
 _LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown of
 _WRONG_UNIT = 100.0  # factor between measured and expected depths
-_AS_LIKELY = 8.0  # difference of penalised costs of explanations that are both named
+_PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
+_AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
 
 Search = Callable[[Evidence], tuple[State, float] | None]
 
@@ -37,11 +40,6 @@ class _Trial(NamedTuple):
     equations: int
     misfit: float  # reduced chi-square of the rest, at least 1
     state: State
-
-    @property
-    def gain(self) -> float:
-        """Cost saved beyond what is expected of so many equations."""
-        return self.saved / self.misfit - 2.0 * self.equations
 
 
 class _Determined(NamedTuple):
@@ -64,6 +62,8 @@ def contradictions(
     pieces = pieces_of(evidence)
     if len(pieces) < 2:
         return ()
+    evidence, basis = reduce_modes(evidence)
+    state = state._replace(coefficients=state.coefficients @ basis)
     whole = _determined(evidence, state)
     trials = []
     for piece in pieces:
@@ -78,9 +78,10 @@ def contradictions(
     suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
     if not suspects:
         return ()
-    suspects.sort(key=lambda trial: -trial.gain)
+    noise = min(trial.misfit for trial in suspects)
+    suspects.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
     best = suspects[0]
-    alike = [trial for trial in suspects if best.gain - trial.gain < _AS_LIKELY]
+    alike = _as_likely(best, suspects, noise)
     names = [name_of(*trial.piece) for trial in alike]
     sigmas = np.sqrt(best.saved / best.misfit / best.equations)
     unit = next((text for trial in alike if (text := _wrong_unit(evidence, trial))), "")
@@ -88,6 +89,22 @@ def contradictions(
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
     return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
+    """Trials that explain the misfit as well as the best; the fewest equations of one view."""
+    found = []
+    for trial in suspects:
+        shortfall = (best.saved - trial.saved) / noise
+        fewer = max(best.equations - trial.equations, 0)
+        if shortfall < _AS_LIKELY + _PER_EQUATION * fewer:
+            found.append(trial)
+    freed = {trial.piece.view for trial in found if trial.piece.kind == "rig"}
+    return [
+        trial
+        for trial in found
+        if trial is best or trial.piece.kind != "keypoints" or trial.piece.view not in freed
+    ]
 
 
 def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
@@ -168,4 +185,6 @@ def count_equations(evidence: Evidence) -> int:
     count += 2 * len(evidence.directions.image) + len(evidence.lengths.weight)
     count += len(evidence.heights.weight) + len(evidence.planes.weight)
     count += len(evidence.shape.modes)
-    return count + int(np.linalg.matrix_rank(evidence.scales.precision))
+    if has_scale_prior(evidence.scales):
+        count += int(np.linalg.matrix_rank(evidence.scales.precision))
+    return count

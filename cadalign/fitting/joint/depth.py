@@ -35,14 +35,17 @@ def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View
         images.append(np.full(int(known.sum()), number))
         depths.append(depth[known])
         sigmas.append(relative * depth[known])
-    point = np.concatenate([np.empty(0, dtype=np.int64), *points])
+    if not points:
+        none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
+        return Planes(none, none, np.empty((0, 3)), no_value, no_value, none, no_value)
+    point = np.concatenate(points)
     count = len(point)
     return Planes(
         point,
-        np.concatenate([np.empty(0, dtype=np.int64), *images]),
+        np.concatenate(images),
         np.tile([0.0, 0.0, 1.0], (count, 1)),
-        np.concatenate([np.empty(0), *depths]),
-        1.0 / np.hypot(np.concatenate([np.empty(0), *sigmas]), shape.spread[point]),
+        np.concatenate(depths),
+        1.0 / np.hypot(np.concatenate(sigmas), shape.spread[point]),
         np.full(count, CAUCHY),
         np.full(count, _LOSS_SCALE),
     )

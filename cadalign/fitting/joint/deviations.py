@@ -20,9 +20,8 @@ def pose_and_lengths(evidence: Evidence, state: State, unknowns: FloatArray) -> 
     modes = shape.modes[:, -1] - shape.modes[:, -2]
     extent = shape.mean[-1] - shape.mean[-2] + state.coefficients @ modes
     safe = np.where(extent > 0, extent, np.inf)
-    own = np.zeros(9)
-    for axis in range(3):
-        rows[6 + axis, first + axis] = 1.0
-        rows[6 + axis, first + 3 :] = modes[:, axis] / safe[axis]
-        own[6 + axis] = (shape.spread[-2:] ** 2).sum() / safe[axis] ** 2
-    return np.asarray(rows @ unknowns @ rows.T + np.diag(own))
+    rows[6:, first : first + 3] = np.eye(3)
+    rows[6:, first + 3 :] = (modes / safe).T
+    covariance = np.asarray(rows @ unknowns @ rows.T)
+    covariance[[6, 7, 8], [6, 7, 8]] += (shape.spread[-2:] ** 2).sum() / safe**2
+    return covariance

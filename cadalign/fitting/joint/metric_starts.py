@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.solvers.joint.evidence import Evidence
 
 _GRID = 400
@@ -166,7 +167,7 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
 
 def _scale_basis(evidence: Evidence) -> FloatArray:
     """Scales (3, k) as sums of unknowns: three, or a common one where a prior holds them so."""
-    return np.ones((3, 1)) if evidence.scales.precision.any() else np.eye(3)
+    return np.ones((3, 1)) if has_scale_prior(evidence.scales) else np.eye(3)
 
 
 def _other_rows(

@@ -11,6 +11,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.joint.depth import sampled_planes
 from cadalign.fitting.joint.prior import ShapePrior
+from cadalign.fitting.joint.scales import scale_priors
 from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.noise import rays_of, whitening_of
@@ -20,13 +21,11 @@ from cadalign.solvers.joint.evidence import (
     Heights,
     Lengths,
     Rig,
-    ScalePriors,
     Sightings,
 )
 
+_NONE = np.empty(0, dtype=np.int64)
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
-_COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
-_SAME_SCALE_SIGMA = 1e-4
 
 
 def evidence_of(
@@ -59,7 +58,7 @@ def evidence_of(
         _lengths(prior, size),
         _heights(prior, views),
         sampled_planes(prior.components[0], rows, views),
-        _scales(prior, is_metric(views, size)),
+        scale_priors(prior, is_metric(views, size)),
     )
 
 
@@ -83,20 +82,6 @@ def _check_view(prior: ShapePrior, view: View, number: int) -> None:
         if getattr(view, name) is not None and prior.up is None:
             fix = f"learn it with an up axis, or leave `{name}` away"
             raise InputError("the model has no up axis", where=f"views[{number}].{name}", fix=fix)
-
-
-def _scales(prior: ShapePrior, metric: bool) -> ScalePriors:
-    """Free the size where it is told; what was held to x is then held to the common scale."""
-    if not metric:
-        return prior.scales
-    if prior.scales.free.sum() == 2 and not prior.scales.precision.any():
-        return ScalePriors(np.ones(3), np.zeros((3, 3)))
-    held = prior.scales.free == 0
-    weights = np.where(held, 1 / _SAME_SCALE_SIGMA**2, prior.scales.precision.diagonal())
-    common = np.tile(held / held.sum(), (3, 1))
-    from_common = np.eye(3) - common
-    tied = from_common.T @ (weights[:, None] * from_common)
-    return ScalePriors(np.ones(3), tied + common.T @ common / (3 * _COMMON_SCALE_SIGMA**2))
 
 
 def _sightings(
@@ -179,11 +164,12 @@ def _whitening_of_up(view: View) -> FloatArray:
 
 
 def _lengths(prior: ShapePrior, size: Size | None) -> Lengths:
+    if size is None:
+        return Lengths(np.empty((0, 2), dtype=np.int64), _NONE, np.empty(0), np.empty(0))
     shape = prior.components[0]
-    axes = np.flatnonzero([] if size is None else np.isfinite(size.lengths))
+    axes = np.flatnonzero(np.isfinite(size.lengths))
     count = len(shape.mean)
-    values = np.array([] if size is None else size.lengths[axes])
-    sigmas = np.array([] if size is None else size.deviations[axes])
+    values, sigmas = size.lengths[axes], size.deviations[axes]
     for axis in axes:
         if not prior.lengths[axis] > 0:
             name = ("width", "height", "length")[axis]

@@ -20,7 +20,7 @@ class ShapePrior:
     """Gaussian components of a shape, and what is known of its scales.
 
     The rows of a component are the keypoints with ``ids`` (m,), then the least and the greatest
-    corner of the box. ``unpriored`` counts scales that are free without a prior.
+    corner of the box. ``inflation`` is that of `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -28,6 +28,7 @@ class ShapePrior:
     weights: tuple[float, ...]
     scales: ScalePriors
     up: FloatArray | None
+    inflation: float = 1.0
 
     @property
     def lengths(self) -> FloatArray:
@@ -92,7 +93,8 @@ def _of_category(model: ShapeModel) -> ShapePrior:
     )
     weights = tuple(component.weight for component in model.components)
     up = None if model.up_axis is None else np.eye(3)["xyz".index(model.up_axis)]
-    return ShapePrior(model.ids, shapes, weights, ScalePriors(np.zeros(3), np.zeros((3, 3))), up)
+    held = ScalePriors(np.zeros(3), np.zeros((3, 3)))
+    return ShapePrior(model.ids, shapes, weights, held, up, model.inflation)
 
 
 _Y = np.array([0.0, 1.0, 0.0])

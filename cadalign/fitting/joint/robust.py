@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.fitting.joint.starts import Start, ViewRays, in_rig, rays_in, starts_of
+from cadalign.fitting.joint.starts import Start, in_rig, starts_of
 from cadalign.solvers.constants import CAUCHY, LINEAR, UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
 from cadalign.solvers.joint.search import Minima, search_joint
+from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
 
 _SAMPLE = 4

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.fitting.joint.metric_starts import metric_starts
-from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence
-from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 
-_MOST_PER_VIEW = 8
 _MOST = 24
-_LEAST_POINTS = 3
-_UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
-_LEAST_DEPTH = 1e-9
 
 
 def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray, FloatArray]:
@@ -30,8 +25,8 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(poses)]
     for view in range(len(rig.pose)):
-        found = _of_view(evidence, view)
         camera = rig.cam_from_rig[view]
+        found = zip(*view_starts(evidence, view), strict=True)
         moved = [(in_rig(pose, camera), scales) for pose, scales in found]
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
@@ -44,10 +39,12 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
             return placed
     if not all(per_pose):
         return np.empty((0, poses, 12)), np.empty((0, 3))
+    if is_metric and init is None and (np.bincount(rig.pose) > 1).any():
+        return _with_rig(evidence, per_pose)
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
-        for rank in range(1, _MOST_PER_VIEW)
+        for rank in range(1, MOST_PER_VIEW)
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
@@ -65,6 +62,48 @@ class Start(NamedTuple):
 
     pose: FloatArray
     log_scales: FloatArray
+
+
+def _with_rig(
+    evidence: Evidence, per_pose: list[list[tuple[FloatArray, FloatArray]]]
+) -> tuple[FloatArray, FloatArray]:
+    """Starts whose scales are those of the rig with the most views; the other poses follow."""
+    main = int(np.argmax(np.bincount(evidence.rig.pose)))
+    rotations = np.array([pose[:9] for pose, _ in per_pose[main]]).reshape(-1, 3, 3)
+    placed, log_scales = metric_starts(_of_pose(evidence, main), rotations)
+    starts = []
+    for k, (own, logs) in enumerate(zip(placed[:, 0], log_scales, strict=True)):
+        for rank in range(MOST_PER_VIEW if k == 0 else 1):
+            start = []
+            for p, found in enumerate(per_pose):
+                pose, scales = found[min(rank, len(found) - 1)]
+                centre = _centre(evidence.rig.cam_from_rig[evidence.rig.pose == p][0])
+                enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
+                start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
+            starts.append((np.array(start), logs))
+    kept = starts[:_MOST]
+    poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
+    return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
+
+
+def _centre(camera: FloatArray) -> FloatArray:
+    """A camera's place (3,) in the rig's frame."""
+    return np.asarray(-camera[:9].reshape(3, 3).T @ camera[9:])
+
+
+def _of_pose(evidence: Evidence, pose: int) -> Evidence:
+    """The evidence of the views that share a pose."""
+    chosen = evidence.rig.pose == pose
+    columns: dict[str, Any] = {
+        name: type(rows)(*(column[chosen[rows.image]] for column in rows))
+        for name, rows in (
+            ("sightings", evidence.sightings),
+            ("directions", evidence.directions),
+            ("heights", evidence.heights),
+            ("planes", evidence.planes),
+        )
+    }
+    return evidence._replace(**columns)
 
 
 def _sized(
@@ -105,80 +144,6 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
         heights.value / below,
     ]
     return float(np.median(np.concatenate(ratios)))
-
-
-class ViewRays(NamedTuple):
-    """Keypoints of one view: points (n, 3) of the mean, rays (n, 2), and whitening (n, 3)."""
-
-    points: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
-    rows: IntArray
-
-
-def rays_in(evidence: Evidence, view: int) -> ViewRays:
-    """One view's keypoints, the shape's uncertainty in their whitening."""
-    sightings = evidence.sightings
-    rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
-    names = sightings.point[rows]
-    points = np.ascontiguousarray(evidence.shape.mean[names])
-    rays = np.ascontiguousarray(sightings.rays[rows])
-    if not len(rows):
-        return ViewRays(points, rays, np.empty((0, 3)), rows)
-    return ViewRays(points, rays, _widened(evidence, points, rays, rows, names), rows)
-
-
-def _of_view(evidence: Evidence, view: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Camera poses (12,) and log scales (3,) from one view's keypoints, the likeliest first."""
-    given = rays_in(evidence, view)
-    if len(given.rows) < _LEAST_POINTS:
-        return []
-    sightings, scales = evidence.sightings, evidence.scales
-    order = _axis_order(scales.free)
-    free = np.ones(UNKNOWNS)
-    free[6:] = scales.free[order[1:]]
-    found, costs, _, _, info = optimal_batch(
-        np.ascontiguousarray(given.points[:, order]),
-        given.rays,
-        given.whitening,
-        np.array([0, len(given.rows)]),
-        int(sightings.loss[given.rows[0]]),
-        np.array([float(sightings.loss_scale[given.rows[0]])]),
-        np.array([float(scales.precision[order[1], order[1]])]),
-        free,
-        _LEAST_POINTS,
-    )
-    count = min(int(info[0, 0]), _MOST_PER_VIEW)
-    kept = [k for k in range(count) if costs[0, k] < costs[0, 0] + _UNLIKELY]
-    place = np.argsort(order)
-    columns = np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])
-    return [(found[0, k, columns[:12]], np.log(found[0, k, columns[12:]])) for k in kept]
-
-
-def _axis_order(free: FloatArray) -> IntArray:
-    """The model's axes in the solvers' order: one whose scale is known first, no reflection."""
-    first = int(np.argmin(free))
-    return np.array([first, (first + 1) % 3, (first + 2) % 3])
-
-
-def _widened(
-    evidence: Evidence, points: FloatArray, rays: FloatArray, rows: IntArray, names: IntArray
-) -> FloatArray:
-    """Whitening (n, 3) of the rays with the shape's own variance in it."""
-    shape, whitening = evidence.shape, evidence.sightings.whitening[rows]
-    variance = (shape.modes[:, names] ** 2).sum(axis=(0, 2)) / 3 + shape.spread[names] ** 2
-    extent = points.std(axis=0)
-    seen = rays.std(axis=0)
-    depth = np.sqrt((extent**2).sum() * 2 / 3 / max((seen**2).sum(), 1e-30))
-    of_rays = variance / max(depth, _LEAST_DEPTH) ** 2
-    if not of_rays.any():
-        return np.ascontiguousarray(whitening)
-    # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-    widened = (
-        whitening
-        / np.sqrt(1 + of_rays * (whitening[:, 0] ** 2 + whitening[:, 2] ** 2) / 2)[:, None]
-    )
-    return np.ascontiguousarray(widened)
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

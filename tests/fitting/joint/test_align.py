@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,18 @@ class TestSimilarModel:
             # Half of the stretch's ellipses hold the truth: chi-square of two has the median 1.386.
             inside += bool(error @ np.linalg.solve(covariance, error) < 1.386)
         assert 35 <= inside <= 65
+
+    def test_inflation_widens_the_deviations_alone(self) -> None:
+        model = spreads(0.05)
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        plain, wide = align(model, view), align(replace(model, inflation=1.5), view)
+        assert np.allclose(wide.alignment.rotation, plain.alignment.rotation, atol=1e-12)
+        assert np.allclose(wide.points_3d, plain.points_3d, atol=1e-12)
+        assert wide.std.rotation_deg > plain.std.rotation_deg
+        growth = np.trace(wide.points_covariance, axis1=1, axis2=2)
+        growth /= np.trace(plain.points_covariance, axis1=1, axis2=2)
+        assert (growth > 1).all()
+        assert (growth < 1.5**2 + 1e-9).all()
 
     def test_a_learned_shape_comes_nearer_than_its_mean(self) -> None:
         model, rng = spreads(0.05), np.random.default_rng(2)

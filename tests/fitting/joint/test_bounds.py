@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.bounds import whitened_square
+from support.bounds import bound_of, whitened_square
 from support.scenes import around, in_camera, keypoints, rig, seen, truth_of
 
 from cadalign import Alignment, Camera, Model, Size, View, align
@@ -83,9 +84,9 @@ def everything(points: np.ndarray, rng: np.random.Generator) -> Case:
     "build",
     [
         pytest.param(known_motion([0, 25]), id="two views, known motion"),
-        pytest.param(known_motion([-40, -20, 0, 20, 40]), id="five views, known motion"),
+        pytest.param(known_motion([0, -40, -20, 20, 40]), id="five views, known motion"),
         pytest.param(unknown_motion([0, 25]), id="two views, unknown motion"),
-        pytest.param(unknown_motion([-40, -20, 0, 20, 40]), id="five views, unknown motion"),
+        pytest.param(unknown_motion([0, -40, -20, 20, 40]), id="five views, unknown motion"),
         pytest.param(depth, id="depth"),
         pytest.param(gravity, id="gravity"),
         pytest.param(length, id="length"),
@@ -148,15 +149,15 @@ class TestRealCameras:
                 poses.setdefault(int(image), {})[each["obj_id"]] = pose
         return camera, meshes, poses
 
-    def test_two_views_of_five_keypoints_tell_all_scales(
+    def test_two_views_of_five_keypoints_reach_the_bound(
         self, scene: tuple[Camera, dict[int, np.ndarray], dict[int, dict[int, np.ndarray]]]
     ) -> None:
         camera, meshes, poses = scene
         images = sorted(poses)
-        errors, squares = [], []
+        errors, squares, bounds = [], [], []
         rng = np.random.default_rng(0)
         for obj, points in meshes.items():
-            for first, second in zip(images, [*images[1:], images[0]], strict=True):
+            for first, second in combinations(images, 2):
                 pair = [poses[image][obj] for image in (first, second)]
                 scale = 2.0 ** rng.uniform(-1, 1, 3)  # the model is the object over this
                 views = []
@@ -169,5 +170,8 @@ class TestRealCameras:
                 truth = Alignment(pair[0][:3, :3], pair[0][:3, 3], scale)
                 errors.append(np.abs(np.log(result.alignment.scale / scale)))
                 squares.append(whitened_square(result, [truth]))
-        assert (np.median(errors, axis=0) < 0.01).all()
-        assert np.sqrt(np.median(squares)) < 1.2  # of a chi-square of nine, the median is 0.93
+                bounds.append(np.sqrt(bound_of(result, [truth]).diagonal()[6:]))
+        # A normal deviate exceeds 0.67 of its deviation in half of the cases.
+        expected = 0.67 * np.median(bounds, axis=0)
+        assert (np.median(errors, axis=0) < 1.3 * expected).all()
+        assert np.sqrt(np.median(squares)) < 1.1  # the median of a chi-square of nine is 0.93

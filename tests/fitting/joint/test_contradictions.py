@@ -98,4 +98,4 @@ def test_two_sources_of_the_size_accuse_each_other() -> None:
     view = seen(points, truth, np.eye(4), rng, depth=depth)
     warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
     assert any("views[0].depth" in text and "size" in text for text in warnings)
-    assert any("1000" in text for text in warnings)
+    assert any("millimetres" in text for text in warnings)

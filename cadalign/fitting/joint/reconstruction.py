@@ -1,24 +1,43 @@
-"""Views of `cadalign.align` from photos of a structure-from-motion model."""
+"""Views of photos whose cameras and poses a reconstruction knows."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import CadalignError, InputError, quote
+from cadalign.fitting.joint.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 
-if TYPE_CHECKING:
-    from cadalign.fitting.joint.view import View
+
+class Photo(Protocol):
+    """A photo of a reconstruction, such as `cadalign.datasets.Correspondences`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The calibrated camera."""
+
+    @property
+    def cam_from_world(self) -> Alignment:
+        """Its pose."""
+
+
+class Reconstruction(Protocol):
+    """Photos by their names, such as `cadalign.datasets.Colmap`."""
+
+    def __getitem__(self, name: str, /) -> Photo:
+        """One photo."""
+
 
 Keypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
 
 
 def views_from(
-    images: CorrespondenceSet, keypoints: Mapping[str, Keypoints], **options: Any
+    images: Reconstruction, keypoints: Mapping[str, Keypoints], **options: Any
 ) -> list[View]:
     """Views with the cameras and the known poses of a reconstruction's photos.
 
@@ -27,8 +46,8 @@ def views_from(
 
     Parameters
     ----------
-    images : Colmap, Bundler or another CorrespondenceSet
-        The reconstruction.
+    images : Colmap, Bundler or another mapping
+        The reconstruction's photos, of `cadalign.datasets`.
     keypoints : mapping of str to ((n, 2) float, sequence of n ids or None)
         For each photo used, by its name: pixels of the object's keypoints, integers being pixel
         centres, and their ids. One keypoint in a photo counts.
@@ -54,8 +73,6 @@ def views_from(
     >>> views = views_from(images, {"00.jpg": (clicks, ["seat", "leg"])})  # doctest: +SKIP
     >>> cadalign.align(chair, views).rig_from_model  # doctest: +SKIP
     """
-    from cadalign.fitting.joint.view import View  # loads what the readers do without
-
     views = []
     for name, pair in keypoints.items():
         given: Any = pair

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cadalign import Model, align
-from cadalign.datasets import Bundler, Colmap, CorrespondenceSet, views_from
+from cadalign import Model, align, views_from
+from cadalign.datasets import Bundler, Colmap, CorrespondenceSet
 from cadalign.errors import InputError
 
 

@@ -1,0 +1,99 @@
+"""`align` with masks of objects whose mesh is not known: learned shapes and similar models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cadalign import Camera, Model, ShapeModel, View, align
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign.errors import InputError
+from cadalign.geometry.box import Box
+from cadalign.metrics import box_iou_up_to_scale
+from cadalign.render import Scene, cast_geometry, sample_view
+from cadalign.shapes.examples import Example, examples_of
+from cadalign.shapes.warp import linear_warp, warp_mesh
+
+CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+
+
+@pytest.fixture(scope="module")
+def bottles(tmp_path_factory: pytest.TempPathFactory) -> tuple[AnnotatedModel, ...]:
+    root = tmp_path_factory.mktemp("bottles") / "sample"
+    dataset = KeypointNet(write_sample_dataset(root, per_category=16))
+    return dataset["bottle"]
+
+
+def learned(models: tuple[AnnotatedModel, ...]) -> ShapeModel:
+    examples = examples_of(models, meshes=True, on_progress=lambda done, total: None)
+    return ShapeModel.learn(examples, category="bottle", components=1)
+
+
+def test_a_learned_shape_is_better_with_a_mask(bottles: tuple[AnnotatedModel, ...]) -> None:
+    shape = learned(bottles[4:])
+    alone, joint = [], []
+    for number, model in enumerate(bottles[:4]):
+        rng = np.random.default_rng(number)
+        scene = Scene(model.load_mesh())
+        points = model.keypoints.xyz
+        shown = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, roll=10.0)
+        truth = shown.cam_from_model
+        pixels = CAMERA.project(truth.apply(points[shown.visible]))
+        pixels += rng.normal(0, 1, pixels.shape)
+        ids = model.keypoints.semantic_ids[shown.visible].tolist()
+        mask = cast_geometry(scene, CAMERA, truth).mask
+        box = Box.from_model(scene.bounds, truth)
+        for found, given in ((alone, None), (joint, mask)):
+            result = align(shape, View(CAMERA, pixels, ids=ids, mask=given))
+            found.append(box_iou_up_to_scale(est=result.box, gt=box))
+    assert np.mean(joint) > np.mean(alone)
+
+
+def test_a_learned_shape_without_meshes_is_told_what_to_do() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (8, 3))
+    examples = [
+        Example(f"model {k}", range(8), points * rng.uniform(0.8, 1.2, 3)) for k in range(20)
+    ]
+    shape = ShapeModel.learn(examples, category="thing", components=1)
+    pixels = CAMERA.project(points + [0, 0, 4])
+    mask = np.zeros((480, 640), dtype=bool)
+    mask[200:300, 250:400] = True
+    with pytest.raises(InputError, match="no training model has a mesh") as caught:
+        align(shape, View(CAMERA, pixels, ids=range(8), mask=mask))
+    assert "views[0].mask" in str(caught.value)
+
+
+def test_a_similar_model_follows_the_mask(sample_root: Path) -> None:
+    model = KeypointNet(sample_root)["chair"][0]
+    scene = Scene(model.load_mesh())
+    rng = np.random.default_rng(3)
+    points = model.keypoints.xyz
+    shown = sample_view(scene, points, CAMERA, rng=rng, min_visible=7)
+    pixels = CAMERA.project(shown.cam_from_model.apply(points[shown.visible]))
+    mask = cast_geometry(scene, CAMERA, shown.cam_from_model).mask
+    similar = Model(points_3d=points, mesh=scene.mesh, shape_sigma=0.02)
+    ids = np.flatnonzero(shown.visible).tolist()
+    noisy = pixels + rng.normal(0, 1, pixels.shape)
+    alone = align(similar, View(CAMERA, noisy, ids=ids))
+    result = align(similar, View(CAMERA, noisy, ids=ids, mask=mask))
+    (residuals,) = result.mask_residuals
+    assert residuals is not None
+    assert residuals.is_used
+    assert residuals.rms < 3
+    assert result.std.rotation_deg < alone.std.rotation_deg
+
+
+def test_a_linear_warp_is_that_of_the_mesh(sample_root: Path) -> None:
+    model = KeypointNet(sample_root)["chair"][0]
+    mesh, points = model.load_mesh(), model.keypoints.xyz
+    target = points + np.random.default_rng(0).normal(0, 0.02, points.shape)
+    bounds = mesh.bounds * [1.1, 0.9, 1.05]
+    warp = linear_warp(mesh.vertices, mesh.bounds, points)
+    expected = warp_mesh(mesh, points, target, bounds=bounds).vertices
+    assert np.allclose(warp.apply(target, bounds), expected)
+    step = np.random.default_rng(1).normal(0, 0.01, points.shape)
+    moved = warp.apply(target + step, bounds) - warp.apply(target, bounds)
+    assert np.allclose(moved, warp.derivative(step, np.zeros((2, 3))), atol=1e-12)

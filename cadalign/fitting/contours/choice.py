@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
     """
     if isinstance(model, Model):
         if model.mesh is None:
-            fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
+            fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
             raise InputError("the model has no mesh, which a mask wants", where=where, fix=fix)
         if model.shape_sigma is None:
             return [RigidSurface(model.mesh)]
@@ -77,7 +77,7 @@ def _load(path: Path) -> Mesh:
     import trimesh  # takes long to import
 
     try:
-        loaded = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        loaded: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
         return Mesh(loaded.vertices, loaded.faces, source=str(path))
     except CadalignError:
         raise

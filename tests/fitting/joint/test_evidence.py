@@ -84,6 +84,28 @@ class TestSize:
         assert str(caught.value).startswith(message)
 
 
+def test_deviations_of_a_learned_shape_hold_the_truth() -> None:
+    model, truth = similar(), truth_of((1.5, 1.5, 1.5))
+    component, squares = model.components[0], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        shape = component.mean + np.tensordot(rng.normal(size=2), component.modes, 1)
+        shape = shape + 1e-3 * rng.normal(size=shape.shape)
+        views = rig(shape[:-2], truth, [0, 30], rng)
+        depth = in_camera(shape[:-2], truth, np.eye(4))[:, 2]
+        noisy = depth * (1 + 0.01 * rng.normal(size=len(depth)))
+        up = turned(truth.rotation[:, 1], abs(rng.normal()), rng)
+        views[0] = View(CAMERA, views[0].points_2d, cam_from_rig=np.eye(4), depth=noisy, up=up)
+        lengths = 1.5 * (shape[-1] - shape[-2])
+        size = Size(height=lengths[1] * (1 + 0.01 * rng.normal()))
+        result = align(model, views, size=size)
+        found = (result.bounds[1] - result.bounds[0]) * result.alignment.scale
+        deviations = np.array(result.std.scale)
+        squares.append((np.log(found / lengths) / deviations) ** 2)
+        assert not any("contradict" in text for text in result.warnings)
+    assert 0.5 < np.mean(squares) < 1.5
+
+
 class TestCameraHeight:
     def test_it_determines_the_size(self) -> None:
         points, truth = keypoints(), truth_of()

@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.evidence import Evidence, Shape
 from cadalign.solvers.optimal import optimal_batch
 
 _MOST_PER_VIEW = 8
@@ -16,6 +16,7 @@ _MOST = 24
 _LEAST_POINTS = 3
 _UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
 _LEAST_DEPTH = 1e-9
+_FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
 def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +95,40 @@ def _of_view(evidence: Evidence, view: int) -> list[tuple[FloatArray, FloatArray
     kept = [k for k in range(count) if costs[0, k] < costs[0, 0] + _UNLIKELY]
     place = np.argsort(order)
     columns = np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])
-    return [(found[0, k, columns[:12]], np.log(found[0, k, columns[12:]])) for k in kept]
+    starts = [(found[0, k, columns[:12]], np.log(found[0, k, columns[12:]])) for k in kept]
+    if scales.free.any():
+        return starts
+    turns = _half_turns(evidence.shape, given.points, sightings.point[given.rows])
+    return starts + [(_after(pose, turn), logs) for turn in turns for pose, logs in starts]
+
+
+def _half_turns(shape: Shape, points: FloatArray, names: IntArray) -> list[FloatArray]:
+    """Motions (12,) of the model by half a turn that leave it a likely shape.
+
+    The mean does not show such an ambiguity: a blade whose width varies more than it measures looks
+    much the same from behind, with its edge and its back exchanged.
+    """
+    centre = points.mean(axis=0)
+    offsets = points - centre
+    modes = shape.modes[:, names].reshape(len(shape.modes), -1)
+    own = np.repeat(shape.spread[names] ** 2, 3) + (_FLATNESS**2 * (offsets**2).sum(axis=1).max())
+    largest = float((modes**2).sum(axis=1).max(initial=0.0) + own.max())
+    found = []
+    for axis in np.linalg.svd(offsets, full_matrices=False)[2]:
+        turn = 2 * np.outer(axis, axis) - np.eye(3)
+        moved = (offsets @ turn - offsets).ravel()
+        if moved @ moved > _UNLIKELY * largest:  # a bound that spares the next line
+            continue
+        if moved @ np.linalg.solve(modes.T @ modes + np.diag(own), moved) < _UNLIKELY:
+            found.append(np.concatenate([turn.ravel(), centre - turn @ centre]))
+    return found
+
+
+def _after(pose: FloatArray, motion: FloatArray) -> FloatArray:
+    """The pose (12,) of a model that was moved first."""
+    rotation = pose[:9].reshape(3, 3)
+    turned = rotation @ motion[:9].reshape(3, 3)
+    return np.concatenate([turned.ravel(), rotation @ motion[9:] + pose[9:]])
 
 
 def _axis_order(free: FloatArray) -> IntArray:

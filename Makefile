@@ -16,11 +16,15 @@ demo: $(VENV)/.installed  ## align a set of sample models and show the result in
 paper: $(VENV)/.installed  ## make every table and figure of the AEPnP paper anew, in paper/ (QUICK=1: two minutes)
 	$(BIN)/python scripts/reproduce_paper.py --out paper$(if $(QUICK),-quick --quick) $(if $(CADALIGN_DATA),--root $(CADALIGN_DATA)/keypointnet)
 
-test: $(VENV)/.installed-dev  ## run the whole test suite
-	$(BIN)/python -m pytest
+# The modules of tests are shared out among processes; what measures times runs alone, after them.
+PARALLEL := -n $(or $(WORKERS),logical) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones
-	$(BIN)/python -m pytest -m "not slow"
+test: $(VENV)/.installed-dev  ## run the whole test suite (WORKERS=2)
+	$(BIN)/python -m pytest $(PARALLEL) -m "not timing" --durations=20; status=$$?; \
+	$(BIN)/python -m pytest -m timing && exit $$status
+
+test-fast: $(VENV)/.installed-dev  ## run the tests but for the long ones and those of times
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not timing"
 
 fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with random input (COUNT=20000)
 	for what in fits batches readers; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
@@ -32,7 +36,9 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed of solvers, rendere
 	$(BIN)/python scripts/benchmark_focal.py
 	$(BIN)/python scripts/benchmark_calibration.py
 	$(BIN)/python scripts/benchmark_render.py
+	$(BIN)/python scripts/benchmark_masks.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
 ifneq ($(CADALIGN_DATA),)
+	$(BIN)/python scripts/benchmark_align.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet
 	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello
 endif

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from cadalign.fitting.fit import fit, fit_batch
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
+    from cadalign.fitting.joint.reconstruction import views_from
     from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.joint.size import Size
+    from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
     from cadalign.fitting.joint.view import View
     from cadalign.fitting.options import RansacOptions
     from cadalign.retrieval.library import Library
@@ -34,6 +37,8 @@ __all__ = [
     "Box",
     "CadalignError",
     "Camera",
+    "Contribution",
+    "EvidenceSummary",
     "FitResult",
     "FocalPrior",
     "Library",
@@ -43,6 +48,7 @@ __all__ = [
     "Model",
     "RansacOptions",
     "ShapeModel",
+    "Size",
     "View",
     "align",
     "align_batch",
@@ -56,12 +62,17 @@ __all__ = [
     "retrieval",
     "simulate",
     "solvers",
+    "views_from",
 ]
 
 # Imported when first asked for, so that `import cadalign` stays quick.
 _NAMES = {
     "AlignResult": "cadalign.fitting.joint.result",
     "Model": "cadalign.fitting.joint.model",
+    "Contribution": "cadalign.fitting.joint.summary",
+    "EvidenceSummary": "cadalign.fitting.joint.summary",
+    "views_from": "cadalign.fitting.joint.reconstruction",
+    "Size": "cadalign.fitting.joint.size",
     "View": "cadalign.fitting.joint.view",
     "align": "cadalign.fitting.joint.align",
     "align_batch": "cadalign.fitting.joint.align",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -49,7 +50,25 @@ def _compiled(function: F, fastmath: set[str], *, forceinline: bool = False) -> 
     if cache_file is not None:
         folder = Path(function.__code__.co_filename).resolve().parent
         cache_file._source_stamp = _stamp(folder) + _stamp(_SOLVERS.resolve())
+        cache_file.save = partial(_save, cache_file)
     return cast(F, dispatcher)
+
+
+def _save(cache_file: Any, key: object, code: object) -> None:
+    """Save compiled code, one process at a time, before the index that names it.
+
+    Numba writes the index first and without a lock: of processes that compile at the same time,
+    one could read code of an older version, or that of another signature.
+    """
+    from filelock import FileLock
+
+    with FileLock(f"{cache_file._index_path}.lock"):
+        names = cache_file._load_index()
+        taken = set(names.values())
+        free = (cache_file._data_name(number) for number in count(1))
+        name = names.get(key) or next(name for name in free if name not in taken)
+        cache_file._save_data(name, code)
+        cache_file._save_index({**names, key: name})
 
 
 @cache

@@ -1,13 +1,15 @@
-"""Renderers, cores and the cache of compiled solvers, as found on this machine."""
+"""Renderers, cores, the cache of compiled solvers, and data sets, as found on this machine."""
 
 from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from cadalign.datasets import PhotoSummary, open_photos
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 from cadalign.render.remedy import remedy
 from cadalign.render.select import best_renderer
@@ -47,6 +49,23 @@ def examine() -> Health:
         numpy=version("numpy"),
         numba=version("numba"),
     )
+
+
+def examine_data(folder: Path, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
+    """Recognise the data set of photos in a folder and count what can be read.
+
+    Parameters
+    ----------
+    folder : Path
+    progress : callable, optional
+        Called with the number of photos read after each.
+
+    Raises
+    ------
+    DataError
+        If no known data set is there, or it cannot be opened.
+    """
+    return open_photos(folder).summary(progress=progress)
 
 
 def compiled_cache() -> str:

@@ -1,4 +1,4 @@
-"""Loaders: annotated CAD models (KeypointNet, ShapeNet, mesh files), and correspondences."""
+"""Loaders: annotated CAD models (KeypointNet, ShapeNet, mesh files), photos, correspondences."""
 
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
@@ -12,6 +12,18 @@ from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
 from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.datasets.models.shapenet import ShapeNet, ShapeNetModel
+from cadalign.datasets.photos.bop import Bop
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
+from cadalign.datasets.photos.kitti import KittiCars
+from cadalign.datasets.photos.objectron import Objectron
+from cadalign.datasets.photos.pascal3d import Pascal3D
+from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
+from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
+from cadalign.datasets.photos.pix3d import Pix3D
+from cadalign.datasets.photos.posed_photos import PosedPhotos
+from cadalign.datasets.photos.recognise import open_photos
+from cadalign.datasets.photos.recognise import open_photos as open
+from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
 from cadalign.datasets.sfm.blind_pnp import BlindPnP
 from cadalign.datasets.sfm.bundler import Bundler
@@ -24,7 +36,9 @@ __all__ = [
     "SYNSETS",
     "AnnotatedModel",
     "BlindPnP",
+    "Bop",
     "Bundler",
+    "CadModel",
     "Circle",
     "Colmap",
     "CorrespondenceSet",
@@ -32,18 +46,33 @@ __all__ = [
     "ImageKeypoints",
     "KeypointNet",
     "Keypoints",
+    "KittiCars",
     "ModelKeypoint",
     "ModelKeypoints",
+    "Objectron",
+    "Pascal3D",
+    "Pascal3DDetections",
+    "Photo",
+    "PhotoDataset",
+    "PhotoKeypoints",
+    "PhotoObject",
+    "PhotoSummary",
+    "Pix3D",
+    "PosedPhotos",
     "RotationalSymmetry",
+    "Scan2CAD",
     "ShapeNet",
     "ShapeNetModel",
     "Symmetries",
+    "Truth",
     "check_solid",
     "choose_object",
     "flat_axes",
     "join_keypoints",
     "load_mesh",
+    "open",
     "open_correspondences",
+    "open_photos",
     "read_image_keypoints",
     "sample_models",
     "write_sample_dataset",

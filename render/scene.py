@@ -11,7 +11,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.raycast.caster import EmbreeEngine, RayCaster
+from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.raycast.normals import corner_normals
 from cadalign.render.raycast.surface import Surface
@@ -94,10 +94,7 @@ class Scene:
     @cached_property
     def face_normals(self) -> FloatArray:
         """Unit normals of the triangles, (m, 3) float; zero for one without area."""
-        corners = self.triangles
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.asarray(normals / np.where(length > 0, length, 1.0))
+        return face_normals(self.triangles)
 
     @cached_property
     def corner_normals(self) -> FloatArray:

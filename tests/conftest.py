@@ -1,15 +1,16 @@
-"""What several test modules share: real data, a sample data set, random cases for hypothesis."""
+"""What the test modules share: fixtures, random cases for hypothesis, and how they are run."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from playwright.sync_api import Browser, Error, sync_playwright
+from playwright.sync_api import Browser, Error, expect, sync_playwright
 
 from cadalign.datasets import write_sample_dataset
 
@@ -22,6 +23,39 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("cadalign")
+
+# What a page shows is waited for; how soon it does is a matter for the tests of times.
+expect.set_options(timeout=30_000)
+
+
+REQUIRED = os.environ.get("CADALIGN_REQUIRED", "").split()
+"""Names of optional packages that are known to be here: a test skipped for want of one fails."""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the usual kernels before xdist starts the processes that run the tests."""
+    if session.config.getoption("numprocesses", None):
+        from support.kernels import compile_usual_kernels
+
+        compile_usual_kernels()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let the processes of xdist begin with slow modules: in the end none works on one alone."""
+    if hasattr(config, "workerinput"):
+        slow = {item.path for item in items if item.get_closest_marker("slow")}
+        items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, Any]:
+    report = yield
+    if report.skipped and not hasattr(report, "wasxfail"):
+        _, _, reason = report.longrepr
+        for name in REQUIRED:
+            if name in reason.lower():
+                report.outcome, report.longrepr = "failed", f"{name} is required: {reason}"
+    return report
 
 
 @pytest.fixture(scope="session")

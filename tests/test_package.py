@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
+from support.timing import ratio, timed_process
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
@@ -140,21 +141,11 @@ def test_command_line_brings_nothing_heavy_before_it_runs() -> None:
     assert (HEAVY - {"rich", "tyro"}) & loaded == set()
 
 
-def best_of(times: int, code: str) -> float:
-    """The least time [s] that code takes in a new process.
-
-    Of wall time and processor time the lesser: other programs lengthen the one, helper threads
-    the other.
-    """
-    timed = (
-        "import time; wall, own = time.perf_counter(), time.process_time(); "
-        f"{code}; print(min(time.perf_counter() - wall, time.process_time() - own))"
-    )
-    return min(float(python(timed)) for _ in range(times))
-
-
+@pytest.mark.timing
 def test_import_is_quick() -> None:
-    assert best_of(5, "import cadalign") < 0.3
+    # NumPy is two thirds of it; SciPy would make it 5 times NumPy.
+    ours, theirs = timed_process("import cadalign"), timed_process("import numpy")
+    assert ratio(ours, theirs, below=2.0) < 2.0
 
 
 FIRST_FIT = (
@@ -166,9 +157,18 @@ FIRST_FIT = (
 
 
 @pytest.mark.slow
-def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled() -> None:
-    python(FIRST_FIT)
-    assert best_of(4, FIRST_FIT) < 1.0
+@pytest.mark.timing
+def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled(tmp_path: Path) -> None:
+    # What no code with a compiled function can avoid: to import Numba and to read one from disk.
+    (tmp_path / "plain.py").write_text(
+        "import numba\n\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
+    )
+    plain = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import plain; plain.twice(1.0)"
+    for code in (FIRST_FIT, plain):  # compiles what is not yet on disk
+        python(code)
+    # The fit reads more kernels and takes 1.25 times as long. Compiling a single small one would
+    # add 0.6 to that, importing trimesh the same, pandas 0.35.
+    assert ratio(timed_process(FIRST_FIT), timed_process(plain), below=1.5) < 1.5
 
 
 def test_everything_that_is_promised_is_there() -> None:

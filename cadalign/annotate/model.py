@@ -12,9 +12,9 @@ from cadalign.arrays import FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import simplify
 from cadalign.render.drawing.color import bytes_from_linear
-from cadalign.render.raycast.caster import FaceArray
 from cadalign.render.scene import Scene
 
 MOST_FACES = 150_000  # that are displayed

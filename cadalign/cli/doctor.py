@@ -1,28 +1,39 @@
-"""`cadalign doctor`: check this machine and show how to enable missing parts."""
+"""`cadalign doctor`: check this machine, or a data set of photos."""
 
 from __future__ import annotations
 
 import json
 import sys
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.cli.options import JsonOption
 from cadalign.cli.output import new_console
 
 if TYPE_CHECKING:
+    from cadalign.datasets import PhotoSummary
     from cadalign.health import Health
+
+# Problems of a data set that are printed; JSON has all.
+_SHOWN = 10
 
 
 @dataclass(frozen=True)
 class Doctor(JsonOption):
     """Check the renderers and their speed, and show how to enable missing ones.
 
-    Also shows the processor cores and the cache of compiled solvers.
+    Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
+    in a folder of photos instead: its format, and how many photos and objects can be read.
     """
 
+    data: Path | None = None
+    """Folder of a data set of photos, in any known format (see cadalign.datasets.open)."""
+
     def run(self) -> int:
-        """Run the checks; returns the exit code, 0 if ray casting works."""
+        """Run the checks; returns the exit code, 0 if ray casting works or photos can be read."""
+        if self.data is not None:
+            return self._check_data(self.data)
         from cadalign.health import examine
 
         with new_console().status("trying the renderers, each in a process of its own ..."):
@@ -32,6 +43,20 @@ class Doctor(JsonOption):
         else:
             _print(health)
         return 0 if health.renderers[-1].works else 1
+
+    def _check_data(self, folder: Path) -> int:
+        from cadalign.health import examine_data
+
+        with new_console().status("reading the annotations ...") as status:
+            summary = examine_data(
+                folder, progress=lambda count: status.update(f"{count} photos read ...")
+            )
+        if self.json:
+            found = {**asdict(summary), "root": str(summary.root)}
+            sys.stdout.write(json.dumps(found, indent=2) + "\n")
+        else:
+            _print_data(summary)
+        return 0 if summary.photos else 1
 
 
 def _print(health: Health) -> None:
@@ -62,3 +87,25 @@ def _print(health: Health) -> None:
     console.print(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
     console.print(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
     console.print(f"Compiled solvers: {health.cache}", markup=False)
+
+
+def _print_data(summary: PhotoSummary) -> None:
+    from rich.table import Column, Table
+
+    console = new_console(stderr=False)
+    console.print(f"{summary.root}: {summary.kind}", markup=False)
+    console.print(
+        f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image"
+    )
+    table = Table("category", Column("objects", justify="right"), title="Objects")
+    for category, count in summary.categories.items():
+        table.add_row(category, str(count))
+    console.print(table)
+    console.print(
+        f"{summary.objects} objects: {summary.with_pose} with pose, {summary.with_keypoints} with "
+        f"keypoints, {summary.with_model} with CAD model, {summary.with_mask} with mask"
+    )
+    for problem in summary.problems[:_SHOWN]:
+        console.print(f"Left out: {problem}", markup=False)
+    if len(summary.problems) > _SHOWN:
+        console.print(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")

@@ -51,13 +51,16 @@ class _RansacOptions(RansacOptions):
 
 @dataclass(frozen=True)
 class Fit(ObservationCommand):
-    """Align a model to one image's keypoints and draw the result.
+    """Align a model to what an observation file holds, and draw the result.
 
-    Prints the alignment; writes fit.json and overlay.png.
+    Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
+    known lengths. Prints the alignment and, where there is more than keypoints of one image, the
+    deviations without each piece of evidence. Writes fit.json and overlay.png, overlay_1.png and so
+    on for further views.
     """
 
     observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
-    """JSON file with camera and keypoints, optionally image and model."""
+    """JSON file with camera and keypoints, optionally image, model and further evidence."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
@@ -92,31 +95,71 @@ class Fit(ObservationCommand):
         console = new_console()
         status = console.status("fitting (the first time after an installation takes a minute)")
         result: FitResult | AlignResult
-        if self.shape is None and self.shape_sigma is None:
-            result, picture = self._fit(console, status)
+        observation = self._load()
+        command = self._with_stored_sigma(observation)
+        is_joint = command.shape_of(observation) is not None or command.shape_sigma is not None
+        if observation.is_plain and not is_joint:
+            result, picture = self._fit(observation, console, status)
+            data, table, pictures = result.to_dict(), "", [picture]
         else:
-            from cadalign.cli.fit_shape import fit_shape
+            from cadalign.cli.contributions import list_contributions, tabulate_contributions
+            from cadalign.cli.fit_joint import fit_joint
 
-            result, picture = fit_shape(self, status)
+            result, pictures = fit_joint(command, observation, status)
+            data = result.to_dict() | list_contributions(result)
+            table = tabulate_contributions(result)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
         make_folder(out)
-        text = json.dumps(result.to_dict(), indent=2) + "\n"
+        text = json.dumps(data, indent=2) + "\n"
         write_text(out / "fit.json", text)
-        write_image(out / "overlay.png", picture)
+        paths = [
+            out / (f"overlay_{number}.png" if number else "overlay.png")
+            for number in range(len(pictures))
+        ]
+        for path, picture in zip(paths, pictures, strict=True):
+            write_image(path, picture)
         if self.json:
             sys.stdout.write(text)
         else:
-            new_console(stderr=False).print(str(result), markup=False)
-            console.print(f"Picture: {out / 'overlay.png'}", markup=False)
+            new_console(stderr=False).print(f"{result}{table}", markup=False)
+            listed = ", ".join(str(path) for path in paths)
+            label = "Picture" if len(paths) == 1 else "Pictures"
+            console.print(f"{label}: {listed}", markup=False)
         return 0
 
-    def _fit(self, console: Console, status: Status) -> tuple[FitResult, ByteImage]:
+    def shape_of(self, observation: Observation) -> Path | None:
+        """File of the learned shape to fit: the flag's, or else the file's."""
+        if self.shape is not None or self.shape_sigma is not None or not self.stored:
+            return self.shape
+        return observation.shape
+
+    def _with_stored_sigma(self, observation: Observation) -> Fit:
+        """The command with the file's ``shape_sigma``, unless flags say otherwise."""
+        if not self.stored or self.shape is not None or self.shape_sigma is not None:
+            return self
+        return replace(self, shape_sigma=observation.fit_options.get("shape_sigma"))
+
+    def sigma_for_all(self, observation: Observation) -> Sigma | None:
+        """The given or stored deviation in place of the keypoints' own, if there is one."""
+        if self.sigma is not None or not self.stored:
+            return self.sigma
+        return cast("Sigma | None", observation.fit_options.get("sigma"))
+
+    def _load(self) -> Observation:
+        from cadalign.io.observation import Observation
+
+        observation = Observation.load(self.observation, needs_xyz=False)
+        if self.shape_of(observation) is not None:
+            return observation
+        return Observation.load(self.observation)
+
+    def _fit(
+        self, observation: Observation, console: Console, status: Status
+    ) -> tuple[FitResult, ByteImage]:
         """Fit the stretched model; returns the result and its picture."""
         from cadalign.fitting.fit import fit
-        from cadalign.io.observation import Observation
         from cadalign.render.drawing.fit_overlay import draw_observation
 
-        observation = Observation.load(self.observation)
         options = self.options_for(observation)
         prior = options.focal_prior
         if prior is not None:
@@ -138,7 +181,8 @@ class Fit(ObservationCommand):
         """Options of the fit: those of the flags, otherwise those of the file."""
         from cadalign.io.documents import in_file, within
 
-        given = observation.fit_options if self.stored else {}
+        given = dict(observation.fit_options) if self.stored else {}
+        given.pop("shape_sigma", None)  # which is not an option of the plain fit
         with in_file(self.observation), within("fit"):
             stored = FitOptions(**given)
         set_by_flags = {

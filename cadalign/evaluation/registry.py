@@ -23,7 +23,15 @@ if TYPE_CHECKING:
     from cadalign.evaluation.spec import Spec
 
 # The folders of experiments in this package, in the order in which they are named to users.
-_FOLDERS = ("keypointnet", "demo", "simulation", "correspondences", "retrieval", "unseen")
+_FOLDERS = (
+    "keypointnet",
+    "demo",
+    "simulation",
+    "correspondences",
+    "retrieval",
+    "unseen",
+    "evidence",
+)
 _REGISTERED: dict[str, Spec] = {}
 
 

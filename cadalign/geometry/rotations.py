@@ -1,6 +1,8 @@
-"""Rotation matrices from and to rotation vectors and quaternions, on SciPy's `Rotation`."""
+"""Rotation matrices from and to rotation vectors and quaternions."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -29,9 +31,53 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     >>> vector_from_rotation(rotation_from_vector(np.array([0.0, 0.5, 0.0]))).round(12).tolist()
     [0.0, 0.5, 0.0]
     """
-    from scipy.spatial.transform import Rotation
+    w, x, y, z = _quaternion(rotation)
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 * math.atan2(sine, w) / sine if sine > 0 else 2.0
+    return np.array([factor * x, factor * y, factor * z])
 
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
+    """The unit quaternion w, x, y, z of a rotation matrix (3, 3), with w not negative.
+
+    Each of its components in turn is the square root of a sum of the diagonal; the largest one
+    determines the others (Shepperd, "Quaternion from rotation matrix", 1978). SciPy's conversion
+    takes ten times as long for a single matrix.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    largest = squares.index(max(squares))
+    quaternion = (
+        (squares[0], h - f, c - g, d - b),
+        (h - f, squares[1], d + b, c + g),
+        (c - g, d + b, squares[2], f + h),
+        (d - b, c + g, f + h, squares[3]),
+    )[largest]
+    length = math.copysign(math.hypot(*quaternion), quaternion[0])
+    w, x, y, z = (each / length for each in quaternion)
+    return w, x, y, z
+
+
+def nearest_rotation(matrix: FloatArray, *, tolerance: float = 1e-2) -> FloatArray:
+    """The rotation nearest to a matrix (3, 3) that a file holds with few digits.
+
+    Raises
+    ------
+    InputError
+        If an entry of ``matrix @ matrix.T`` is more than the tolerance off the identity, or the
+        matrix is a reflection.
+
+    Examples
+    --------
+    >>> nearest_rotation(np.diag([1.0001, 0.9999, 1.0])).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not error <= tolerance or np.linalg.det(matrix) < 0:
+        raise InputError("not a rotation matrix", where="rotation")
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right)
 
 
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
@@ -64,7 +110,7 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
 
 def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """The quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
-    from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation  # too slow to load with `import cadalign`
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.array([w, x, y, z])

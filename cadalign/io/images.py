@@ -94,12 +94,25 @@ def read_image(path: Path, camera: Camera) -> ByteImage:
     return pixels
 
 
+def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """Read an image of one channel of 8 or 16 bits as it is stored, (h, w)."""
+    with open_photo(path) as image:
+        mode = image.mode
+        pixels = np.asarray(image.convert("L") if mode in ("1", "P") else image)
+    if pixels.ndim != 2 or not (mode.startswith("I") or mode in ("1", "L", "P")):
+        fix = "give an image of one grey channel, of 8 or 16 bits"
+        raise DataError(f"the image has the mode {brief(mode)}", where=str(path), fix=fix)
+    return pixels if pixels.dtype == np.uint8 else pixels.astype(np.uint16)
+
+
 def write_image(path: Path, image: ByteImage) -> None:
-    """Write an RGB image (h, w, 3) uint8, or RGBA (h, w, 4), as PNG, whole or not at all."""
+    """Write an image as PNG, whole or not at all: RGB (h, w, 3) uint8, RGBA (h, w, 4) or grey."""
     import cv2  # on first use: it takes longer to import than all the rest
 
-    colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(image, colors))
+    if image.ndim == 3:
+        colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        image = np.asarray(cv2.cvtColor(image, colors), dtype=np.uint8)
+    encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise DataError("the picture cannot be encoded as PNG", where=str(path))
     write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))

@@ -1,6 +1,6 @@
-"""Observations: one image's keypoints with their model points, as a JSON file.
+"""Observations: one object's keypoints in one or more images, as a JSON file.
 
-The file holds one object::
+The file of one image holds one object::
 
     {
       "camera": {"model": "PINHOLE", "width": 640, "height": 480,
@@ -23,119 +23,93 @@ with integers at pixel centres, of the photo as it is seen: turned upright where
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``; and
+``shape_sigma`` of `cadalign.Model`, for a model that is only similar.
+
+Evidence beyond keypoints stands beside them, each field optional, deviations and scales as
+`cadalign.View` and `cadalign.Size` describe them::
+
+      "mask": "photo.mask.png", "mask_sigma": 1.5,
+      "depth": "photo.depth.png", "depth_scale": 0.001, "depth_sigma": 0.01,
+      "up": [0.02, -0.97, 0.24], "up_sigma_deg": 1.0,
+      "camera_height": 1.45, "camera_height_sigma": 0.02,
+      "size": {"width": 0.45, "height": 0.91, "length": 0.52, "sigma": 0.01},
+      "shape": "chair.shape"
+
+``mask`` and ``depth`` are PNG files of the camera's size, ``depth`` of 16 bits with ``depth_scale``
+units per count; in its place keypoints may have a ``depth`` [units], left out where unknown.
+``shape`` is a file of `cadalign shape learn`, which takes the model's place. Several images of one
+object stand in ``views``, each with camera, image, keypoints (or none) and evidence of its own; and
+``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the cameras' motion is
+known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``) are the same::
+
+    {
+      "model": "chair.obj",
+      "views": [
+        {"camera": ..., "image": "left.png", "keypoints": [...], "mask": "left.mask.png",
+         "cam_from_rig": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+        {"camera": ..., "image": "right.png", "keypoints": [...], "cam_from_rig": [...]}
+      ]
+    }
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
-import numpy as np
-from msgspec import UNSET, Meta, UnsetType
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
-from cadalign.errors import DataError
-from cadalign.geometry.camera import Camera
-from cadalign.io.documents import (
-    Document,
-    Labelled,
-    NotNegative,
-    PathText,
-    Point2,
-    Point3,
-    Positive,
-    Text,
-    convert,
-    in_file,
-    path_from,
-    read_json,
-    written_path,
-)
+from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.files import write_json
-
-
-class _Keypoint(Labelled, kw_only=True):
-    """One entry of ``keypoints``, as the module's documentation describes it."""
-
-    xyz: Point3
-    uv: Point2
-    sigma: Positive | None = None
-    name: Text | None = None
-    confidence: NotNegative | None = None
-
-
-class _FitFields(Document):
-    """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
-
-    method: Text | UnsetType = UNSET
-    sigma: Positive | list[Positive] | UnsetType | None = UNSET
-    loss: Text | UnsetType = UNSET
-    loss_scale: Positive | UnsetType = UNSET
-    stretch: Text | UnsetType | None = UNSET
-    scale_prior_sigma: Positive | UnsetType | None = UNSET
-    known_axis: Text | UnsetType = UNSET
-    focal: Literal["known", "estimate"] | UnsetType = UNSET
-
-
-class _ObservationFile(Document):
-    """The file's only object."""
-
-    camera: Any  # in the form of `Camera.from_dict`
-    keypoints: Annotated[list[_Keypoint], Meta(min_length=1)]
-    image: PathText | None = None
-    model: PathText | None = None
-    fit: _FitFields = msgspec.field(default_factory=_FitFields)
+from cadalign.io.observation_file import (
+    fill_xyz,
+    read_fields,
+    read_image_fields,
+    read_size,
+    write_image_fields,
+)
+from cadalign.io.observed_image import KnownSize, ObservedImage
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
-    """Keypoints on a model and in one image.
+class Observation(ObservedImage):
+    """An object in one image, or in several: this is the first one.
 
     Parameters
     ----------
-    points_3d : (n, 3) float
-        Model points [model units].
-    points_2d : (n, 2) float
-        Image points [px].
-    camera : Camera
-    sigma : (n,) float, optional
-        Standard deviation of each image point [px].
-    semantic_ids : (n,) int, optional
-        Meaning of each keypoint; the same number on all models of a category.
-    names : tuple of n str, optional
-        Name of each keypoint.
-    confidences : (n,) float, optional
-        Trust in each keypoint, for the ``confidences`` of `cadalign.fit`.
-    image, model : Path, optional
-        The photo and the CAD model.
+    points_3d, points_2d, camera, sigma, semantic_ids, names, confidences, image, depths, evidence
+        Of the first image, as for `ObservedImage`.
+    model : Path, optional
+        The CAD model.
     fit_options : mapping
         Keyword arguments for `cadalign.fit` where they are not its defaults; see the module.
+    others : tuple of ObservedImage
+        The other images.
+    size : KnownSize, optional
+        Known lengths of the object.
+    shape : Path, optional
+        File of the learned shape that takes the model's place.
     """
 
-    points_3d: FloatArray
-    points_2d: FloatArray
-    camera: Camera
-    sigma: FloatArray | None = None
-    semantic_ids: IntArray | None = None
-    names: tuple[str, ...] | None = None
-    confidences: FloatArray | None = None
-    image: Path | None = None
     model: Path | None = None
     fit_options: Mapping[str, Any] = field(default_factory=dict)
+    others: tuple[ObservedImage, ...] = field(default=(), kw_only=True)
+    size: KnownSize | None = field(default=None, kw_only=True)
+    shape: Path | None = field(default=None, kw_only=True)
 
-    def __post_init__(self) -> None:
-        points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
-        points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
-        object.__setattr__(self, "points_3d", points_3d)
-        object.__setattr__(self, "points_2d", points_2d)
-        for name in ("sigma", "confidences"):
-            if (value := getattr(self, name)) is not None:
-                checked = as_floats(value, name=name, shape=(len(points_3d),))
-                object.__setattr__(self, name, checked)
+    @property
+    def views(self) -> tuple[ObservedImage, ...]:
+        """All images, the first one first."""
+        return (self, *self.others)
+
+    @property
+    def is_plain(self) -> bool:
+        """True where nothing but keypoints in one image is known."""
+        return not self.others and self.size is None and not self.has_more
 
     @classmethod
     def load(cls, path: str | Path, *, needs_xyz: bool = True) -> Observation:
@@ -156,53 +130,40 @@ class Observation:
         path = Path(path)
         data = read_json(path)
         if not needs_xyz:
-            data = _with_xyz(data)
+            data = fill_xyz(data)
         with in_file(path):
             return cls.from_dict(data, folder=path.parent)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        read: _ObservationFile = convert(data, _ObservationFile)
-        sigma = read.fit.sigma
-        if isinstance(sigma, list) and len(sigma) != len(read.keypoints):
-            what = f"{len(sigma)} numbers for {len(read.keypoints)} keypoints"
-            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
-        names = _column(read.keypoints, "name")
-        ids = _column(read.keypoints, "semantic_id")
+        read, fields = read_fields(data)
+        images = []
+        for number, each in enumerate(fields):
+            with nullcontext() if each is read else within(f"views[{number}]"):
+                images.append(read_image_fields(each, folder))
+        first, *others = images
         return cls(
-            points_3d=np.array([keypoint.xyz for keypoint in read.keypoints]),
-            points_2d=np.array([keypoint.uv for keypoint in read.keypoints]),
-            camera=Camera.from_dict(read.camera),
-            sigma=_column(read.keypoints, "sigma"),
-            semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
-            names=None if names is None else tuple(names),
-            confidences=_column(read.keypoints, "confidence"),
-            image=None if read.image is None else path_from(read.image, folder),
+            **vars(first),
             model=None if read.model is None else path_from(read.model, folder),
             fit_options=msgspec.to_builtins(read.fit),
+            others=tuple(others),
+            size=read_size(read.size),
+            shape=None if read.shape is None else path_from(read.shape, folder),
         )
 
     def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
         """The parsed form of an observation file, its paths relative to ``folder``."""
-        keypoints: list[dict[str, Any]] = [
-            {"xyz": xyz, "uv": uv}
-            for xyz, uv in zip(self.points_3d.tolist(), self.points_2d.tolist(), strict=True)
-        ]
-        for name, values in (
-            ("sigma", self.sigma),
-            ("semantic_id", self.semantic_ids),
-            ("name", self.names),
-            ("confidence", self.confidences),
-        ):
-            if values is not None:
-                listed = values.tolist() if isinstance(values, np.ndarray) else values
-                for keypoint, value in zip(keypoints, listed, strict=True):
-                    keypoint[name] = value
-        data: dict[str, Any] = {"camera": self.camera.to_dict(), "keypoints": keypoints}
-        for name, path in (("image", self.image), ("model", self.model)):
+        data: dict[str, Any]
+        if self.others:
+            data = {"views": [write_image_fields(view, folder) for view in self.views]}
+        else:
+            data = write_image_fields(self, folder)
+        for name, path in (("model", self.model), ("shape", self.shape)):
             if path is not None:
                 data[name] = written_path(path, folder=folder)
+        if self.size is not None:
+            data["size"] = self.size.given
         if self.fit_options:
             data["fit"] = dict(self.fit_options)
         return data
@@ -210,30 +171,3 @@ class Observation:
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
         write_json(Path(path), self.to_dict(folder=Path(path).parent))
-
-
-def _with_xyz(data: Any) -> Any:
-    """The parsed form of a file, with zeros for the ``xyz`` of keypoints that have none."""
-    keypoints = data.get("keypoints") if isinstance(data, Mapping) else None
-    if not isinstance(keypoints, list):
-        return data
-    filled = [
-        {"xyz": [0.0, 0.0, 0.0], **each} if isinstance(each, Mapping) else each
-        for each in keypoints
-    ]
-    return {**data, "keypoints": filled}
-
-
-def _column(keypoints: list[_Keypoint], name: str) -> Any:
-    """One optional field of all keypoints as a list; None where none has it."""
-    values = [getattr(keypoint, name) for keypoint in keypoints]
-    missing = [row for row, value in enumerate(values) if value is None]
-    if len(missing) == len(values):
-        return None
-    if missing:
-        raise DataError(
-            "missing, though other keypoints have it",
-            where=f"keypoints[{missing[0]}].{name}",
-            fix="give it for all keypoints or for none",
-        )
-    return values

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -74,23 +75,84 @@ def warp_mesh(
     targets = as_floats(target, name="target", shape=(len(places), 3))
     if not len(places):
         raise InputError("no keypoints", where="source")
-    box = mesh.bounds
+    if bounds is not None:
+        corners = _checked_bounds(bounds)
+        warp = linear_warp(mesh.vertices, mesh.bounds, places)
+        return replace(mesh, vertices=warp.apply(targets, corners))
+    diagonal = _diagonal(mesh.bounds, places)
+    merged = _merging(places, _COINCIDENT * diagonal)
+    places, targets = merged @ places, merged @ targets
+    stretch = _stretch_of_keypoints(places, targets)
+    weights = _weights(mesh.vertices, mesh.bounds, places, diagonal)
+    vertices = stretch(mesh.vertices) + weights @ (targets - stretch(places))
+    return replace(mesh, vertices=vertices)
+
+
+class LinearWarp(NamedTuple):
+    """A warp of p points as a linear map of n keypoints' places and the box to fill.
+
+    ``by_keypoints`` (p, n) holds for every axis alike, ``by_least`` and ``by_greatest`` (p, 3) are
+    the weights of the box's corners along each axis, ``constant`` (p, 3) holds for all places.
+    """
+
+    by_keypoints: FloatArray
+    by_least: FloatArray
+    by_greatest: FloatArray
+    constant: FloatArray
+
+    def apply(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
+        """The points (p, 3) where the keypoints come to ``target`` (n, 3), the box to a box."""
+        return self.constant + self.derivative(target, bounds)
+
+    def derivative(self, target: FloatArray, bounds: FloatArray) -> FloatArray:
+        """Displacements (p, 3) by those of the keypoints (n, 3) and of the box's corners (2, 3)."""
+        of_box = self.by_least * bounds[0] + self.by_greatest * bounds[1]
+        return np.asarray(self.by_keypoints @ target + of_box)
+
+
+def linear_warp(points: FloatArray, box: FloatArray, source: FloatArray) -> LinearWarp:
+    """The warp of points (p, 3) of a mesh, with its ``box`` (2, 3) and keypoints (n, 3)."""
+    diagonal = _diagonal(box, source)
+    merging = _merging(source, _COINCIDENT * diagonal)
+    places = merging @ source
+    weights = _weights(points, box, places, diagonal)
+    extents = box[1] - box[0]
+    flat = extents <= _COINCIDENT * extents.max()
+    safe = np.where(flat, np.inf, extents)
+
+    def corners(of: FloatArray) -> tuple[FloatArray, FloatArray]:
+        share = (of - box.mean(axis=0)) / safe
+        return 0.5 - share, 0.5 + share
+
+    (least, greatest), (least_there, greatest_there) = corners(points), corners(places)
+    middle = box.mean(axis=0)
+    return LinearWarp(
+        weights @ merging,
+        least - weights @ least_there,
+        greatest - weights @ greatest_there,
+        flat * (points - middle - weights @ (places - middle)),
+    )
+
+
+def _weights(
+    points: FloatArray, box: FloatArray, places: FloatArray, diagonal: float
+) -> FloatArray:
+    """Shares (p, n) of the keypoints' displacements in those of points."""
     everything = np.vstack([box, places])
-    diagonal = float(np.linalg.norm(np.ptp(everything, axis=0))) or 1.0
-    places, targets = _merged(places, targets, _COINCIDENT * diagonal)
-    if bounds is None:
-        stretch = _stretch_of_keypoints(places, targets)
-    else:
-        stretch = _stretch_of_boxes(box, as_floats(bounds, name="bounds", shape=(2, 3)))
-    corners = _corners(everything.min(axis=0), everything.max(axis=0), _MARGIN * diagonal)
-    leaves = RBFInterpolator(
-        np.vstack([places, corners]),
-        np.vstack([targets - stretch(places), np.zeros_like(corners)]),
+    around = _corners(everything.min(axis=0), everything.max(axis=0), _MARGIN * diagonal)
+    shares = RBFInterpolator(
+        np.vstack([places, around]),
+        np.eye(len(places) + len(around), len(places)),
         kernel="multiquadric",
         epsilon=1 / _rounding(places, diagonal),
         degree=0,
     )
-    return replace(mesh, vertices=stretch(mesh.vertices) + leaves(mesh.vertices))
+    return np.asarray(shares(points))
+
+
+def _diagonal(box: FloatArray, places: FloatArray) -> float:
+    """Diagonal of mesh and keypoints together; 1 where they are one point."""
+    return float(np.linalg.norm(np.ptp(np.vstack([box, places]), axis=0))) or 1.0
 
 
 def _rounding(places: FloatArray, diagonal: float) -> float:
@@ -99,15 +161,12 @@ def _rounding(places: FloatArray, diagonal: float) -> float:
     return min(_ROUNDING * diagonal, least)
 
 
-def _merged(
-    places: FloatArray, targets: FloatArray, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Replace coincident keypoints by one, which comes to the mean of their targets."""
+def _merging(places: FloatArray, tolerance: float) -> FloatArray:
+    """Matrix (k, n) that replaces coincident keypoints by one, which takes their mean."""
     gaps = np.linalg.norm(places[:, None] - places, axis=2)
     first = (gaps <= tolerance).argmax(axis=1)
-    kept = np.unique(first)
-    means = np.array([targets[first == row].mean(axis=0) for row in kept])
-    return places[kept], means
+    same = np.unique(first)[:, None] == first
+    return np.asarray(same / same.sum(axis=1, keepdims=True))
 
 
 def _stretch_of_keypoints(
@@ -126,15 +185,12 @@ def _stretch_of_keypoints(
     return lambda points: (points - centre) * stretch + to
 
 
-def _stretch_of_boxes(box: FloatArray, bounds: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """The shift and stretch that take one box to another; a flat axis is only shifted."""
-    extents, wanted = box[1] - box[0], bounds[1] - bounds[0]
-    if (wanted < 0).any():
-        what = f"the least corner {bounds[0].tolist()} exceeds {bounds[1].tolist()}"
+def _checked_bounds(bounds: npt.ArrayLike) -> FloatArray:
+    corners = as_floats(bounds, name="bounds", shape=(2, 3))
+    if (corners[1] < corners[0]).any():
+        what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
         raise InputError(what, where="bounds")
-    flat = extents <= _COINCIDENT * extents.max()
-    stretch = np.where(flat, 1.0, wanted / np.where(flat, 1.0, extents))
-    return lambda points: (points - box.mean(axis=0)) * stretch + bounds.mean(axis=0)
+    return corners
 
 
 def _corners(low: FloatArray, high: FloatArray, margin: float) -> FloatArray:

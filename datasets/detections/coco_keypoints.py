@@ -15,7 +15,8 @@ ultralytics' ``results.to_json()``
 
 The third number of a keypoint is its visibility flag where all of an object's are 0, 1 or 2 and one
 is 2: 0 for not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in
-COCO, integer coordinates are pixel centres.
+COCO, integer coordinates are pixel centres. A ``segmentation`` beside the keypoints is kept as it
+is, for `cadalign.datasets.detections.coco_masks`.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ class _Object(ForeignDocument):
     num_keypoints: int | None = None
     frame_id: _Id | None = None
     instances: list[_Object] | None = None
+    segmentation: Any = None
 
 
 class _Image(ForeignDocument):
@@ -182,6 +184,7 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         names=None if names is None else tuple(names),
         image=None if entry.image_id is None else str(entry.image_id),
         score=next((score for score in given if score is not None), None),
+        segmentation=entry.segmentation or None,
         source=where,
     )
 

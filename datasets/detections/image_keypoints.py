@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,9 @@ class ImageKeypoints:
         How many images the file lists, with keypoints or without.
     score : float, optional
         How sure the detector is of the whole object.
+    segmentation : list or dict, optional
+        The object's mask as COCO writes it, unchecked; see
+        `cadalign.datasets.detections.coco_masks.decode_segmentation`.
     source : str
         The file and the place in it, for messages.
     """
@@ -57,6 +61,7 @@ class ImageKeypoints:
     images: int = 1
     score: float | None = None
     source: str = "keypoints"
+    segmentation: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)

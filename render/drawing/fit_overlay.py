@@ -11,6 +11,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY, check_image_size
@@ -31,7 +32,7 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
     )
 
 
-def photo_of(observation: Observation, camera: Camera) -> ByteImage:
+def photo_of(observation: ObservedImage, camera: Camera) -> ByteImage:
     """The photo (h, w, 3), grey where there is none; refuses images that are too large."""
     check_image_size(camera)
     if observation.image is None:

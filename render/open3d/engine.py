@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import open3d
 
-from cadalign.render.raycast.caster import FaceArray, SingleArray
+from cadalign.geometry.raycaster import FaceArray, SingleArray
 
 _NO_HIT = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
 

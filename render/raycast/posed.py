@@ -12,8 +12,8 @@ from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays, perspective
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.color import LinearArray
-from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 from cadalign.render.views.lens_field import within_lens_field

@@ -12,9 +12,9 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.frame import Frame, Geometry, check_image_size
-from cadalign.render.raycast.caster import FaceArray, RayCaster
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import PosedScene, Rectangle, pose_scene
 from cadalign.render.raycast.shading import Studio

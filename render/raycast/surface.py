@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.raycaster import FaceArray
 from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
-from cadalign.render.raycast.caster import FaceArray
 
 
 class Surface:

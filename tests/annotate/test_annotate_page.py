@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from support.annotating import Case, place_all, place_twenty, served
+from support.timing import Yardstick, reference_seconds
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.page_state import page_state
@@ -21,11 +22,18 @@ from cadalign.cli import main
 READY = (
     "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
 )
+POLLS = 3000  # 20 ms apart; what fails after them does not come at all, however slow the machine
 
 # Without the thousands of numbers of the lines.
 STATE = """() => annotator.api.idle && annotator.state && {
     ...annotator.state,
     alignment: { ...annotator.state.alignment, lines: null, box: null },
+}"""
+ROUND_TRIPS = """async () => {
+    const begin = performance.now();
+    for (let k = 0; k < 4; k += 1) await (await fetch("/")).text();
+    await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+    return (performance.now() - begin) / 1000;
 }"""
 COUNT_COLOR = """color => {
     const { canvas, context } = annotator.photo;
@@ -53,15 +61,15 @@ class Driver:
         self.wait(READY)
 
     # Not `wait_for_function`, which evaluates text in the page: its policy forbids that.
-    def wait(self, condition: str, timeout: float = 20.0) -> None:
-        for _ in range(int(timeout / 0.02)):
+    def wait(self, condition: str) -> None:
+        for _ in range(POLLS):
             if self.page.evaluate(condition):
                 return
             self.page.wait_for_timeout(20)
-        pytest.fail(f"not true in {timeout:g} s: {condition}; errors: {self.errors}")
+        pytest.fail(f"never true: {condition}; errors: {self.errors}")
 
     def wait_for_state(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        for _ in range(500):
+        for _ in range(POLLS):
             state = self.page.evaluate(STATE)
             if state and condition(state):
                 return dict(state)
@@ -245,6 +253,7 @@ def test_tabs_of_one_photo_add_to_each_other_and_are_undone_apart(
     assert second.errors == []
 
 
+@pytest.mark.timing
 def test_click_is_fitted_and_redrawn_within_100_ms_at_20_pairs(
     opened: tuple[Driver, Case, Access],
 ) -> None:
@@ -252,16 +261,19 @@ def test_click_is_fitted_and_redrawn_within_100_ms_at_20_pairs(
     place_twenty(driver.session, case)
     driver.page.evaluate("annotator.api.refresh()")
     driver.wait_for_state(lambda state: len(state["pairs"]) == 20)
-    times = []
-    for _ in range(6):
+
+    def redrawing() -> float:
         # The last half of the twentieth pair is placed anew; that is what is timed.
         driver.page.evaluate("annotator.act({ do: 'undo' })")
         driver.wait_for_state(lambda state: fitted_pairs(state) == 19)
         driver.page.evaluate("annotator.redrawn = null; annotator.act({ do: 'redo' })")
         driver.wait("annotator.redrawn !== null")
         driver.wait_for_state(lambda state: fitted_pairs(state) == 20)
-        times.append(driver.page.evaluate("annotator.redrawn"))
-    assert min(times) < 100, times
+        return float(driver.page.evaluate("annotator.redrawn")) / 1000
+
+    # What the same browser and server take for page, network and screen alone.
+    by = Yardstick(lambda: float(driver.page.evaluate(ROUND_TRIPS)), 0.05)
+    assert reference_seconds(redrawing, below=0.1, by=by, rounds=5) < 0.1
 
 
 def fitted_pairs(state: dict[str, Any]) -> int:

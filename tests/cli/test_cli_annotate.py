@@ -35,11 +35,11 @@ def test_it_serves_until_interrupted(case: Case) -> None:
     try:
         url = process.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{43}", url)
-        with urllib.request.urlopen(url, timeout=30) as response:
+        with urllib.request.urlopen(url, timeout=120) as response:
             assert b"annotate.js" in response.read()
     finally:
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
     assert out == ""
     assert err.strip().splitlines()[-1] == f"Saved in {case.folder.absolute()}"

@@ -113,6 +113,25 @@ def test_keypoints_are_found_by_name_and_need_no_xyz(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+def test_shape_of_the_file_is_fitted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, shape=tmp_path / "box.shape")
+    keypoints = json.loads(path.read_text())["keypoints"]
+    bare = [{"semantic_id": each["semantic_id"], "uv": each["uv"]} for each in keypoints]
+    edit(path, keypoints=bare)
+    assert main(["fit", str(path)]) == 0
+    expected = align(numbered, View(CAMERA, [each["uv"] for each in keypoints], ids=range(6)))
+    assert capsys.readouterr().out == f"{expected}\n"
+    for flags in (["--no-stored"], ["--shape-sigma", "0.1"]):
+        line = refusal_line(capsys, "fit", path, *flags)
+        assert line == f"{path}: keypoints[0].xyz: missing"
+    assert refusal_line(capsys, "fit", path, "--similar") == (
+        "--similar: has no effect together with the file's shape; leave out one of the two"
+    )
+
+
 def test_similar_model_is_that_of_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

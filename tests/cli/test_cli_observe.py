@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera, FitResult, FocalPrior, fit
@@ -234,4 +236,98 @@ def test_photo_and_camera_of_different_sizes_are_refused(
     assert text == (
         f"{photo}: the image has 640 x 480 pixels, that of {camera} 100 x 50; "
         "give keypoints, photo and camera of one image"
+    )
+
+
+# --- evidence beyond keypoints -----------------------------------------------------------------
+
+
+@pytest.fixture
+def masked(folder: Path) -> Path:
+    """The folder with a camera, a model's mesh, and a square mask in the detector's file."""
+    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
+    (folder / "model.obj").write_text(TETRAHEDRON)
+    keypoints = ModelKeypoints.load(folder / "model.keypoints.json")
+    replace(keypoints, model=folder / "model.obj").save(folder / "model.keypoints.json")
+    found = json.loads((folder / "found.json").read_text())
+    found[0]["segmentation"] = [[100, 50, 300, 50, 300, 250, 100, 250]]
+    (folder / "found.json").write_text(json.dumps(found))
+    return folder
+
+
+def test_mask_is_written_beside_the_observation(
+    masked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert observe(masked, "--camera", str(masked / "camera.json"), "--mask-sigma", "2") == 0
+    path = masked / "found.observation.mask.png"
+    assert capsys.readouterr().out.endswith(f"; mask: {path}\n")
+    evidence = Observation.load(masked / "found.observation.json").evidence
+    assert (evidence.mask, evidence.mask_sigma) == (path, 2.0)
+    assert json.loads((masked / "found.observation.json").read_text())["mask"] == path.name
+    with Image.open(path) as mask:
+        pixels = np.asarray(mask)
+    expected = np.zeros((480, 640), dtype=np.uint8)
+    expected[50:250, 100:300] = 255
+    np.testing.assert_array_equal(pixels, expected)
+
+
+def test_mask_that_a_fit_cannot_use_is_left_out(
+    masked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert observe(masked, "--image", str(masked / "photo.jpg")) == 0
+    assert capsys.readouterr().err == "The mask is left out: a fit to it needs --camera.\n"
+    assert Observation.load(masked / "found.observation.json").is_plain
+    camera = ["--camera", str(masked / "camera.json")]
+    assert observe(masked, *camera, "--no-segmentation") == 0
+    assert Observation.load(masked / "found.observation.json").is_plain
+
+
+def test_options_give_depth_gravity_and_size(masked: Path) -> None:
+    Image.fromarray(np.full((480, 640), 4000, dtype=np.uint16)).save(masked / "depth.png")
+    Image.fromarray(np.full((480, 640), 255, dtype=np.uint8)).save(masked / "mask.png")
+    options = ["--camera", masked / "camera.json", "--mask", masked / "mask.png"]
+    options += ["--depth", masked / "depth.png", "--depth-scale", ".001", "--depth-sigma", ".02"]
+    options += ["--up", "0", "-1", ".1", "--up-sigma-deg", "2", "--camera-height", "1.5"]
+    options += ["--size", "height", ".9", "sigma", ".02"]
+    assert observe(masked, *map(str, options)) == 0
+    observation = Observation.load(masked / "found.observation.json")
+    evidence = observation.evidence
+    assert (evidence.mask, evidence.depth) == (masked / "mask.png", masked / "depth.png")
+    assert (evidence.depth_scale, evidence.depth_sigma) == (0.001, 0.02)
+    assert evidence.up is not None
+    assert evidence.up.tolist() == [0.0, -1.0, 0.1]
+    assert (evidence.up_sigma_deg, evidence.camera_height) == (2.0, 1.5)
+    assert observation.size is not None
+    assert observation.size.given == {"height": 0.9, "sigma": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--mask-sigma", "-1"], "--mask-sigma: -1.0 is not positive"),
+        (["--no-segmentation", "--mask-sigma", "1"], "--mask-sigma: given without mask; "),
+        (["--depth-scale", ".001"], "--depth-scale: given without depth; "),
+        (["--depth", "{folder}/none.png"], "{folder}/none.png: no such file"),
+        (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
+        (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
+        (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
+        (["--size", "sigma", "1"], "size: no length is given; give width, height or length"),
+    ],
+)
+def test_evidence_that_cannot_be_used_is_refused(
+    masked: Path, capsys: pytest.CaptureFixture[str], options: list[str], text: str
+) -> None:
+    Image.new("L", (8, 6)).save(masked / "small.png")
+    given = [option.format(folder=masked) for option in options]
+    line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json"), *given))
+    assert line.startswith(text.format(folder=masked))
+
+
+def test_malformed_mask_is_refused(masked: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = json.loads((masked / "found.json").read_text())
+    found[0]["segmentation"] = {"size": [480, 640], "counts": [1, 2]}
+    (masked / "found.json").write_text(json.dumps(found))
+    line = refusal_line(capsys, *observing(masked, "--camera", str(masked / "camera.json")))
+    assert line.startswith(
+        f"{masked / 'found.json'}: [0]: segmentation.counts: the runs have 3 pixels, "
     )

@@ -70,6 +70,7 @@ def test_simulate_takes_the_address(cluster: Any) -> None:
     assert table.status.tolist() == ["ok"] * 5
 
 
+@pytest.mark.timing
 @pytest.mark.parametrize(
     ("address", "reason"),
     [

@@ -24,7 +24,15 @@ def evaluate(*arguments: Any, **options: Any) -> Any:
 
 def test_every_experiment_has_a_specification_with_its_name() -> None:
     names = [options.experiment for options in known_options()]
-    assert names == ["keypointnet", "demo", "simulate", "correspondences", "retrieval", "unseen"]
+    assert names == [
+        "keypointnet",
+        "demo",
+        "simulate",
+        "correspondences",
+        "retrieval",
+        "unseen",
+        "evidence",
+    ]
     for options in known_options():
         spec = spec_named(options.experiment)
         assert spec.options is options

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import gc
-import time
 from collections.abc import Callable
 
 import cv2
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from support.problems import problem_of
+from support.timing import ratio, timed
 
 from cadalign import Box, RansacOptions, fit, fit_batch
 from cadalign.evaluation.simulation.problems import random_rotation
@@ -63,22 +62,7 @@ def test_box_iou(benchmark: BenchmarkFixture) -> None:
     benchmark(box_iou, est=est, gt=gt)
 
 
-def ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> float:
-    """The ratio of median times; both take turns of ten calls, without garbage collection."""
-    times: dict[Callable[[], object], list[float]] = {ours: [], theirs: []}
-    gc.disable()  # the rest of the test suite's garbage is none of theirs
-    try:
-        for _ in range(15):
-            for function, seconds in times.items():
-                for _ in range(10):
-                    start = time.perf_counter()
-                    function()
-                    seconds.append(time.perf_counter() - start)
-    finally:
-        gc.enable()
-    return float(np.median(times[ours]) / np.median(times[theirs]))
-
-
+@pytest.mark.timing
 @pytest.mark.parametrize(
     ("points", "solver_limit", "linear_limit", "optimal_limit"),
     [(10, 0.3, 1.2, 1.5), (100, 0.25, 1.0, 1.2), (1024, 0.2, 0.5, 0.7), (4096, 0.2, 0.4, 0.7)],
@@ -101,9 +85,5 @@ def test_times_over_opencv(
         (lambda: fit(x, uv, camera, method="aepnp"), epnp, linear_limit),
         (lambda: fit(x, uv, camera), iterative, optimal_limit),
     ):
-        # The machine may be busy with other things for a while; one good measurement decides.
-        measured = [ratio(ours, theirs)]
-        while min(measured) >= limit and len(measured) < 20:
-            time.sleep(0.2)
-            measured.append(ratio(ours, theirs))
-        assert min(measured) < limit
+        turns = timed(ours, calls=10), timed(theirs, calls=10)
+        assert ratio(*turns, below=limit, rounds=15) < limit

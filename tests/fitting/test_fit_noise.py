@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -230,7 +232,10 @@ def test_many_good_keypoints_leave_nothing_to_warn_of() -> None:
 
 
 def test_stats_count_the_work() -> None:
-    stats = fit_problem(problem_of(0)).stats
+    problem = problem_of(0)
+    start = time.perf_counter()
+    stats = fit_problem(problem).stats
+    elapsed = time.perf_counter() - start
     assert stats.iterations > 0
     assert stats.hypotheses > 0
-    assert 0 < stats.seconds < 60
+    assert 0 < stats.seconds <= elapsed

@@ -202,6 +202,26 @@ _OBSERVATION = {
         )
     ],
 }
+_EVIDENCE = {
+    "views": [
+        {
+            **_OBSERVATION,
+            "mask": "a.png",
+            "mask_sigma": 1.5,
+            "depth": "b.png",
+            "depth_scale": 0.001,
+            "depth_sigma": 0.01,
+            "up": [0.0, -1.0, 0.0],
+            "up_sigma_deg": 1.0,
+            "camera_height": 1.4,
+            "camera_height_sigma": 0.02,
+            "cam_from_rig": np.eye(4).tolist(),
+        },
+    ],
+    "size": {"width": 1.0, "sigma": [0.1, 0.1, 0.1]},
+    "shape": "a.shape",
+    "model": "a.obj",
+}
 _COCO = {
     "images": [{"id": 1, "file_name": "a.jpg", "width": 64, "height": 48}],
     "categories": [{"id": 1, "name": "chair", "keypoints": ["a", "b", "c"]}],
@@ -369,6 +389,7 @@ FORMATS = {
         Format("sealed image", _write_image, read_photo, _seal_png),
         Format("photo", _write_photo, _read_photo),
         Format("observation", _json("o.json", _OBSERVATION), Observation.load),
+        Format("evidence", _json("e.json", _EVIDENCE), Observation.load),
         Format("coco", _json("c.json", _COCO), read_image_keypoints),
         Format("csv", _text("k.csv", "name,u,v,score\na,1,2,.5\nb,3,4,.1\n"), read_image_keypoints),
         Format("keypointnet", _write_annotations, _read_annotations),

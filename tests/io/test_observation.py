@@ -128,7 +128,9 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             DATA | {"cameras": 3},
             "{path}: top level: unknown field 'cameras'; "
-            "known are camera, fit, image, keypoints, model",
+            "known are cam_from_rig, camera, camera_height, camera_height_sigma, depth, "
+            "depth_scale, depth_sigma, fit, image, keypoints, mask, mask_sigma, model, shape, "
+            "size, up, up_sigma_deg",
         ),
         (
             DATA | {"x` - at `$.y": 3},
@@ -140,7 +142,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             changed("keypoints.2.uvw", 3),
             "{path}: keypoints[2]: unknown field 'uvw'; "
-            "known are confidence, name, semantic_id, sigma, uv, xyz",
+            "known are confidence, depth, name, semantic_id, sigma, uv, xyz",
         ),
         (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: [1, 2] is not a list of 3"),
         (

@@ -9,10 +9,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
+    Heights,
     Lengths,
+    Planes,
     Rig,
     ScalePriors,
     Shape,
@@ -22,7 +25,6 @@ from cadalign.solvers.joint.evidence import (
     points_of,
 )
 from cadalign.solvers.joint.refine import move_state, refine_joint
-from cadalign.solvers.joint.search import joint_covariance
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
 POINTS, MODES, VIEWS = 7, 3, 2
@@ -50,14 +52,31 @@ def evidence_of(seed: int, *, spread: float, poses: tuple[int, int], loss: int) 
     rotations = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.3, 0]]).as_matrix().reshape(VIEWS, 9)
     cameras = np.concatenate([rotations, 0.1 * rng.normal(size=(VIEWS, 3))], axis=1)
     up = Directions(
-        np.array([[0.0, 1.0, 0.0]]), np.array([[0, 0.8, 0.6]]), np.array([1]), np.array([30.0])
+        np.array([[0.0, 1.0, 0.0]]),
+        np.array([[0, 0.8, 0.6]]),
+        np.array([1]),
+        30 * np.eye(3)[None] + rng.normal(size=(1, 3, 3)),
     )
     lengths = Lengths(
         np.array([[0, 1], [2, 3]]), np.array([0, 1]), np.array([1.0, 2.0]), np.array([10.0, 20.0])
     )
+    heights = Heights(
+        np.array([5]), np.array([1]), np.array([[0.0, 0.6, 0.8]]), np.array([2.0]), np.array([20.0])
+    )
+    planes = Planes(
+        np.array([2, 6]),
+        np.array([0, 1]),
+        rng.normal(size=(2, 3)),
+        np.array([4.0, 5.0]),
+        np.array([30.0, 20.0]),
+        np.full(2, loss),
+        np.full(2, 2.0),
+    )
     precision = rng.normal(size=(3, 3))
     scales = ScalePriors(np.ones(3), precision @ precision.T)
-    return Evidence(shape, sightings, Rig(cameras, np.array(poses)), up, lengths, scales)
+    return Evidence(
+        shape, sightings, Rig(cameras, np.array(poses)), up, lengths, heights, planes, scales
+    )
 
 
 def state_of(seed: int, poses: int) -> State:
@@ -133,7 +152,12 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = seen_from(evidence, state_of(5, 1))
     free = evidence.scales._replace(free=np.zeros(3))
-    evidence = evidence._replace(scales=free, lengths=_without(evidence.lengths))
+    evidence = evidence._replace(
+        scales=free,
+        lengths=Lengths(*(column[:0] for column in evidence.lengths)),
+        heights=Heights(*(column[:0] for column in evidence.heights)),
+        planes=Planes(*(column[:0] for column in evidence.planes)),
+    )
     as_modes = evidence._replace(
         shape=Shape(
             evidence.shape.mean,
@@ -183,7 +207,3 @@ def test_covariances_of_points_are_propagated_from_the_unknowns(poses: tuple[int
     expected = slopes @ found.unknowns @ slopes.swapaxes(-1, -2)
     size = np.abs(expected).max()
     assert np.allclose(expected, [found.points, found.seen], rtol=1e-5, atol=1e-7 * size)
-
-
-def _without(lengths: Lengths) -> Lengths:
-    return Lengths(*(column[:0] for column in lengths))

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import RAYS
 from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.runs.tables import Row
 
 if TYPE_CHECKING:
@@ -80,10 +79,26 @@ class KeypointTask:
         )
 
 
+class TaskOptions(Protocol):
+    """Options that say which tasks there are."""
+
+    @property
+    def visibility(self) -> str:
+        """Rule by which keypoints count as seen."""
+
+    @property
+    def views_per_model(self) -> int:
+        """Number of views of each model."""
+
+    @property
+    def max_models(self) -> int | None:
+        """Largest number of models of each category."""
+
+
 class KeypointTasks(Sequence[KeypointTask]):
     """All views of all models of a dataset in the order of their names, made when asked for."""
 
-    def __init__(self, dataset: KeypointNet, options: KeypointNetOptions) -> None:
+    def __init__(self, dataset: KeypointNet, options: TaskOptions) -> None:
         self._dataset, self._visibility = dataset, options.visibility
         self._views = options.views_per_model
         self._keys = [

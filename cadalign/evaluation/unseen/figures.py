@@ -7,15 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import HIGH, Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.curves import cumulative
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import known
 
-_SHARE = replace(metrics.COVERED, key="share", label="objects", better=HIGH)
 _CURVES = (
     (metrics.ROTATION, np.array([0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(metrics.BOX_IOU_UP_TO_SCALE, log=False), np.arange(0, 1.01, 0.1)),
@@ -26,32 +23,11 @@ _CALIBRATED = (("rotation_level", "rotation"), ("stretch_level", "stretch"))
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of objects within an error, and of truths within stated regions, by method."""
-    curves = [_curve(runs, metric, places) for metric, places in _CURVES]
+    curves = [
+        cumulative(runs, metric, places, title=f"{metric.label} of unseen objects")
+        for metric, places in _CURVES
+    ]
     return [*curves, *(_calibration(runs, column, name) for column, name in _CALIBRATED)]
-
-
-def _curve(runs: Sequence[Run], metric: Metric, places: FloatArray) -> Plot:
-    traces = []
-    for index, run in enumerate(runs):
-        for method in run.methods:
-            chosen = run.cells["method"] == method
-            solved = chosen & (run.cells["status"] == OK)
-            errors = known(run.cells[metric.key][solved])
-            count = max(int(chosen.sum()), 1)
-            within = (
-                errors >= places[:, None] if metric.better == HIGH else errors <= places[:, None]
-            )
-            shares = within.sum(axis=1) / count
-            traces.append(Trace.of(index, method, places.tolist(), shares.tolist(), _SHARE))
-    words = "at least this overlap" if metric.better == HIGH else "at most this error"
-    return Plot(
-        id=f"within_{metric.key}",
-        x=metric,
-        y=replace(_SHARE, label=f"objects with {words}"),
-        traces=traces,
-        note="over all categories; failures count",
-        title=f"{metric.label} of unseen objects",
-    )
 
 
 def _calibration(runs: Sequence[Run], column: str, name: str) -> Plot:

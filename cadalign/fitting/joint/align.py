@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -18,10 +19,12 @@ from cadalign.fitting.joint.plain import align_plain, is_plain
 from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.robust import Consensus, find_consensus, state_of
-from cadalign.fitting.joint.starts import starts_of
+from cadalign.fitting.joint.size import Size
+from cadalign.fitting.joint.starts import Start, starts_of
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.options import LOSSES, FitOptions, RansacOptions
 from cadalign.fitting.result import FitStats
+from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.search import search_joint
@@ -32,6 +35,8 @@ def align(
     model: Model | ShapeModel,
     views: View | Sequence[View],
     *,
+    size: Size | None = None,
+    init: Alignment | None = None,
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
@@ -46,6 +51,12 @@ def align(
     views : View or sequence of View
         What the images tell. Views with ``cam_from_rig`` share one pose and determine the object's
         size; views without it have a pose each and share the stretch and the shape.
+    size : Size, optional
+        Known lengths of the object.
+    init : Alignment, optional
+        A start beside those that the keypoints suggest, needed where these are too few: the
+        alignment in the rig's frame or, where the views have no ``cam_from_rig``, in the first
+        camera's.
     loss, loss_scale
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
@@ -79,21 +90,25 @@ def align(
     start = time.perf_counter()
     given = [views] if isinstance(views, View) else list(views)
     _check_views(given)
+    _check_start(size, init)
     options = FitOptions(loss=loss, loss_scale=loss_scale)
-    if is_plain(model, given):
+    if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
     prior = prior_of(model)
     minima: list[Minimum] = []
     iterations = hypotheses = 0
-    everything = evidence_of(prior, given, loss=LOSSES[options.loss], loss_scale=options.loss_scale)
+    everything = evidence_of(
+        prior, given, size, loss=LOSSES[options.loss], loss_scale=options.loss_scale
+    )
+    first = None if init is None else _start(init, everything)
     for number, shape in enumerate(prior.components):
         evidence = everything._replace(shape=shape)
         if ransac is None:
-            found, used, tried = _search(evidence)
+            found, used, tried = _search(evidence, first)
         else:
             threshold = _thresholds(evidence, given, ransac.max_reproj_error)
-            found, used, tried = find_consensus(evidence, threshold, int(ransac.seed))
+            found, used, tried = find_consensus(evidence, threshold, int(ransac.seed), first)
         iterations, hypotheses = iterations + used, hypotheses + tried
         prior_score = -2 * float(np.log(prior.weights[number]))
         minima.extend(
@@ -103,11 +118,18 @@ def align(
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
-            fix="give at least 3 keypoints in one view, and check which is which",
+            fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
     minima.sort(key=lambda minimum: minimum.score)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    return assemble(model, prior, given, minima, stats)
+    if all(view.mask is None for view in given):
+        return assemble(model, prior, given, minima, stats)
+    from cadalign.fitting.contours.depth import fit_depths
+    from cadalign.fitting.contours.fit import fit_masks  # with OpenCV and embree
+
+    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
+    stats = replace(stats, seconds=time.perf_counter() - start)
+    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
 
 
 def align_batch(
@@ -154,9 +176,9 @@ def align_batch(
         return list(pool.map(one, objects))
 
 
-def _search(evidence: Evidence) -> tuple[list[Consensus], int, int]:
+def _search(evidence: Evidence, init: Start | None) -> tuple[list[Consensus], int, int]:
     """Minima of all sightings together, and the effort they took."""
-    poses, log_scales = starts_of(evidence)
+    poses, log_scales = starts_of(evidence, init)
     if not len(poses):
         return [], 0, 0
     minima, count, iterations = search_joint(evidence, poses, log_scales)
@@ -189,3 +211,22 @@ def _check_views(views: Sequence[object]) -> None:
         if not isinstance(view, View):
             what = f"expected a cadalign.View, got {type(view).__name__}"
             raise InputError(what, where=f"views[{number}]")
+
+
+def _start(init: Alignment, evidence: Evidence) -> Start:
+    """A given alignment as a start; where the size is held, it shrinks about the origin."""
+    rotation, translation, scale = init.rotation, init.translation, np.array(init.scale)
+    held = evidence.scales.free == 0
+    if held.any():
+        size = scale[held].mean()
+        scale, translation = np.where(held, 1.0, scale / size), translation / size
+    return Start(np.concatenate([rotation.ravel(), translation]), np.log(scale))
+
+
+def _check_start(size: object, init: object) -> None:
+    if size is not None and not isinstance(size, Size):
+        what = f"expected a cadalign.Size, got {type(size).__name__}"
+        raise InputError(what, where="size")
+    if init is not None and not isinstance(init, Alignment):
+        what = f"expected a cadalign.Alignment, got {type(init).__name__}"
+        raise InputError(what, where="init")

@@ -9,6 +9,9 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.fitting.fit import LEAST_LIKELIHOOD
+from cadalign.fitting.joint.agreement import summaries_of
+from cadalign.fitting.joint.contributions import Basis
+from cadalign.fitting.joint.deviations import pose_and_lengths
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
 from cadalign.fitting.joint.result import AlignAlternative, AlignResult
@@ -18,10 +21,10 @@ from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.joint.search import joint_covariance
 
-_SAME = 9.0  # squared distance of rotations, in deviations, up to which two estimates are one
+_SAME = 9.0  # squared distance of rotations, in the best one's deviations, of equal estimates
 
 
 class Minimum(NamedTuple):
@@ -62,7 +65,7 @@ def assemble(
     """
     likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
     likely = [
-        _estimate(_widened(each, prior.inflation), likelihood)
+        _estimate(_widened(each, prior.inflation), likelihood, len(prior.ids))
         for each, likelihood in zip(minima, likelihoods, strict=True)
         if likelihood >= LEAST_LIKELIHOOD
     ]
@@ -74,12 +77,13 @@ def assemble(
         rows = prior.rows_of(view.keypoint_ids, "ids")
         seen = view.camera.project(pose.apply(best.points[rows]))
         residuals.append(seen - cast(FloatArray, view.points_2d))
-    stretch = best.lengths / np.where(prior.lengths > 0, prior.lengths, 1.0)
-    stretch = np.where(prior.lengths > 0, stretch, 1.0)
+    of_mean = prior.lengths
+    stretch = np.where(of_mean > 0, best.lengths / np.where(of_mean > 0, of_mean, 1.0), 1.0)
+    information = np.linalg.pinv(best.covariance[:3, :3]) if len(likely) > 1 else np.zeros((3, 3))
     alternatives = tuple(
         AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
         for each, step in zip(likely[1:], steps[1:], strict=True)
-        if _differs(step, best)
+        if float(step[:3] @ information @ step[:3]) > _SAME
     )
     return AlignResult(
         alignment=best.poses[0],
@@ -96,8 +100,11 @@ def assemble(
         component=minimum.component,
         model=model,
         alternatives=alternatives,
-        warnings=warnings_of(minimum.evidence, minimum.cost, best.poses, covariance),
+        warnings=warnings_of(minimum.evidence, minimum.state, minimum.cost, best.poses, covariance),
         stats=stats,
+        evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
+        rig_from_model=_in_rig(views, minimum, best.scale),
+        basis=Basis(minimum.evidence, minimum.state),
     )
 
 
@@ -113,10 +120,12 @@ def _widened(minimum: Minimum, factor: float) -> Minimum:
     )
 
 
-def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
+def _estimate(minimum: Minimum, likelihood: float, keypoints: int) -> _Estimate:
     scale = np.exp(minimum.state.log_scales)
-    stretched = points_of(minimum.evidence.shape, minimum.state)
-    seen = stretched[np.unique(minimum.evidence.sightings.point)]
+    rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
+    stretched = points_of(minimum.evidence.shape, minimum.state)[rows]
+    sighted = np.unique(minimum.evidence.sightings.point)
+    seen = stretched[sighted[sighted < keypoints]]
     if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
@@ -126,11 +135,19 @@ def _estimate(minimum: Minimum, likelihood: float) -> _Estimate:
         scale,
         _poses(minimum, scale),
         stretched[-1] - stretched[-2],
-        _pose_and_lengths(minimum, unknowns),
-        of_points,
-        of_seen,
+        pose_and_lengths(minimum.evidence, minimum.state, unknowns),
+        of_points[rows],
+        of_seen[rows],
         likelihood,
     )
+
+
+def _in_rig(views: Sequence[View], minimum: Minimum, scale: FloatArray) -> Alignment | None:
+    """The alignment in the frame that the views share."""
+    if views[0].cam_from_rig is None:
+        return None
+    pose = minimum.state.poses[0]
+    return Alignment(pose[:9].reshape(3, 3), pose[9:], scale)
 
 
 def _moments(
@@ -140,13 +157,13 @@ def _moments(
 
     ``steps`` lead from the first to each.
     """
-    total = sum(each.likelihood for each in likely)
     best = likely[0]
-    covariance, of_points = np.zeros((9, 9)), np.zeros_like(best.of_points)
-    of_seen = np.zeros_like(best.of_seen)
-    for each, step in zip(likely, steps, strict=True):
-        weight = each.likelihood / total
-        covariance += weight * (each.covariance + np.outer(step, step))
+    share = 1.0 / sum(each.likelihood for each in likely)
+    covariance = share * best.covariance
+    of_points, of_seen = share * best.of_points, share * best.of_seen
+    for each, step in zip(likely[1:], steps[1:], strict=True):
+        weight = share * each.likelihood
+        covariance += weight * (each.covariance + step[:, None] * step)
         moved = each.points * each.scale - best.points * best.scale
         of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
         moved = each.poses[0].apply(each.points) - best.poses[0].apply(best.points)
@@ -162,12 +179,6 @@ def _step(best: _Estimate, other: _Estimate) -> FloatArray:
     logs[safe] = np.log(other.lengths[safe] / best.lengths[safe])
     turn = vector_from_rotation(second.rotation @ first.rotation.T)
     return np.concatenate([turn, second.translation - first.translation, logs])
-
-
-def _differs(step: FloatArray, best: _Estimate) -> bool:
-    """True for a step that turns the best estimate by more than its deviations."""
-    turn = step[:3]
-    return bool(turn @ np.linalg.pinv(best.covariance[:3, :3]) @ turn > _SAME)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
@@ -187,26 +198,6 @@ def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
         pose = minimum.state.poses[p]
         rotation = camera[:9].reshape(3, 3)
         turned = rotation @ pose[:9].reshape(3, 3)
-        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
+        shift = rotation @ pose[9:] + camera[9:]
+        poses.append(Alignment(turned, shift, scale, is_valid=True))
     return tuple(poses)
-
-
-def _pose_and_lengths(minimum: Minimum, unknowns: FloatArray) -> FloatArray:
-    """Covariance (9, 9) of the first camera's pose and the log lengths of the box."""
-    shape, state = minimum.evidence.shape, minimum.state
-    rig = minimum.evidence.rig
-    rotation = rig.cam_from_rig[0][:9].reshape(3, 3)
-    first = 6 * int(rig.pose.max() + 1)
-    rows = np.zeros((9, len(unknowns)))
-    pose = 6 * int(rig.pose[0])
-    rows[:3, pose : pose + 3] = rotation
-    rows[3:6, pose + 3 : pose + 6] = rotation
-    modes = shape.modes[:, -1] - shape.modes[:, -2]
-    extent = shape.mean[-1] - shape.mean[-2] + state.coefficients @ modes
-    safe = np.where(extent > 0, extent, np.inf)
-    own = np.zeros(9)
-    for axis in range(3):
-        rows[6 + axis, first + axis] = 1.0
-        rows[6 + axis, first + 3 :] = modes[:, axis] / safe[axis]
-        own[6 + axis] = (shape.spread[-2:] ** 2).sum() / safe[axis] ** 2
-    return np.asarray(rows @ unknowns @ rows.T + np.diag(own))

@@ -10,6 +10,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
+from cadalign.fitting.joint.summary import EvidenceSummary
 from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import Finite, ForeignDocument, NotNegative, Point3, convert, within
@@ -38,6 +39,15 @@ class _View(ForeignDocument):
             raise InputError(what, where="inliers")
 
 
+class _Summary(ForeignDocument):
+    kind: str
+    view: int | None
+    count: int
+    rms_sigmas: NotNegative
+    rms: NotNegative
+    unit: str
+
+
 class _Result(ForeignDocument):
     """The fields of `AlignResult`; ``rms``, ``std`` and ``box`` follow from them."""
 
@@ -53,6 +63,8 @@ class _Result(ForeignDocument):
     alternatives: list[_Alternative]
     warnings: list[str]
     stats: FitStats
+    evidence: tuple[_Summary, ...] = ()
+    rig_from_model: Any = None
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -100,6 +112,8 @@ def write_result(result: AlignResult) -> dict[str, Any]:
         ],
         "warnings": list(result.warnings),
         "stats": asdict(result.stats),
+        "evidence": [asdict(summary) for summary in result.evidence],
+        "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
     }
 
 
@@ -141,6 +155,11 @@ def read_result(data: Mapping[str, Any]) -> AlignResult:
             ),
             warnings=tuple(read.warnings),
             stats=read.stats,
+            evidence=tuple(
+                EvidenceSummary(**{name: getattr(each, name) for name in each.__struct_fields__})
+                for each in read.evidence
+            ),
+            rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
         )
     except CadalignError as error:
         place = f"alignment result: {error.where}" if error.where else "alignment result"

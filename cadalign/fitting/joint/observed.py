@@ -1,37 +1,60 @@
-"""Models and views of observation files, for `align`."""
+"""Models, views and known lengths of observation files, for `align`."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
+from contextlib import nullcontext
 
 from cadalign.errors import InputError
 from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.options import FitOptions, Sigma
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.documents import within
 from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
 
 
-def similar_model(
-    observation: Observation, *, shape_sigma: float, options: FitOptions, mesh: Mesh | None = None
+def model_of(
+    observation: Observation,
+    *,
+    options: FitOptions,
+    shape_sigma: float | None = None,
+    mesh: Mesh | None = None,
 ) -> Model:
-    """The model of an observation's own keypoints, which is only similar to the object.
+    """The model of an observation's own keypoints, those of all its views.
 
     Parameters
     ----------
     observation : Observation
-    shape_sigma : float
-        See `cadalign.Model`.
     options : FitOptions
         Of these the known axis, the stretch and the prior on it count.
+    shape_sigma : float, optional
+        See `cadalign.Model`.
     mesh : Mesh, optional
         That of the model.
+
+    Raises
+    ------
+    InputError
+        If views place the same keypoint at different points of the model.
     """
+    points: dict[Hashable, tuple[float, ...]] = {}
+    labels = own_ids(observation.views)
+    for number, (view, names) in enumerate(zip(observation.views, labels, strict=True)):
+        for row, (name, xyz) in enumerate(zip(names, view.points_3d.tolist(), strict=True)):
+            if points.setdefault(name, tuple(xyz)) != tuple(xyz):
+                raise InputError(
+                    f"differs from that of keypoint {name!r} in a view before",
+                    where=f"views[{number}].keypoints[{row}].xyz",
+                    fix="give the same point of the model",
+                )
     return Model(
-        points_3d=observation.points_3d,
-        ids=own_ids(observation),
+        points_3d=list(points.values()),
+        ids=list(points),
         mesh=mesh,
         shape_sigma=shape_sigma,
         stretch=options.stretch,
@@ -40,38 +63,56 @@ def similar_model(
     )
 
 
-def view_of(observation: Observation, model: Model | ShapeModel, *, sigma: Sigma) -> View:
-    """Evidence of an observation's image about a model.
+def views_of(
+    observation: Observation, model: Model | ShapeModel, *, sigma: Sigma | None = None
+) -> tuple[View, ...]:
+    """What the images of an observation tell about a model.
 
     A learned shape's keypoints are found by semantic id or by name, as the shape has them.
 
-    Raises
-    ------
-    InputError
-        If the shape has no such keypoints, the observation has no ids or names, or one of them
-        occurs twice.
-    """
-    ids = own_ids(observation) if isinstance(model, Model) else shape_ids(observation, model)
-    return View(
-        observation.camera,
-        observation.points_2d,
-        ids=ids,
-        sigma=sigma,
-        confidences=observation.confidences,
-    )
-
-
-def shape_ids(observation: Observation, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """The ids, or names, by which a learned shape knows an observation's keypoints.
+    Parameters
+    ----------
+    observation : Observation
+    model : Model or ShapeModel
+    sigma : float or array, optional
+        Standard deviation of the keypoints [px] in place of the observation's, which is 1 where it
+        has none.
 
     Raises
     ------
     InputError
-        As `view_of`.
+        If the shape has no such keypoints, the observation has no ids or names, one of them occurs
+        twice, or what the observation says of an image is invalid.
+    DataError
+        If a mask or a depth image cannot be read.
     """
+    own = own_ids(observation.views)
+    views = []
+    for number, image in enumerate(observation.views):
+        with within(f"views[{number}]") if observation.others else nullcontext():
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
+            views.append(_view(image, ids, sigma))
+    return tuple(views)
+
+
+def size_of(observation: Observation) -> Size | None:
+    """The known lengths of an observation's object, if there are any."""
+    return None if observation.size is None else Size(**observation.size.given)
+
+
+def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
+    """The ids, or names, by which a learned shape knows an image's keypoints.
+
+    Raises
+    ------
+    InputError
+        As `views_of`.
+    """
+    if not len(image.points_2d):
+        return ()
     named = isinstance(shape.ids[0], str)
     field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
-    given = observation.names if named else observation.semantic_ids
+    given = image.names if named else image.semantic_ids
     if given is None:
         raise InputError(
             f"the keypoints have no {field}",
@@ -88,10 +129,41 @@ def shape_ids(observation: Observation, shape: ShapeModel) -> tuple[KeypointId, 
     return ids
 
 
-def own_ids(observation: Observation) -> tuple[Hashable, ...] | None:
-    """Semantic ids or names of an observation's keypoints, where these tell them apart."""
-    ids = observation.semantic_ids
-    for given in (None if ids is None else ids.tolist(), observation.names):
-        if given is not None and len(set(given)) == len(given):
-            return tuple(given)
-    return None
+def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
+    """Labels of the images' keypoints by which they are the same in several.
+
+    Their semantic ids or names, where these tell all keypoints of an image apart; otherwise their
+    numbers, in several images those of equal ``xyz``.
+    """
+    shown = [image for image in images if len(image.points_2d)]
+    for field in ("semantic_ids", "names"):
+        columns = [getattr(image, field) for image in shown]
+        if all(column is not None and len(set(column)) == len(column) for column in columns):
+            of_all = [getattr(image, field) if len(image.points_2d) else () for image in images]
+            return tuple(
+                tuple(each if isinstance(each, str) else int(each) for each in column)
+                for column in of_all
+            )
+    if len(shown) < 2:
+        return tuple(tuple(range(len(image.points_2d))) for image in images)
+    numbers: dict[tuple[float, ...], int] = {}
+    return tuple(
+        tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
+        for image in images
+    )
+
+
+def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) -> View:
+    evidence = image.evidence.given
+    if image.depths is not None:
+        evidence["depth"] = image.depths
+    if sigma is None:
+        sigma = 1.0 if image.sigma is None else image.sigma
+    return View(
+        image.camera,
+        image.points_2d,
+        ids=ids,
+        sigma=sigma,
+        confidences=image.confidences,
+        **evidence,
+    )

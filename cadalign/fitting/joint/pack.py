@@ -9,76 +9,87 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.fitting.joint.depth import sampled_planes
 from cadalign.fitting.joint.prior import ShapePrior
+from cadalign.fitting.joint.scales import scale_priors
+from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
+    Heights,
     Lengths,
     Rig,
-    ScalePriors,
     Sightings,
 )
 
+_NONE = np.empty(0, dtype=np.int64)
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
-_NO_LENGTHS = Lengths(
-    np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
-)
-_COMMON_SCALE_SIGMA = 3.0  # of the log of a size that views or depth determine
-_SAME_SCALE_SIGMA = 1e-4
 
 
 def evidence_of(
     prior: ShapePrior,
     views: Sequence[View],
+    size: Size | None,
     *,
     loss: int,
     loss_scale: float,
 ) -> Evidence:
-    """All that the views and the first component of the prior tell.
+    """All that the views, the size and the first component of the prior tell.
 
     Raises
     ------
     InputError
-        If a view names a keypoint that the model lacks, or only some views have a known pose.
+        If a view names a keypoint that the model lacks, tells nothing, or tells of an up axis that
+        the model lacks, or if only some views have a known pose.
     """
+    rows = [
+        prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+        for number, view in enumerate(views)
+    ]
+    for number, view in enumerate(views):
+        _check_view(prior, view, number)
     return Evidence(
         prior.components[0],
-        _sightings(prior, views, loss, loss_scale),
+        _sightings(rows, views, loss, loss_scale),
         _rig(views),
         _directions(prior, views),
-        _NO_LENGTHS,
-        _scales(prior, views),
+        _lengths(prior, size),
+        _heights(prior, views),
+        sampled_planes(prior.components[0], rows, views),
+        scale_priors(prior, is_metric(views, size)),
     )
 
 
-def is_metric(views: Sequence[View]) -> bool:
-    """True if the views tell the object's size: by depth, or by several known camera poses."""
-    if any(view.depth is not None and np.isfinite(view.depth).any() for view in views):
+def is_metric(views: Sequence[View], size: Size | None) -> bool:
+    """True if the object's size is told: by depths, lengths, heights, or known camera poses."""
+    if size is not None or any(view.camera_height is not None for view in views):
+        return True
+    depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
+    if any(np.isfinite(depth).any() for depth in depths):
         return True
     return len(views) > 1 and views[0].cam_from_rig is not None
 
 
-def _scales(prior: ShapePrior, views: Sequence[View]) -> ScalePriors:
-    """Free the size where the views tell it."""
-    if not is_metric(views):
-        return prior.scales
-    if prior.scales.free.sum() == 2 and not prior.scales.precision.any():
-        return ScalePriors(np.ones(3), np.zeros((3, 3)))
-    mean = np.ones((3, 3)) / 3
-    common = mean / (3 * _COMMON_SCALE_SIGMA**2)
-    tied = (np.eye(3) - mean) / _SAME_SCALE_SIGMA**2
-    if prior.scales.free.any():
-        tied = (np.eye(3) - mean) * prior.scales.precision.max()
-    return ScalePriors(np.ones(3), common + tied)
+def _check_view(prior: ShapePrior, view: View, number: int) -> None:
+    has_samples = view.depth is not None and view.mask is not None
+    told = (view.mask, view.up, view.camera_height)
+    if not len(view.keypoint_ids) and all(each is None for each in told) and not has_samples:
+        fix = "give keypoints, a mask or a direction, or leave the view away"
+        raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
+    for name in ("up", "camera_height"):
+        if getattr(view, name) is not None and prior.up is None:
+            fix = f"learn it with an up axis, or leave `{name}` away"
+            raise InputError("the model has no up axis", where=f"views[{number}].{name}", fix=fix)
 
 
-def _sightings(prior: ShapePrior, views: Sequence[View], loss: int, loss_scale: float) -> Sightings:
+def _sightings(
+    names: Sequence[list[int]], views: Sequence[View], loss: int, loss_scale: float
+) -> Sightings:
     points, images, rays, whitenings, depths = [], [], [], [], []
-    for number, view in enumerate(views):
+    for number, (rows, view) in enumerate(zip(names, views, strict=True)):
         pixels = cast(FloatArray, view.points_2d)
-        rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
         points.append(np.array(rows, dtype=np.int64))
         images.append(np.full(len(rows), number))
         seen = rays_of(np.require(pixels, requirements="W"), view.camera)
@@ -103,7 +114,7 @@ def _sightings(prior: ShapePrior, views: Sequence[View], loss: int, loss_scale: 
 def _depths(view: View, count: int) -> FloatArray:
     """Depths (n, 2) and their inverse standard deviations, 0 where unknown."""
     found = np.zeros((count, 2))
-    if view.depth is not None:
+    if view.depth is not None and view.depth_image is None:
         depth = cast(FloatArray, view.depth)
         known = np.isfinite(depth)
         relative = np.broadcast_to(np.asarray(view.depth_sigma, dtype=np.float64), (count,))
@@ -129,15 +140,61 @@ def _rig(views: Sequence[View]) -> Rig:
 
 def _directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
     numbers = [number for number, view in enumerate(views) if view.up is not None]
-    if numbers and prior.up is None:
-        fix = "learn it with an up axis, or leave `up` away"
-        raise InputError("the model has no up axis", where=f"views[{numbers[0]}].up", fix=fix)
     model = np.tile(np.zeros(3) if prior.up is None else prior.up, (len(numbers), 1))
     camera = [cast(FloatArray, views[number].up) for number in numbers]
-    weight = [1.0 / np.radians(views[number].up_sigma_deg) for number in numbers]
+    whitening = [_whitening_of_up(views[number]) for number in numbers]
     return Directions(
         model,
         np.array(camera).reshape(-1, 3),
         np.array(numbers, dtype=np.int64),
-        np.array(weight, dtype=np.float64),
+        np.array(whitening).reshape(-1, 3, 3),
+    )
+
+
+def _whitening_of_up(view: View) -> FloatArray:
+    """Whitening (3, 3) of the difference of directions [1/rad]; along them as weak as across."""
+    sigma = np.asarray(view.up_sigma_deg, dtype=np.float64)
+    if not sigma.ndim:
+        return np.asarray(np.eye(3) / np.radians(sigma))
+    up = cast(FloatArray, view.up)
+    across = np.eye(3) - np.outer(up, up)
+    covariance = across @ np.radians(np.radians(sigma)) @ across
+    largest = np.linalg.eigvalsh(covariance)[-1]
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance + largest * np.outer(up, up))).T)
+
+
+def _lengths(prior: ShapePrior, size: Size | None) -> Lengths:
+    if size is None:
+        return Lengths(np.empty((0, 2), dtype=np.int64), _NONE, np.empty(0), np.empty(0))
+    shape = prior.components[0]
+    axes = np.flatnonzero(np.isfinite(size.lengths))
+    count = len(shape.mean)
+    values, sigmas = size.lengths[axes], size.deviations[axes]
+    for axis in axes:
+        if not prior.lengths[axis] > 0:
+            name = ("width", "height", "length")[axis]
+            what = f"the model has no extent along its {'xyz'[axis]}"
+            raise InputError(what, where=f"size.{name}", fix="leave it away")
+    own = (shape.spread[-2:] ** 2).sum()  # of the two corners, which move by themselves
+    return Lengths(
+        np.tile([count - 2, count - 1], (len(axes), 1)).astype(np.int64),
+        axes.astype(np.int64),
+        values,
+        1.0 / np.sqrt(sigmas**2 + own),
+    )
+
+
+def _heights(prior: ShapePrior, views: Sequence[View]) -> Heights:
+    numbers = [number for number, view in enumerate(views) if view.camera_height is not None]
+    shape, count = prior.components[0], len(prior.components[0].mean)
+    up = np.zeros(3) if prior.up is None else prior.up
+    lowest = count - 2 if up.sum() > 0 else count - 1  # the box's corner in its lowest face
+    values = np.array([views[number].camera_height for number in numbers], dtype=np.float64)
+    relative = np.array([views[number].camera_height_sigma for number in numbers])
+    return Heights(
+        np.full(len(numbers), lowest, dtype=np.int64),
+        np.array(numbers, dtype=np.int64),
+        np.tile(up, (len(numbers), 1)),
+        values,
+        1.0 / np.hypot(values * relative, shape.spread[lowest]),
     )

@@ -12,8 +12,11 @@ from cadalign.fitting.fit import fit
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.result import AlignAlternative, AlignResult
+from cadalign.fitting.joint.summary import EvidenceSummary
 from cadalign.fitting.joint.view import View
+from cadalign.fitting.noise import pixel_information
 from cadalign.fitting.options import RansacOptions
+from cadalign.fitting.result import FitResult
 from cadalign.fitting.uncertainty import unknown_axes
 from cadalign.geometry.alignment import Alignment
 
@@ -23,7 +26,8 @@ def is_plain(model: object, views: Sequence[View]) -> bool:
     if not isinstance(model, Model) or model.shape_sigma is not None or len(views) != 1:
         return False
     view = views[0]
-    return view.depth is None and view.up is None and view.cam_from_rig is None
+    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
+    return all(each is None for each in others)
 
 
 def align_plain(
@@ -73,7 +77,23 @@ def align_plain(
         ),
         warnings=found.warnings,
         stats=found.stats,
+        evidence=(_summary(found, view),),
     )
+
+
+def _summary(found: FitResult, view: View) -> EvidenceSummary:
+    """Agreement of the keypoints that the estimate rests on."""
+    residuals = found.residuals[found.inliers]
+    count = len(residuals)
+    sigma = found.sigma if view.sigma is None else view.sigma
+    squares = (residuals * residuals).sum()
+    if isinstance(sigma, int | float):
+        whitened = squares / sigma**2
+    else:
+        information = pixel_information(sigma, len(found.residuals))[found.inliers]
+        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
+    in_sigmas = float(np.sqrt(whitened / (2 * count)))
+    return EvidenceSummary("keypoints", 0, count, in_sigmas, float(np.sqrt(squares / count)), "px")
 
 
 def _points_covariances(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.fitting.contours.residuals import MaskResiduals
+from cadalign.fitting.joint.contributions import Basis, contributions_of
 from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
 from cadalign.fitting.result import FitStats
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
@@ -91,6 +94,14 @@ class AlignResult:
     warnings : tuple of str
         What the evidence leaves undetermined, and what contradicts the rest.
     stats : FitStats
+    evidence : tuple of EvidenceSummary
+        Agreement of every piece of evidence with the estimate.
+    mask_residuals : tuple of MaskResiduals or None
+        Agreement of the contour of every view's mask with the estimate; empty without masks.
+    rig_from_model : Alignment, optional
+        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
+    basis : Basis, optional
+        What `contributions` is computed from.
     """
 
     alignment: Alignment
@@ -109,6 +120,10 @@ class AlignResult:
     alternatives: tuple[AlignAlternative, ...]
     warnings: tuple[str, ...]
     stats: FitStats
+    evidence: tuple[EvidenceSummary, ...] = ()
+    mask_residuals: tuple[MaskResiduals | None, ...] = ()
+    rig_from_model: Alignment | None = None
+    basis: Basis | None = field(default=None, repr=False)
 
     @property
     def rms(self) -> float:
@@ -174,6 +189,36 @@ class AlignResult:
         if not isinstance(self.model, ShapeModel):
             raise InputError("only a learned shape has training models", where="model")
         return self.model.nearest(self.points_3d)
+
+    def contributions(self) -> tuple[Contribution, ...]:
+        """Standard deviations without each piece of evidence; compare them with ``std``.
+
+        They are linearised at the estimate, infinite for what nothing else determines. Without the
+        known motion of its camera, a view has a pose of its own. Empty for the keypoints of one
+        view of an exact model, which nothing can be left out of.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file, which does not hold the evidence.
+
+        Examples
+        --------
+        >>> from cadalign import Camera, Size, View, align
+        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+        >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], [1.2, 1.1, 0.9])
+        >>> view = View(camera, camera.project(truth.apply(corners)))
+        >>> result = align(Model(points_3d=corners), view, size=Size(width=1.2))
+        >>> [(each.name, round(each.without.scale[0], 3)) for each in result.contributions()]
+        [('views[0].points_2d', 0.01), ('size', inf)]
+        """
+        if self.basis is None:
+            if self.model is not None:
+                return ()
+            what = "the result holds no evidence: it was read from a file"
+            raise InputError(what, where="contributions", fix="align again")
+        return contributions_of(self.basis)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the result as plain lists and numbers, for JSON; its model is not part of it."""

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.fitting.joint.starts import ViewRays, in_rig, rays_in, starts_of
+from cadalign.fitting.joint.starts import Start, in_rig, starts_of
 from cadalign.solvers.constants import CAUCHY, LINEAR, UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
 from cadalign.solvers.joint.search import Minima, search_joint
+from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
 
 _SAMPLE = 4
@@ -33,7 +34,7 @@ class Consensus(NamedTuple):
 
 
 def find_consensus(
-    evidence: Evidence, threshold: FloatArray, seed: int
+    evidence: Evidence, threshold: FloatArray, seed: int, init: Start | None = None
 ) -> tuple[list[Consensus], int, int]:
     """Estimates that most keypoints support, the best first, with the effort they took.
 
@@ -48,9 +49,11 @@ def find_consensus(
         Largest whitened residual of an inlier.
     seed : int
         Seed of the samples.
+    init : Start, optional
+        One more start.
     """
     robust = with_loss(evidence, CAUCHY)
-    poses, log_scales = starts_of(robust)
+    poses, log_scales = starts_of(robust, init)
     if evidence.rig.pose.max() == 0:
         samples = np.array(
             [

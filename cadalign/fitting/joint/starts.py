@@ -2,44 +2,53 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.joint.evidence import Evidence, Shape
-from cadalign.solvers.optimal import optimal_batch
+from cadalign.fitting.joint.half_turns import half_turned
+from cadalign.fitting.joint.metric_starts import metric_starts
+from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 
-_MOST_PER_VIEW = 8
 _MOST = 24
-_LEAST_POINTS = 3
-_UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
-_LEAST_DEPTH = 1e-9
-_FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
-def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray, FloatArray]:
     """Poses (S, P, 12) and log scales (S, 3); none where every view has too few keypoints.
 
     Where every view has a pose of its own, the likeliest ones are taken together, and then one of
     them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
-    the size of its image, widens the keypoints' own.
+    the size of its image, widens the keypoints' own. A start that is given comes first, poses half
+    a turn away come last.
     """
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(poses)]
     for view in range(len(rig.pose)):
-        found = _of_view(evidence, view)
         camera = rig.cam_from_rig[view]
-        moved = [(in_rig(pose, camera), scales) for pose, scales in found]
+        found, logs = view_starts(evidence, view)
+        turned = half_turned(evidence, view, list(found))
+        moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
+        moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
+    is_metric = bool(evidence.scales.free.all())
+    if init is not None:
+        per_pose[0].insert(0, (init.pose, init.log_scales))
+    elif is_metric and poses == 1:
+        rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
+        placed = metric_starts(evidence, rotations)
+        if len(placed[0]):
+            return placed
     if not all(per_pose):
         return np.empty((0, poses, 12)), np.empty((0, 3))
+    if is_metric and init is None and (np.bincount(rig.pose) > 1).any():
+        return _with_rig(evidence, per_pose)
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
-        for rank in range(1, _MOST_PER_VIEW)
+        for rank in range(1, max(len(found) for found in per_pose))
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
@@ -47,114 +56,98 @@ def starts_of(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
     chosen = [[per_pose[p][k] for p, k in enumerate(ranks)] for ranks in combinations]
     stacked = np.array([[pose for pose, _ in each] for each in chosen]).reshape(-1, poses, 12)
     scales = np.array([each[0][1] for each in chosen]).reshape(-1, 3)
+    if is_metric and init is None:
+        return _sized(evidence, stacked, scales)
     return stacked, scales
 
 
-class ViewRays(NamedTuple):
-    """Keypoints of one view: points (n, 3) of the mean, rays (n, 2), and whitening (n, 3)."""
+class Start(NamedTuple):
+    """A pose (12,) of the rig, and log scales (3,)."""
 
-    points: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
-    rows: IntArray
+    pose: FloatArray
+    log_scales: FloatArray
 
 
-def rays_in(evidence: Evidence, view: int) -> ViewRays:
-    """One view's keypoints, the shape's uncertainty in their whitening."""
-    sightings = evidence.sightings
-    rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
-    names = sightings.point[rows]
-    points = np.ascontiguousarray(evidence.shape.mean[names])
-    rays = np.ascontiguousarray(sightings.rays[rows])
-    if not len(rows):
-        return ViewRays(points, rays, np.empty((0, 3)), rows)
-    return ViewRays(points, rays, _widened(evidence, points, rays, rows, names), rows)
+def _with_rig(
+    evidence: Evidence, per_pose: list[list[tuple[FloatArray, FloatArray]]]
+) -> tuple[FloatArray, FloatArray]:
+    """Starts whose scales are those of the rig with the most views; the other poses follow."""
+    main = int(np.argmax(np.bincount(evidence.rig.pose)))
+    rotations = np.array([pose[:9] for pose, _ in per_pose[main]]).reshape(-1, 3, 3)
+    placed, log_scales = metric_starts(_of_pose(evidence, main), rotations)
+    starts = []
+    for k, (own, logs) in enumerate(zip(placed[:, 0], log_scales, strict=True)):
+        for rank in range(MOST_PER_VIEW if k == 0 else 1):
+            start = []
+            for p, found in enumerate(per_pose):
+                pose, scales = found[min(rank, len(found) - 1)]
+                centre = _centre(evidence.rig.cam_from_rig[evidence.rig.pose == p][0])
+                enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
+                start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
+            starts.append((np.array(start), logs))
+    kept = starts[:_MOST]
+    poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
+    return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
 
 
-def _of_view(evidence: Evidence, view: int) -> list[tuple[FloatArray, FloatArray]]:
-    """Camera poses (12,) and log scales (3,) from one view's keypoints, the likeliest first."""
-    given = rays_in(evidence, view)
-    if len(given.rows) < _LEAST_POINTS:
-        return []
-    sightings, scales = evidence.sightings, evidence.scales
-    order = _axis_order(scales.free)
-    free = np.ones(UNKNOWNS)
-    free[6:] = scales.free[order[1:]]
-    found, costs, _, _, info = optimal_batch(
-        np.ascontiguousarray(given.points[:, order]),
-        given.rays,
-        given.whitening,
-        np.array([0, len(given.rows)]),
-        int(sightings.loss[given.rows[0]]),
-        np.array([float(sightings.loss_scale[given.rows[0]])]),
-        np.array([float(scales.precision[order[1], order[1]])]),
-        free,
-        _LEAST_POINTS,
-    )
-    count = min(int(info[0, 0]), _MOST_PER_VIEW)
-    kept = [k for k in range(count) if costs[0, k] < costs[0, 0] + _UNLIKELY]
-    place = np.argsort(order)
-    columns = np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])
-    starts = [(found[0, k, columns[:12]], np.log(found[0, k, columns[12:]])) for k in kept]
-    if scales.free.any():
-        return starts
-    turns = _half_turns(evidence.shape, given.points, sightings.point[given.rows])
-    return starts + [(_after(pose, turn), logs) for turn in turns for pose, logs in starts]
+def _centre(camera: FloatArray) -> FloatArray:
+    """A camera's place (3,) in the rig's frame."""
+    return np.asarray(-camera[:9].reshape(3, 3).T @ camera[9:])
 
 
-def _half_turns(shape: Shape, points: FloatArray, names: IntArray) -> list[FloatArray]:
-    """Motions (12,) of the model by half a turn that leave it a likely shape.
-
-    The mean does not show such an ambiguity: a blade whose width varies more than it measures looks
-    much the same from behind, with its edge and its back exchanged.
-    """
-    centre = points.mean(axis=0)
-    offsets = points - centre
-    modes = shape.modes[:, names].reshape(len(shape.modes), -1)
-    own = np.repeat(shape.spread[names] ** 2, 3) + (_FLATNESS**2 * (offsets**2).sum(axis=1).max())
-    largest = float((modes**2).sum(axis=1).max(initial=0.0) + own.max())
-    found = []
-    for axis in np.linalg.svd(offsets, full_matrices=False)[2]:
-        turn = 2 * np.outer(axis, axis) - np.eye(3)
-        moved = (offsets @ turn - offsets).ravel()
-        if moved @ moved > _UNLIKELY * largest:  # a bound that spares the next line
-            continue
-        if moved @ np.linalg.solve(modes.T @ modes + np.diag(own), moved) < _UNLIKELY:
-            found.append(np.concatenate([turn.ravel(), centre - turn @ centre]))
-    return found
+def _of_pose(evidence: Evidence, pose: int) -> Evidence:
+    """The evidence of the views that share a pose."""
+    chosen = evidence.rig.pose == pose
+    columns: dict[str, Any] = {
+        name: type(rows)(*(column[chosen[rows.image]] for column in rows))
+        for name, rows in (
+            ("sightings", evidence.sightings),
+            ("directions", evidence.directions),
+            ("heights", evidence.heights),
+            ("planes", evidence.planes),
+        )
+    }
+    return evidence._replace(**columns)
 
 
-def _after(pose: FloatArray, motion: FloatArray) -> FloatArray:
-    """The pose (12,) of a model that was moved first."""
-    rotation = pose[:9].reshape(3, 3)
-    turned = rotation @ motion[:9].reshape(3, 3)
-    return np.concatenate([turned.ravel(), rotation @ motion[9:] + pose[9:]])
+def _sized(
+    evidence: Evidence, poses: FloatArray, log_scales: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Starts enlarged about each view's camera such that depths, lengths and heights agree."""
+    poses, log_scales = poses.copy(), log_scales.copy()
+    for pose, logs in zip(poses, log_scales, strict=True):
+        factor = _size_factor(evidence, pose, np.exp(logs))
+        if np.isfinite(factor) and factor > 0:
+            pose[:, 9:] *= factor
+            logs += np.log(factor)
+    return poses, log_scales
 
 
-def _axis_order(free: FloatArray) -> IntArray:
-    """The model's axes in the solvers' order: one whose scale is known first, no reflection."""
-    first = int(np.argmin(free))
-    return np.array([first, (first + 1) % 3, (first + 2) % 3])
+def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
+    """Median of measured over predicted lengths, where every view has a pose of its own."""
+    sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
+    lengths, heights = evidence.lengths, evidence.heights
 
+    def seen(point: IntArray, image: IntArray) -> FloatArray:
+        turns = poses[evidence.rig.pose[image]]
+        turned = np.einsum("nij,nj->ni", turns[:, :9].reshape(-1, 3, 3), mean[point] * scale)
+        return np.asarray(turned + turns[:, 9:])
 
-def _widened(
-    evidence: Evidence, points: FloatArray, rays: FloatArray, rows: IntArray, names: IntArray
-) -> FloatArray:
-    """Whitening (n, 3) of the rays with the shape's own variance in it."""
-    shape, whitening = evidence.shape, evidence.sightings.whitening[rows]
-    variance = (shape.modes[:, names] ** 2).sum(axis=(0, 2)) / 3 + shape.spread[names] ** 2
-    extent = points.std(axis=0)
-    seen = rays.std(axis=0)
-    depth = np.sqrt((extent**2).sum() * 2 / 3 / max((seen**2).sum(), 1e-30))
-    of_rays = variance / max(depth, _LEAST_DEPTH) ** 2
-    if not of_rays.any():
-        return np.ascontiguousarray(whitening)
-    # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-    widened = (
-        whitening
-        / np.sqrt(1 + of_rays * (whitening[:, 0] ** 2 + whitening[:, 2] ** 2) / 2)[:, None]
-    )
-    return np.ascontiguousarray(widened)
+    has_depth = sightings.depths[:, 1] > 0
+    depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
+    distances = (seen(planes.point, planes.image) * planes.normal).sum(axis=1)
+    box = mean[lengths.points[:, 1]] - mean[lengths.points[:, 0]]
+    extents = (box * scale)[np.arange(len(box)), lengths.axis]
+    turns = poses[evidence.rig.pose[heights.image]][:, :9].reshape(-1, 3, 3)
+    ups = np.einsum("nij,nj->ni", turns, heights.direction)
+    below = -(seen(heights.point, heights.image) * ups).sum(axis=1)
+    ratios = [
+        sightings.depths[has_depth, 0] / depths,
+        planes.offset / distances,
+        lengths.value / extents,
+        heights.value / below,
+    ]
+    return float(np.median(np.concatenate(ratios)))
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

@@ -7,15 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.fitting.joint.contradictions import contradictions, count_equations
+from cadalign.fitting.joint.robust import state_of
+from cadalign.fitting.joint.starts import starts_of
 from cadalign.fitting.uncertainty import WEAK_DISTANCE, WEAK_ROTATION_DEG, WEAK_SCALE
 from cadalign.geometry.alignment import Alignment
-from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.search import search_joint
 
 _LEAST_PROBABILITY = 0.005  # of residuals as large as these by chance
 
 
 def warnings_of(
     evidence: Evidence,
+    state: State,
     cost: float,
     poses: Sequence[Alignment],
     covariance: FloatArray,
@@ -36,10 +41,24 @@ def warnings_of(
     spread = float(np.linalg.norm(deviations[3:6]))
     if spread > WEAK_DISTANCE * distance > 0:
         warnings.append(f"the distance is known only to +-{100 * spread / distance:.0f} %")
-    misfit = _misfit(evidence, cost)
+    contradicting = contradictions(evidence, state, cost, _searched)
+    warnings.extend(contradicting)
+    misfit = None if contradicting else _misfit(evidence, cost)
     if misfit is not None:
         warnings.append(misfit)
     return tuple(warnings)
+
+
+def _searched(evidence: Evidence) -> tuple[State, float] | None:
+    """The best estimate of the evidence, and its cost."""
+    poses, log_scales = starts_of(evidence)
+    if not len(poses):
+        return None
+    minima, count, _ = search_joint(evidence, poses, log_scales)
+    if not count:
+        return None
+    best = int(np.argmin(minima.costs[:count]))
+    return state_of(minima, best), float(minima.costs[best])
 
 
 def _misfit(evidence: Evidence, cost: float) -> str | None:
@@ -50,12 +69,9 @@ def _misfit(evidence: Evidence, cost: float) -> str | None:
     """
     from scipy.special import chdtrc  # takes longer to import than all that is compiled
 
-    sightings = evidence.sightings
-    equations = 2 * len(sightings.point) + int((sightings.depths[:, 1] > 0).sum())
-    equations += 2 * len(evidence.directions.weight) + len(evidence.lengths.weight)
-    free = int(evidence.scales.free.sum()) - int(np.linalg.matrix_rank(evidence.scales.precision))
-    redundancy = equations - 6 * int(evidence.rig.pose.max() + 1) - max(free, 0)
-    if redundancy <= 0 or sightings.loss.any():
+    redundancy = count_equations(evidence) - len(evidence.shape.modes)
+    redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
+    if redundancy <= 0 or evidence.sightings.loss.any():
         return None
     if chdtrc(redundancy, cost) >= _LEAST_PROBABILITY:
         return None

@@ -54,12 +54,15 @@ class Rig(NamedTuple):
 
 
 class Directions(NamedTuple):
-    """Directions ``model`` (D, 3) seen as ``camera`` (D, 3) in a view, ``weight`` [1/rad]."""
+    """Directions ``model`` (D, 3) seen as ``camera`` (D, 3) in a view.
+
+    ``whitening`` (D, 3, 3) [1/rad] gives the difference of the unit vectors unit covariance.
+    """
 
     model: FloatArray
     camera: FloatArray
     image: IntArray
-    weight: FloatArray
+    whitening: FloatArray
 
 
 class Lengths(NamedTuple):
@@ -69,6 +72,36 @@ class Lengths(NamedTuple):
     axis: IntArray
     value: FloatArray
     weight: FloatArray
+
+
+class Heights(NamedTuple):
+    """Heights ``value`` (H,) of the cameras ``image`` (H,) above planes through ``point`` (H,).
+
+    The planes lie across ``direction`` (H, 3) of the model; ``weight`` (H,) is the inverse
+    deviation.
+    """
+
+    point: IntArray
+    image: IntArray
+    direction: FloatArray
+    value: FloatArray
+    weight: FloatArray
+
+
+class Planes(NamedTuple):
+    """Planes ``normal . X = offset`` (N, 3), (N,) in a camera that points lie in.
+
+    ``point``, ``image``, ``loss`` and ``loss_scale`` are as in `Sightings`; ``weight`` (N,) is the
+    inverse deviation of ``normal . X``.
+    """
+
+    point: IntArray
+    image: IntArray
+    normal: FloatArray
+    offset: FloatArray
+    weight: FloatArray
+    loss: IntArray
+    loss_scale: FloatArray
 
 
 class ScalePriors(NamedTuple):
@@ -86,6 +119,8 @@ class Evidence(NamedTuple):
     rig: Rig
     directions: Directions
     lengths: Lengths
+    heights: Heights
+    planes: Planes
     scales: ScalePriors
 
 

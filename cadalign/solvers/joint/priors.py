@@ -38,11 +38,11 @@ def add_directions(
 ) -> float:
     """Add directions known in a camera, such as gravity; returns their cost.
 
-    The residual is the difference of two unit vectors: its length is 2 sin(angle / 2).
+    The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
     """
     directions, rig = evidence.directions, evidence.rig
     cost = 0.0
-    row = np.empty(3)
+    row, seen, by_rig = np.empty(3), np.empty(3), np.empty(3)
     for d in range(directions.image.shape[0]):
         v = directions.image[d]
         p, camera, pose = rig.pose[v], rig.cam_from_rig[v], state.poses[rig.pose[v]]
@@ -51,15 +51,22 @@ def add_directions(
             for a in range(3):
                 rotated[r] += pose[3 * r + a] * directions.model[d, a]
         for c in range(3):
-            value = -directions.camera[d, c]
+            seen[c] = -directions.camera[d, c]
             for r in range(3):
-                value += camera[3 * c + r] * rotated[r]
-            value *= directions.weight[d]
+                seen[c] += camera[3 * c + r] * rotated[r]
+        for w in range(3):
+            whitening = directions.whitening[d, w]
+            value = whitening[0] * seen[0] + whitening[1] * seen[1] + whitening[2] * seen[2]
             cost += value * value
-            jx, jy, jz = camera[3 * c], camera[3 * c + 1], camera[3 * c + 2]
-            row[0] = directions.weight[d] * (rotated[1] * jz - rotated[2] * jy)
-            row[1] = directions.weight[d] * (rotated[2] * jx - rotated[0] * jz)
-            row[2] = directions.weight[d] * (rotated[0] * jy - rotated[1] * jx)
+            for r in range(3):
+                by_rig[r] = (
+                    whitening[0] * camera[r]
+                    + whitening[1] * camera[3 + r]
+                    + whitening[2] * camera[6 + r]
+                )
+            row[0] = rotated[1] * by_rig[2] - rotated[2] * by_rig[1]
+            row[1] = rotated[2] * by_rig[0] - rotated[0] * by_rig[2]
+            row[2] = rotated[0] * by_rig[1] - rotated[1] * by_rig[0]
             for k in range(3):
                 gradient[6 * p + k] += row[k] * value
                 for m in range(k, 3):

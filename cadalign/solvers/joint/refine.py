@@ -7,8 +7,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
+from cadalign.solvers.joint.factor import factorize, solve_factor
 from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
-from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.unknowns import orthonormalize
 
 _FIRST_DAMPING = 1e-4
@@ -45,8 +45,8 @@ def refine_joint(evidence: Evidence, max_iterations: int, state: State) -> tuple
             factor[k, k] += damping * system.hessian[k, k] + least
         accepted = False
         expected = 0.0
-        if cholesky(factor, unknowns, 0.0):
-            solve_cholesky(factor, unknowns, step)
+        if factorize(factor):
+            solve_factor(factor, step)
             for k in range(unknowns):
                 expected -= system.gradient[k] * step[k]
             move_state(evidence, state, system, step, trial)

@@ -108,9 +108,10 @@ def write_rows(evidence: Evidence, state: State, rows: FloatArray, unknowns: int
                 rows[unknowns + 1 + a, column] = by_model[a]
                 by_model[a] *= scale[a]
             for k in range(modes):
-                mode = shape.modes[k, i]
                 rows[first_scale + 3 + k, column] = (
-                    by_model[0] * mode[0] + by_model[1] * mode[1] + by_model[2] * mode[2]
+                    by_model[0] * shape.modes[k, i, 0]
+                    + by_model[1] * shape.modes[k, i, 1]
+                    + by_model[2] * shape.modes[k, i, 2]
                 )
             rows[unknowns, column] = residual[q]
             column += 1

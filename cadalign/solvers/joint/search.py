@@ -9,9 +9,10 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.factor import factorize
+from cadalign.solvers.joint.reduction import reduce_modes
 from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
-from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
@@ -43,12 +44,29 @@ def search_joint(
 
     Returns the minima, their number, and the number of iterations.
     """
+    reduced, basis = reduce_modes(evidence)
+    minima, found, iterations = _search(reduced, poses, log_scales)
+    whole = Minima(
+        minima.poses,
+        minima.log_scales,
+        minima.coefficients @ basis.T,
+        minima.displacements,
+        minima.costs,
+        minima.scores,
+    )
+    return whole, found, iterations
+
+
+@kernel
+def _search(
+    evidence: Evidence, poses: FloatArray, log_scales: FloatArray
+) -> tuple[Minima, int, int]:
     starts, points = poses.shape[0], evidence.shape.mean.shape[0]
     modes = evidence.shape.modes.shape[0]
     minima = Minima(
         np.empty((starts, poses.shape[1], 12)),
         np.empty((starts, 3)),
-        np.empty((starts, modes)),
+        np.zeros((starts, modes)),
         np.empty((starts, points, 3)),
         np.full(starts, np.inf),
         np.full(starts, np.inf),
@@ -56,10 +74,10 @@ def search_joint(
     found = 0
     iterations = 0
     system = empty_system(evidence)
-    probed = np.full(starts, np.inf)
+    probed, converged = np.full(starts, np.inf), np.zeros(starts, dtype=np.bool_)
     states = [_start(poses[s], log_scales[s], modes, points) for s in range(starts)]
     for s in range(starts):
-        probed[s], used, _ = refine_joint(evidence, _PROBE_ITERATIONS, states[s])
+        probed[s], used, converged[s] = refine_joint(evidence, _PROBE_ITERATIONS, states[s])
         iterations += used
     best = np.inf
     for s in np.argsort(probed):
@@ -68,8 +86,10 @@ def search_joint(
         state = states[s]
         if _find(state, minima, found) >= 0:
             continue
-        cost, used, _ = refine_joint(evidence, _MAX_ITERATIONS, state)
-        iterations += used
+        cost = probed[s]
+        if not converged[s]:
+            cost, used, _ = refine_joint(evidence, _MAX_ITERATIONS, state)
+            iterations += used
         if not cost < np.inf or _find(state, minima, found) >= 0:
             continue
         best = min(best, cost)
@@ -122,104 +142,11 @@ def _insert(state: State, cost: float, score: float, minima: Minima, found: int)
 def score_of(evidence: Evidence, state: State, system: System) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     cost = evaluate_joint(evidence, state, system)
-    unknowns = system.gradient.shape[0]
     factor = system.hessian.copy()
-    if not cost < np.inf or not cholesky(factor, unknowns, 0.0):
+    if not cost < np.inf or not factorize(factor):
         return np.inf
     score = cost
-    for k in range(unknowns):
+    for k in range(factor.shape[0]):
         score += 2.0 * np.log(factor[k, k])
     score += system.log_determinant[0]
     return float(score)
-
-
-class JointCovariance(NamedTuple):
-    """Covariances: of the ``unknowns`` (U, U), and of every point in two frames.
-
-    ``points`` (m, 3, 3) in the model's frame are those of the shape, scales and displacements
-    included; ``seen`` (m, 3, 3) in the first view's camera include the pose.
-    """
-
-    unknowns: FloatArray
-    points: FloatArray
-    seen: FloatArray
-
-
-@kernel
-def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
-    """The inverse information at a state; zero for log scales that are held."""
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    unknowns = system.gradient.shape[0]
-    factor = system.hessian.copy()
-    covariance = np.zeros((unknowns, unknowns))
-    points = evidence.shape.mean.shape[0]
-    of_points = np.zeros((points, 3, 3))
-    of_seen = np.zeros((points, 3, 3))
-    modes = evidence.shape.modes.shape[0]
-    first = unknowns - modes - 3
-    if not cholesky(factor, unknowns, 0.0):
-        covariance[:] = np.inf
-        of_points[:] = np.inf
-        of_seen[:] = np.inf
-        return JointCovariance(covariance, of_points, of_seen)
-    column = np.empty(unknowns)
-    for k in range(unknowns):
-        if first <= k < first + 3 and evidence.scales.free[k - first] == 0.0:
-            continue
-        column[:] = 0.0
-        column[k] = 1.0
-        solve_cholesky(factor, unknowns, column)
-        covariance[:, k] = column
-    scale = np.exp(state.log_scales)
-    turn, pose = _first_camera(evidence, state)
-    starts = np.zeros(points, dtype=np.int64)
-    ends = np.zeros(points, dtype=np.int64)
-    for n in range(evidence.sightings.point.shape[0]):
-        i = evidence.sightings.point[n]
-        if ends[i] == 0:
-            starts[i] = system.first[n]
-        ends[i] = system.first[n + 1]
-    for i in range(points):
-        rows = np.zeros((3, unknowns))
-        own = np.zeros((3, 3))
-        point = np.empty(3)
-        for a in range(3):
-            value = evidence.shape.mean[i, a]
-            for k in range(modes):
-                value += state.coefficients[k] * evidence.shape.modes[k, i, a]
-                rows[a, first + 3 + k] = scale[a] * evidence.shape.modes[k, i, a]
-            rows[a, first + a] = scale[a] * value
-            point[a] = scale[a] * value + state.displacements[i, a]
-        square = evidence.shape.spread[i] ** 2
-        for a in range(3):
-            own[a, a] = square
-        for c in range(starts[i], ends[i]):
-            by_own = system.rows[unknowns + 1 :, c]
-            by_others = system.rows[:unknowns, c]
-            for a in range(3):
-                for b in range(3):
-                    own[a, b] -= square * square * by_own[a] * by_own[b]
-                for k in range(unknowns):
-                    rows[a, k] -= square * by_own[a] * by_others[k]
-        of_points[i] = rows @ covariance @ rows.T + own
-        # With the pose: exp(rotation vector) turned + translation, in the rig's frame.
-        turned = turn[0] @ point
-        rows = turn[1] @ rows
-        x, y, z = turned
-        across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-        rows[:, pose : pose + 3] += turn[2] @ across
-        rows[:, pose + 3 : pose + 6] += turn[2]
-        of_seen[i] = rows @ covariance @ rows.T + turn[1] @ own @ turn[1].T
-    return JointCovariance(covariance, of_points, of_seen)
-
-
-@kernel
-def _first_camera(evidence: Evidence, state: State) -> tuple[FloatArray, int]:
-    """Rotations (3, 3, 3) rig from model, camera from model, camera from rig; the pose's column."""
-    number = evidence.rig.pose[0]
-    turns = np.empty((3, 3, 3))
-    turns[0] = state.poses[number, :9].copy().reshape((3, 3))
-    turns[2] = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
-    turns[1] = turns[2] @ turns[0]
-    return turns, 6 * number

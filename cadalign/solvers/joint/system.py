@@ -15,6 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.joint.evidence import Evidence, State, count_unknowns
+from cadalign.solvers.joint.planes import add_heights, add_planes
 from cadalign.solvers.joint.priors import add_directions, add_lengths, add_priors
 from cadalign.solvers.joint.rows import count_equations, write_rows
 from cadalign.solvers.linalg import cholesky
@@ -66,6 +67,8 @@ def evaluate_joint(evidence: Evidence, state: State, system: System) -> float:
     cost += add_priors(evidence, state, system.hessian, system.gradient)
     cost += add_directions(evidence, state, system.hessian, system.gradient)
     cost += add_lengths(evidence, state, system.hessian, system.gradient)
+    cost += add_heights(evidence, state, system.hessian, system.gradient)
+    cost += add_planes(evidence, state, system.hessian, system.gradient)
     for k in range(unknowns):
         for m in range(k):
             system.hessian[k, m] = system.hessian[m, k]

@@ -64,6 +64,13 @@ class EmbreeEngine:
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
 
+def face_normals(triangles: FloatArray) -> FloatArray:
+    """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for one without area."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.where(length > 0, length, 1.0))
+
+
 class RayCaster:
     """A bounding volume hierarchy over a mesh, then only read; safe in several threads."""
 
@@ -86,6 +93,14 @@ class RayCaster:
         """
         face = self._first_faces(origin, directions, start)
         return face, self._distances(origin, directions, face)
+
+    def normals(self, face: FaceArray | npt.NDArray[np.int64]) -> FloatArray:
+        """Unit normals (n, 3) of triangles (n,)."""
+        return self._normals[face]
+
+    def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
+        """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
+        return np.asarray(self._first_faces(origin, directions, None) >= 0)
 
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float

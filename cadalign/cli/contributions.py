@@ -1,0 +1,71 @@
+"""What every piece of evidence contributes to an alignment, as text and as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.uncertainty import Uncertainty
+
+_HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
+
+
+def tabulate_contributions(result: AlignResult) -> str:
+    """Table of standard deviations with all evidence and without each piece; empty for one piece.
+
+    Rotation [degrees], position [units of the translation] and lengths along x, y, z [%].
+    """
+    pieces = result.contributions()
+    if len(pieces) < 2:
+        return ""
+    rows = [_HEADS, ("with all evidence", *_cells(result.std))]
+    rows += [(f"without {piece.name}", *_cells(piece.without)) for piece in pieces]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0])]
+            + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        )
+        for row in rows
+    ]
+    return "\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def list_contributions(result: AlignResult) -> dict[str, Any]:
+    """The same for JSON, as ``contributions``; null for what is not determined."""
+    pieces = result.contributions()
+    if len(pieces) < 2:
+        return {}
+    return {
+        "contributions": [
+            {
+                "kind": piece.kind,
+                "view": piece.view,
+                "name": piece.name,
+                "std_without": _finite(asdict(piece.without)),
+            }
+            for piece in pieces
+        ]
+    }
+
+
+def _cells(std: Uncertainty) -> tuple[str, ...]:
+    position = float(np.linalg.norm(std.translation))
+    lengths = [_text(100 * each, " %") for each in std.scale]
+    return _text(std.rotation_deg, " deg"), _text(position, ""), *lengths
+
+
+def _text(value: float, unit: str) -> str:
+    return f"{value:.2g}{unit}" if np.isfinite(value) else "unknown"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return value if np.isfinite(value) else None

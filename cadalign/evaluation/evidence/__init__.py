@@ -1,0 +1,1 @@
+"""The experiment on evidence beyond keypoints."""

@@ -1,0 +1,198 @@
+"""Scan2CAD's alignment accuracy: 20 cm, 20 degrees and 20 % of scale.
+
+Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 2019, section 8, and
+the benchmark's script.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.metrics import scale_error
+from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+
+MAX_TRANSLATION = 0.2
+"""[m]"""
+MAX_ROTATION_DEG = 20.0
+MAX_SCALE = 0.2
+"""Fraction."""
+BENCHMARK_CATEGORIES = frozenset(
+    {"bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trash bin"}
+)
+"""Categories of which the benchmark reports each; all others are pooled."""
+OTHER = "other"
+
+
+@dataclass(frozen=True)
+class Scan2CadErrors:
+    """Errors of one alignment.
+
+    Parameters
+    ----------
+    translation : float
+        Distance of the positions [m].
+    rotation_deg : float
+        Angle to the nearest rotation that looks the same [degrees].
+    scale : float
+        The benchmark's: the mean over the axes of the ratio to the truth, less 1; a fraction.
+        Errors of opposite sign cancel in it.
+    scale_axes : (3,) float
+        Relative error along each axis.
+    """
+
+    translation: float
+    rotation_deg: float
+    scale: float
+    scale_axes: FloatArray
+
+    @property
+    def is_aligned(self) -> bool:
+        """True if no error is over its threshold."""
+        return (
+            self.translation <= MAX_TRANSLATION
+            and self.rotation_deg <= MAX_ROTATION_DEG
+            and self.scale <= MAX_SCALE
+        )
+
+    @property
+    def is_aligned_on_each_axis(self) -> bool:
+        """True if neither is the scale along any axis."""
+        return self.is_aligned and bool((self.scale_axes <= MAX_SCALE).all())
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedModel:
+    """A model placed in a scene, estimated or true.
+
+    Parameters
+    ----------
+    category : str
+    alignment : Alignment
+        In metres.
+    model_id : str, optional
+        The model's id; estimates of a model count as often as the scene has it at most.
+    symmetry : Symmetry
+        Of a true model: motions that take it to itself.
+    center : (3,) float
+        Of a true model: the point of the model whose positions are compared [model units]. The
+        benchmark's script takes minus the centre of the model's box.
+    """
+
+    category: str
+    alignment: Alignment
+    model_id: str | None = None
+    symmetry: Symmetry = field(default_factory=Symmetry.none)
+    center: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class Scan2CadAccuracy:
+    """Share of the true models that an estimate is aligned with.
+
+    Parameters
+    ----------
+    aligned, total : dict
+        Numbers of models by category.
+    """
+
+    aligned: dict[str, int]
+    total: dict[str, int]
+
+    @property
+    def by_category(self) -> dict[str, float]:
+        """The accuracy of each category, a fraction."""
+        return {name: self.aligned[name] / count for name, count in self.total.items()}
+
+    @property
+    def category_average(self) -> float:
+        """The mean over categories; NaN without any model."""
+        shares = list(self.by_category.values())
+        return float(np.mean(shares)) if shares else float("nan")
+
+    @property
+    def instance_average(self) -> float:
+        """The share of all models; NaN without any."""
+        total = sum(self.total.values())
+        return sum(self.aligned.values()) / total if total else float("nan")
+
+
+def scan2cad_errors(*, est: Alignment, gt: PlacedModel) -> Scan2CadErrors:
+    """Errors of an estimate of a true model.
+
+    Rotations about an axis of symmetry are compared exactly; the benchmark's script takes steps of
+    10 degrees there, so that its errors are larger by up to 5 degrees.
+
+    Examples
+    --------
+    >>> truth = PlacedModel("chair", Alignment(np.eye(3), [0, 0, 2], [1, 1, 1]))
+    >>> errors = scan2cad_errors(est=Alignment(np.eye(3), [0, 0.1, 2], [1, 1.5, 0.5]), gt=truth)
+    >>> errors.translation, errors.scale, errors.is_aligned, errors.is_aligned_on_each_axis
+    (0.1, 0.0, True, False)
+    """
+    places = [each.apply([gt.center])[0] for each in (est, gt.alignment)]
+    return Scan2CadErrors(
+        translation=float(np.linalg.norm(places[0] - places[1])),
+        rotation_deg=symmetric_rotation_error(est=est, gt=gt.alignment, symmetry=gt.symmetry),
+        scale=float(np.abs(np.mean(est.scale / gt.alignment.scale) - 1)),
+        scale_axes=scale_error(est=est, gt=gt.alignment),
+    )
+
+
+def scan2cad_accuracy(
+    scenes: Iterable[tuple[Sequence[PlacedModel], Sequence[PlacedModel]]],
+    *,
+    categories: Collection[str] = BENCHMARK_CATEGORIES,
+) -> Scan2CadAccuracy:
+    """Alignment accuracy over scenes.
+
+    Estimates are taken in their order. Each is matched with the first true model of its category,
+    not matched before, that it is aligned with.
+
+    Parameters
+    ----------
+    scenes : iterable of (estimates, truths)
+        The models of each scene, in one frame.
+    categories : collection of str
+        Those that are reported; the others are pooled as "other".
+
+    Examples
+    --------
+    >>> chair = PlacedModel("chair", Alignment(np.eye(3), [0, 0, 2], [1, 1, 1]))
+    >>> scan2cad_accuracy([([chair], [chair, chair])]).by_category
+    {'chair': 0.5}
+    """
+    aligned: Counter[str] = Counter()
+    total: Counter[str] = Counter()
+    for estimates, truths in scenes:
+        total.update(_reported(each.category, categories) for each in truths)
+        aligned.update(_reported(name, categories) for name in _matched(estimates, truths))
+    return Scan2CadAccuracy({name: aligned[name] for name in total}, dict(total))
+
+
+def _matched(estimates: Sequence[PlacedModel], truths: Sequence[PlacedModel]) -> list[str]:
+    """Categories of the true models that an estimate is aligned with."""
+    left = list(truths)
+    allowed = Counter(each.model_id for each in truths)
+    found = []
+    for each in estimates:
+        if each.model_id is not None:
+            if not allowed[each.model_id]:
+                continue
+            allowed[each.model_id] -= 1
+        for number, truth in enumerate(left):
+            if truth.category != each.category:
+                continue
+            if scan2cad_errors(est=each.alignment, gt=truth).is_aligned:
+                found.append(left.pop(number).category)
+                break
+    return found
+
+
+def _reported(category: str, categories: Collection[str]) -> str:
+    return category if category in categories else OTHER

@@ -1,0 +1,1 @@
+"""Masks as evidence: the model's rim is matched to the mask's contour."""

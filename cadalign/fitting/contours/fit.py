@@ -1,0 +1,284 @@
+"""Minima of the other evidence, refined with masks; masks that contradict it are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.errors import DegenerateError
+from cadalign.fitting.contours.choice import surfaces_of
+from cadalign.fitting.contours.loop import (
+    ContourFit,
+    Settled,
+    ViewContour,
+    contour_view,
+    settle,
+)
+from cadalign.fitting.contours.mask import mask_contour
+from cadalign.fitting.contours.residuals import MaskResiduals
+from cadalign.fitting.contours.stack import with_displacement_modes
+from cadalign.fitting.contours.surface import RigidSurface, Surface
+from cadalign.fitting.joint.assemble import Minimum
+from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.prior import ShapePrior
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.summary import EvidenceSummary
+from cadalign.fitting.joint.view import View
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.search import score_of
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+_MOST_STARTS = 4
+_UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried with them
+_LEAST_SUPPORT = 0.5  # share of the contour that must agree
+_LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
+_RELATIVE_TOLERANCE = 0.02
+_WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
+_LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+_INLIER = 3.5  # in deviations
+
+
+class MaskFit(NamedTuple):
+    """Minima with the masks, the residuals of every view's mask, and what contradicts."""
+
+    minima: list[Minimum]
+    residuals: tuple[MaskResiduals | None, ...]
+    warnings: tuple[str, ...]
+
+    def noted_in(self, result: AlignResult) -> AlignResult:
+        """The result with what is known of the masks."""
+        if not self.residuals:
+            return result
+        summaries = [
+            EvidenceSummary(
+                "mask", number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
+            )
+            for number, each in enumerate(self.residuals)
+            if each is not None
+        ]
+        return replace(
+            result,
+            mask_residuals=self.residuals,
+            evidence=(*result.evidence, *summaries),
+            warnings=(*result.warnings, *self.warnings),
+        )
+
+
+class _Candidate(NamedTuple):
+    """A start, a surface, and where the rounds led.
+
+    ``evidence`` and ``state`` are those of the start, with displacements as modes where the surface
+    follows them; ``prior_score`` is that of the component.
+    """
+
+    start: Minimum
+    evidence: Evidence
+    state: State
+    prior_score: float
+    surface: Surface
+    settled: Settled
+
+
+def fit_masks(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    minima: Sequence[Minimum],
+) -> MaskFit:
+    """Refine the likely minima of the other evidence with the views' masks.
+
+    Parameters
+    ----------
+    model, prior, views
+        Those of `cadalign.align`; without a mask the minima stay as they are.
+    minima : sequence of Minimum
+        Estimates without masks, the likeliest first; their scores are infinite where nothing but
+        the masks determines the unknowns.
+
+    Raises
+    ------
+    InputError
+        If a mask has no contour, or the model has no mesh.
+    DegenerateError
+        If there is no estimate without the masks and no rim near them.
+    """
+    contours = [
+        contour_view(
+            number,
+            view.camera,
+            mask_contour(view.mask_image, f"views[{number}].mask"),
+            view.mask_sigma,
+        )
+        for number, view in enumerate(views)
+        if view.mask_image is not None
+    ]
+    if not contours:
+        return MaskFit(list(minima), (), ())
+    keypoints = len(prior.ids)
+    first = minima[0]
+    points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
+    surfaces = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
+    likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
+    used, left_out, warnings = list(contours), [], []
+    best: list[_Candidate] = []
+    while used:
+        best = _settled(likely[:_MOST_STARTS], keypoints, used, surfaces)
+        wrong = _contradicting(best, used)
+        if wrong is None:
+            break
+        contour, reason = wrong
+        if len(used) == 1 and not np.isfinite(first.score):
+            if not best:
+                raise _no_rim(contour)
+            warnings.append(f"views[{contour.image}].mask: {reason}")
+            break
+        warnings.append(
+            f"views[{contour.image}].mask contradicts the rest and is left out: {reason}"
+        )
+        left_out.append(contour)
+        used.remove(contour)
+    residuals: list[MaskResiduals | None] = [None] * len(views)
+    if not used:
+        for contour in left_out:
+            residuals[contour.image] = _unused(contour)
+        return MaskFit(list(minima), tuple(residuals), tuple(warnings))
+    for contour, fit in zip(used, best[0].settled.fits, strict=True):
+        residuals[contour.image] = _residuals(contour, fit)
+    for contour in left_out:
+        residuals[contour.image] = _unused(contour)
+    return MaskFit([_minimum(each) for each in best], tuple(residuals), tuple(warnings))
+
+
+def _settled(
+    starts: Sequence[Minimum],
+    keypoints: int,
+    contours: list[ViewContour],
+    surfaces: list[Surface],
+) -> list[_Candidate]:
+    """Every start with every surface; the scores are made comparable by the best one's noise."""
+    found = []
+    for start in starts:
+        own = score_of(start.evidence, start.state, empty_system(start.evidence))
+        extra = start.score - own if np.isfinite(start.score - own) else 0.0
+        evidence, state = with_displacement_modes(start.evidence, start.state)
+        for surface in surfaces:
+            settled = settle(evidence, keypoints, state, contours, surface)
+            if settled is not None:
+                found.append(_Candidate(start, evidence, state, extra, surface, settled))
+    if len(found) > 1:
+        reference = min(found, key=lambda each: _misfit(each.settled))
+        noises = [fit.noise for fit in reference.settled.fits]
+        again = []
+        for each in found:
+            settled = settle(
+                each.evidence, keypoints, each.settled.bare, contours, each.surface, noises
+            )
+            if settled is not None:
+                again.append(each._replace(settled=settled))
+        found = again
+    found.sort(key=lambda each: each.settled.score + each.prior_score)
+    return found
+
+
+def _misfit(settled: Settled) -> float:
+    """Mean robust residual [px] of all samples, those without a rim at the reach's end."""
+    every = np.concatenate([np.nan_to_num(np.abs(fit.residuals), nan=24.0) for fit in settled.fits])
+    return float(np.minimum(every, 24.0).mean())
+
+
+def _contradicting(
+    candidates: list[_Candidate], contours: list[ViewContour]
+) -> tuple[ViewContour, str] | None:
+    """The mask that contradicts the rest, and how; None where all agree."""
+    if not candidates:
+        return contours[0], "no part of the model's outline comes near its contour"
+    best = candidates[0]
+    is_exact = isinstance(best.surface, RigidSurface)
+    relative = _RELATIVE_TOLERANCE if is_exact else _WARPED_TOLERANCE
+    supports = []
+    for contour, fit in zip(contours, best.settled.fits, strict=True):
+        size = np.sqrt(np.prod(np.ptp(contour.contour.points, axis=0)))
+        tolerance = max(_LEAST_TOLERANCE, relative * float(size))
+        supports.append(
+            float((np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < tolerance).mean())
+        )
+    worst = int(np.argmin(supports))
+    if supports[worst] < _LEAST_SUPPORT:
+        share = f"{100 * supports[worst]:.0f} % of its contour"
+        return contours[worst], f"only {share} can be the model's outline"
+    tension = _tension(best)
+    if tension is not None:
+        return contours[worst], tension
+    return None
+
+
+def _tension(candidate: _Candidate) -> str | None:
+    """Report other residuals that rise more than the masks' information explains."""
+    from scipy.special import chdtri  # takes longer to import than all that is compiled
+
+    evidence, state = candidate.evidence, candidate.state
+    alone, joint = _cost(evidence, state), _cost(evidence, candidate.settled.bare)
+    equations = 2 * len(evidence.sightings.point)
+    free = 6 * len(state.poses) + int(evidence.scales.free.sum())
+    if not equations:
+        return None
+    redundancy = equations - free
+    scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
+    unknowns = min(free + len(state.coefficients), equations)
+    if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
+        return None
+    times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))
+    return f"with it the other residuals are {times:.2g} times as large"
+
+
+def _cost(evidence: Evidence, state: State) -> float:
+    return float(evaluate_joint(evidence, state, empty_system(evidence)))
+
+
+def _minimum(candidate: _Candidate) -> Minimum:
+    settled = candidate.settled
+    return candidate.start._replace(
+        evidence=settled.evidence,
+        state=settled.state,
+        cost=settled.cost,
+        score=settled.score + candidate.prior_score,
+    )
+
+
+def _residuals(contour: ViewContour, fit: ContourFit) -> MaskResiduals:
+    near = np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < _INLIER * fit.noise.sigma
+    return MaskResiduals(
+        contour.contour.points,
+        contour.contour.normals,
+        fit.residuals,
+        near,
+        fit.noise.sigma,
+        fit.noise.correlation,
+        fit.offset,
+    )
+
+
+def _unused(contour: ViewContour) -> MaskResiduals:
+    count = len(contour.contour.points)
+    return MaskResiduals(
+        contour.contour.points,
+        contour.contour.normals,
+        np.full(count, np.nan),
+        np.zeros(count, dtype=bool),
+        float("nan"),
+        1.0,
+        0.0,
+        is_used=False,
+    )
+
+
+def _no_rim(contour: ViewContour) -> DegenerateError:
+    return DegenerateError(
+        "no part of the model's outline comes near its contour",
+        where=f"views[{contour.image}].mask",
+        fix="give an init that shows the model near the mask, or keypoints",
+    )

@@ -1,0 +1,259 @@
+"""Fit the model's rim to masks' contours, together with all other evidence.
+
+Each round finds the rims at the present estimate, adds them to the evidence as contour sightings,
+and refines everything. That a rim moves along the surface as the pose changes does not count to
+first order, so the rounds converge as fast as Gauss-Newton steps do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.fitting.contours.contour import Contour
+from cadalign.fitting.contours.deviation import correlation_length, robust_deviation
+from cadalign.fitting.contours.rims import Rims, find_rims
+from cadalign.fitting.contours.stack import RimRows, with_rims, with_room, without_rims
+from cadalign.fitting.contours.surface import PosedSurface, Surface
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.refine import refine_joint
+from cadalign.solvers.joint.search import score_of
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+_FIRST_REACH = 24.0  # [px]
+_LEAST_REACH = 4.0
+_REACH = 6.0  # in deviations of the residuals
+_COARSE_ROUNDS = 20
+_FINE_ROUNDS = 4
+_ITERATIONS = 12
+_SETTLED = 0.02  # [px], mean change of the offsets from round to round
+_LEAST_SIGMA = 0.1  # [px]
+_LOSS_SCALE = 2.4  # in deviations: Cauchy's loss then keeps 95 % of the information
+_FIRST_OFFSET = 1.0  # [px], deviation of the offset that all of a contour has in common
+_LEAST_OFFSET = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ViewContour:
+    """The contour in view number ``image``.
+
+    ``rays`` (S, 2) are its samples, ``across`` (S, 2) the derivative of the place along the normal
+    [px] by the ray; ``sigma`` is the given deviation [px], None to estimate it.
+    """
+
+    image: int
+    camera: Camera
+    contour: Contour
+    rays: FloatArray
+    across: FloatArray
+    sigma: float | None
+
+
+class Noise(NamedTuple):
+    """Deviation of a contour [px], number of samples that count as one, deviation of the offset."""
+
+    sigma: float
+    correlation: float
+    offset: float
+
+
+class ContourFit(NamedTuple):
+    """A view's contour at an estimate: rims, residuals (S,) [px] with the offset removed, noise."""
+
+    rims: Rims
+    residuals: FloatArray
+    noise: Noise
+    offset: float
+
+
+class Settled(NamedTuple):
+    """An estimate from all evidence; ``evidence`` and ``state`` hold the rims."""
+
+    evidence: Evidence
+    state: State
+    bare: State
+    fits: tuple[ContourFit, ...]
+    cost: float
+    score: float
+    rounds: int
+
+
+def contour_view(image: int, camera: Camera, contour: Contour, sigma: float | None) -> ViewContour:
+    """The contour with what the sightings need of the camera; samples outside its lens dropped."""
+    rays, valid = camera.normalize_where_valid(contour.points)
+    kept = contour.taken(valid)
+    rays = rays[valid]
+    slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays)
+    across = np.einsum("ni,nij->nj", kept.normals, slopes)
+    return ViewContour(image, camera, kept, rays, across, sigma)
+
+
+def settle(
+    evidence: Evidence,
+    keypoints: int,
+    state: State,
+    views: list[ViewContour],
+    surface: Surface,
+    noises: list[Noise] | None = None,
+) -> Settled | None:
+    """Rounds from one start until they change little; None where no rim comes near a contour.
+
+    With ``noises`` these are kept, so that the scores of several estimates compare.
+    """
+    offsets = np.zeros(len(views))
+    reach = _FIRST_REACH if noises is None else _reach_of(max(noise.sigma for noise in noises))
+    current = noises or [Noise(view.sigma or reach / 3, 1.0, _FIRST_OFFSET) for view in views]
+    fine = 0
+    last: list[Rims] = []
+    for number in range(_COARSE_ROUNDS):
+        posed = surface.at(evidence.shape, state)
+        poses = poses_of(evidence, state)
+        rims = [
+            find_rims(posed.caster, view.camera, poses[view.image], view.contour, reach)
+            for view in views
+        ]
+        moved = _change(last, rims)
+        residuals = [
+            _residuals(view, each, offset * noise.offset)
+            for view, each, offset, noise in zip(views, rims, offsets, current, strict=True)
+        ]
+        if moved < _SETTLED or number >= _COARSE_ROUNDS - _FINE_ROUNDS:
+            fine += 1
+        if noises is None:
+            before = current
+            current = [
+                noise_of(view, each, residual, noise, correlated=fine > 0)
+                for view, each, residual, noise in zip(views, rims, residuals, current, strict=True)
+            ]
+            reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
+        rows = [
+            rim_rows(view, each, noise, posed, poses[view.image])
+            for view, each, noise in zip(views, rims, current, strict=True)
+        ]
+        if not any(len(each.mean) for each in rows):
+            return None
+        full = with_rims(evidence, keypoints, rows)
+        if noises is None:
+            offsets = offsets * [b.offset / n.offset for b, n in zip(before, current, strict=True)]
+        stacked = with_room(state, keypoints, rows, offsets)
+        cost, _, _ = refine_joint(full, _ITERATIONS, stacked)
+        if not cost < np.inf:
+            return None
+        state, offsets = without_rims(stacked, keypoints, rows)
+        if noises is None:
+            current, offsets = _relearned(full, stacked, current, offsets)
+        last = rims
+        if fine > _FINE_ROUNDS or (fine > 1 and noises is not None):
+            break
+    unmatched = sum(
+        _cauchy(reach, noise) * int((~each.found).sum())
+        for each, noise in zip(rims, current, strict=True)
+    )
+    score = score_of(full, stacked, empty_system(full)) + unmatched
+    fits = tuple(
+        ContourFit(each, residual, noise, offset * noise.offset)
+        for each, residual, noise, offset in zip(rims, residuals, current, offsets, strict=True)
+    )
+    return Settled(full, stacked, state, fits, cost, score, number + 1)
+
+
+def _reach_of(sigma: float) -> float:
+    return float(np.clip(_REACH * sigma, _LEAST_REACH, _FIRST_REACH))
+
+
+def _cauchy(residual: float, noise: Noise) -> float:
+    """Cost of one sample's residual [px]."""
+    square = (_LOSS_SCALE**2) / noise.correlation
+    return float(square * np.log1p((residual / noise.sigma / _LOSS_SCALE) ** 2))
+
+
+def _change(last: list[Rims], rims: list[Rims]) -> float:
+    """Mean change of the rims' offsets [px] since the last round; infinite in the first."""
+    if not last:
+        return np.inf
+    changes = [np.zeros(0)]
+    for before, after in zip(last, rims, strict=True):
+        both = before.found & after.found
+        changes.append(np.abs(after.offset - before.offset)[both])
+    every = np.concatenate(changes)
+    return float(np.median(every)) if len(every) else np.inf
+
+
+def _residuals(view: ViewContour, rims: Rims, offset: float) -> FloatArray:
+    return np.where(rims.found, rims.offset + offset, np.nan)
+
+
+def noise_of(
+    view: ViewContour, rims: Rims, residuals: FloatArray, noise: Noise, *, correlated: bool
+) -> Noise:
+    """Deviation and correlation that the residuals show."""
+    some = residuals[rims.found]
+    sigma = max(robust_deviation(some), _LEAST_SIGMA)
+    length = 1.0
+    if correlated:
+        kept = rims.found & (np.abs(np.nan_to_num(residuals)) < 3 * sigma)
+        length = correlation_length(view.contour, np.nan_to_num(residuals), kept)
+    return Noise(sigma if view.sigma is None else view.sigma, length, noise.offset)
+
+
+def _relearned(
+    evidence: Evidence, state: State, noises: list[Noise], offsets: FloatArray
+) -> tuple[list[Noise], FloatArray]:
+    """Deviations of the offsets by their own likelihood, and the offsets in these deviations."""
+    system = empty_system(evidence)
+    evaluate_joint(evidence, state, system)
+    variances = np.linalg.pinv(system.hessian).diagonal()[-len(noises) :]
+    learned, coefficients = [], []
+    for noise, coefficient, variance in zip(noises, offsets, variances, strict=True):
+        without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of noise.offset
+        free = coefficient * (1 + without_prior)
+        square = noise.offset**2 * max(free**2 - without_prior, 0.0)
+        deviation = max(np.sqrt(square), _LEAST_OFFSET)
+        learned.append(noise._replace(offset=deviation))
+        coefficients.append(coefficient * noise.offset / deviation)
+    return learned, np.array(coefficients)
+
+
+def rim_rows(
+    view: ViewContour, rims: Rims, noise: Noise, surface: PosedSurface, pose: Alignment
+) -> RimRows:
+    """The rims that were found, in the form of the evidence."""
+    kept = np.flatnonzero(rims.found)
+    points = rims.points[kept]
+    mean, modes = surface.rows(points, rims.face[kept])
+    count = len(kept)
+    across = view.across[kept]
+    depth = pose.apply(points)[:, 2]
+    # A step along this direction of the ray moves the image by one pixel along the normal.
+    step = across / (across**2).sum(axis=1, keepdims=True)
+    outwards = np.column_stack([step * depth[:, None], np.zeros(count)])
+    offset_mode = noise.offset * (outwards @ pose.rotation) / pose.scale
+    weight = 1 / (noise.sigma * np.sqrt(noise.correlation))
+    whitening = np.column_stack([across * weight, np.zeros(count)])
+    return RimRows(
+        view.image,
+        mean,
+        modes,
+        offset_mode,
+        view.rays[kept],
+        whitening,
+        np.full(count, CAUCHY),
+        np.full(count, _LOSS_SCALE / np.sqrt(noise.correlation)),
+    )
+
+
+def poses_of(evidence: Evidence, state: State) -> list[Alignment]:
+    """Alignments in every view's camera."""
+    scale = np.exp(state.log_scales)
+    poses = []
+    for camera, p in zip(evidence.rig.cam_from_rig, evidence.rig.pose, strict=True):
+        rotation, pose = camera[:9].reshape(3, 3), state.poses[p]
+        turned = rotation @ pose[:9].reshape(3, 3)
+        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
+    return poses

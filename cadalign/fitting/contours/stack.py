@@ -1,0 +1,126 @@
+"""Rims as points of the shape, so that the joint kernels take them as contour sightings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State
+
+
+class RimRows(NamedTuple):
+    """Rims of one view that count: N points of the shape, each with its sighting.
+
+    ``mean`` (N, 3) and ``modes`` (K, N, 3) as in `Shape`; ``offset_mode`` (N, 3) moves every rim
+    outwards by one deviation of the offset that all of the contour has in common. ``rays`` (N, 2),
+    ``whitening`` (N, 3), ``loss`` (N,) and ``loss_scale`` (N,) as in `Sightings`.
+    """
+
+    image: int
+    mean: FloatArray
+    modes: FloatArray
+    offset_mode: FloatArray
+    rays: FloatArray
+    whitening: FloatArray
+    loss: IntArray
+    loss_scale: FloatArray
+
+
+def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Evidence:
+    """The evidence with rims; their points stand between the keypoints and the box's corners.
+
+    Each view's rims have one more mode, the last ones of the shape in the order of the views.
+    """
+    shape = evidence.shape
+    own, views = len(shape.modes), len(rims)
+    counts = [len(each.mean) for each in rims]
+    total = sum(counts)
+    modes = np.zeros((own + views, len(shape.mean) + total, 3))
+    modes[:own, :keypoints] = shape.modes[:, :keypoints]
+    modes[:own, keypoints + total :] = shape.modes[:, keypoints:]
+    start = keypoints
+    for number, each in enumerate(rims):
+        end = start + counts[number]
+        modes[: len(each.modes), start:end] = each.modes  # none for a rigid surface
+        modes[own + number, start:end] = each.offset_mode
+        start = end
+    extended = Shape(
+        np.concatenate(
+            [shape.mean[:keypoints], *(each.mean for each in rims), shape.mean[keypoints:]]
+        ),
+        modes,
+        np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]),
+    )
+    old, lengths = evidence.sightings, evidence.lengths
+    sightings = Sightings(
+        np.concatenate([old.point, keypoints + np.arange(total)]),
+        np.concatenate([old.image, *(np.full(len(each.mean), each.image) for each in rims)]),
+        np.concatenate([old.rays, *(each.rays for each in rims)]),
+        np.concatenate([old.whitening, *(each.whitening for each in rims)]),
+        np.concatenate([old.depths, np.zeros((total, 2))]),
+        np.concatenate([old.loss, *(each.loss for each in rims)]),
+        np.concatenate([old.loss_scale, *(each.loss_scale for each in rims)]),
+    )
+    return evidence._replace(
+        shape=extended,
+        sightings=sightings,
+        lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
+        heights=evidence.heights._replace(point=_moved(evidence.heights.point, keypoints, total)),
+        planes=evidence.planes._replace(point=_moved(evidence.planes.point, keypoints, total)),
+    )
+
+
+def _moved(rows: IntArray, keypoints: int, total: int) -> IntArray:
+    """Numbers of points when others are put behind the keypoints."""
+    return np.where(rows >= keypoints, rows + total, rows)
+
+
+def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The same with the points' own displacements as modes, which a warped surface follows."""
+    shape = evidence.shape
+    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
+    if not len(rows):
+        return evidence, state
+    axes = np.tile(np.arange(3), len(rows) // 3)
+    own = np.zeros((len(rows), *shape.mean.shape))
+    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
+    moved = state.displacements[rows, axes] / np.exp(state.log_scales)[axes] / shape.spread[rows]
+    return (
+        evidence._replace(
+            shape=Shape(shape.mean, np.concatenate([shape.modes, own]), np.zeros_like(shape.spread))
+        ),
+        state._replace(
+            coefficients=np.concatenate([state.coefficients, moved]),
+            displacements=np.zeros_like(state.displacements),
+        ),
+    )
+
+
+def with_room(state: State, keypoints: int, rims: list[RimRows], offsets: FloatArray) -> State:
+    """A state of the evidence without rims as one of the evidence with them.
+
+    ``offsets`` (V,) are the coefficients of the rims' own modes.
+    """
+    total = sum(len(each.mean) for each in rims)
+    still = state.displacements
+    return State(
+        state.poses.copy(),
+        state.log_scales.copy(),
+        np.concatenate([state.coefficients, offsets]),
+        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
+    )
+
+
+def without_rims(state: State, keypoints: int, rims: list[RimRows]) -> tuple[State, FloatArray]:
+    """A state of the evidence without rims, and the coefficients (V,) of the rims' own modes."""
+    total, own = sum(len(each.mean) for each in rims), len(state.coefficients) - len(rims)
+    still = state.displacements
+    bare = State(
+        state.poses,
+        state.log_scales,
+        state.coefficients[:own].copy(),
+        np.concatenate([still[:keypoints], still[keypoints + total :]]),
+    )
+    return bare, state.coefficients[own:].copy()

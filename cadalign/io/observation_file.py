@@ -1,0 +1,247 @@
+"""The declared fields of observation files, and their conversion to and from images.
+
+`cadalign.io.observation` documents the format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, Meta, UnsetType
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import DataError
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import (
+    Document,
+    Finite,
+    Labelled,
+    NotNegative,
+    PathText,
+    Point2,
+    Point3,
+    Positive,
+    Text,
+    convert,
+    path_from,
+    within,
+    written_path,
+)
+from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+
+_Row4 = tuple[Finite, Finite, Finite, Finite]
+_PATHS = ("mask", "depth")
+
+
+class Keypoint(Labelled, kw_only=True):
+    """One entry of ``keypoints``."""
+
+    xyz: Point3
+    uv: Point2
+    sigma: Positive | None = None
+    name: Text | None = None
+    confidence: NotNegative | None = None
+    depth: Positive | None = None
+
+
+class FitFields(Document):
+    """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
+
+    method: Text | UnsetType = UNSET
+    sigma: Positive | list[Positive] | UnsetType | None = UNSET
+    loss: Text | UnsetType = UNSET
+    loss_scale: Positive | UnsetType = UNSET
+    stretch: Text | UnsetType | None = UNSET
+    scale_prior_sigma: Positive | UnsetType | None = UNSET
+    known_axis: Text | UnsetType = UNSET
+    focal: Literal["known", "estimate"] | UnsetType = UNSET
+    shape_sigma: Positive | UnsetType = UNSET
+
+
+class SizeFields(Document):
+    """The entry ``size``."""
+
+    width: Positive | None = None
+    height: Positive | None = None
+    length: Positive | None = None
+    # A tuple of three beside a number makes msgspec 0.22 crash in garbage collection.
+    sigma: Positive | list[Positive] | None = None
+
+
+class _ImageFields(Document, kw_only=True):
+    """Fields of one image, beside its keypoints."""
+
+    camera: Any  # in the form of `Camera.from_dict`
+    image: PathText | None = None
+    mask: PathText | None = None
+    mask_sigma: Positive | None = None
+    depth: PathText | None = None
+    depth_scale: Positive | None = None
+    depth_sigma: Positive | None = None
+    up: Point3 | None = None
+    up_sigma_deg: Positive | None = None
+    camera_height: Positive | None = None
+    camera_height_sigma: Positive | None = None
+    cam_from_rig: tuple[_Row4, _Row4, _Row4, _Row4] | None = None
+
+
+class ViewFields(_ImageFields, kw_only=True):
+    """One entry of ``views``."""
+
+    keypoints: list[Keypoint] = msgspec.field(default_factory=list)
+
+
+class OneView(_ImageFields, kw_only=True):
+    """A file of one image."""
+
+    keypoints: Annotated[list[Keypoint], Meta(min_length=1)]
+    model: PathText | None = None
+    shape: PathText | None = None
+    size: SizeFields | None = None
+    fit: FitFields = msgspec.field(default_factory=FitFields)
+
+
+class SeveralViews(Document, kw_only=True):
+    """A file of several images."""
+
+    views: Annotated[list[ViewFields], Meta(min_length=1)]
+    model: PathText | None = None
+    shape: PathText | None = None
+    size: SizeFields | None = None
+    fit: FitFields = msgspec.field(default_factory=FitFields)
+
+
+def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | OneView, ...]]:
+    """Check the parsed form of a file; returns its fields and those of its views.
+
+    Raises
+    ------
+    DataError
+        If a field is missing, unknown or invalid.
+    """
+    if not isinstance(data, Mapping) or "views" not in data:
+        one: OneView = convert(data, OneView)
+        sigma = one.fit.sigma
+        if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
+            what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"
+            raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
+        return one, (one,)
+    several: SeveralViews = convert(data, SeveralViews)
+    if isinstance(several.fit.sigma, list):
+        fix = "give one for all, or `sigma` of every keypoint"
+        raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
+    return several, tuple(several.views)
+
+
+def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> ObservedImage:
+    """An image from its checked fields; paths are relative to ``folder``.
+
+    Raises
+    ------
+    InputError
+        If the camera is invalid, or fields contradict each other.
+    """
+    names = _column(read.keypoints, "name")
+    ids = _column(read.keypoints, "semantic_id")
+    evidence = {name: getattr(read, name) for name in ImageEvidence.__dataclass_fields__}
+    for name in _PATHS:
+        if evidence[name] is not None:
+            evidence[name] = path_from(evidence[name], folder)
+    if evidence["cam_from_rig"] is not None:
+        evidence["cam_from_rig"] = np.array(evidence["cam_from_rig"])
+    return ObservedImage(
+        points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
+        points_2d=np.array([each.uv for each in read.keypoints]).reshape(-1, 2),
+        camera=Camera.from_dict(read.camera),
+        sigma=_column(read.keypoints, "sigma"),
+        semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
+        names=None if names is None else tuple(names),
+        confidences=_column(read.keypoints, "confidence"),
+        image=None if read.image is None else path_from(read.image, folder),
+        depths=_depths(read.keypoints),
+        evidence=ImageEvidence(**evidence),
+    )
+
+
+def read_size(read: SizeFields | None) -> KnownSize | None:
+    """The known lengths, if there are any.
+
+    Raises
+    ------
+    DataError
+        If ``size`` has no length, or neither one deviation nor three.
+    """
+    if read is None:
+        return None
+    with within("size"):
+        return KnownSize(**msgspec.structs.asdict(read))
+
+
+def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
+    """Camera, keypoints, photo and evidence of an image as they are written."""
+    keypoints: list[dict[str, Any]] = [
+        {"xyz": xyz, "uv": uv}
+        for xyz, uv in zip(image.points_3d.tolist(), image.points_2d.tolist(), strict=True)
+    ]
+    for name, values in (
+        ("sigma", image.sigma),
+        ("semantic_id", image.semantic_ids),
+        ("name", image.names),
+        ("confidence", image.confidences),
+        ("depth", image.depths),
+    ):
+        if values is not None:
+            listed = values.tolist() if isinstance(values, np.ndarray) else values
+            for keypoint, value in zip(keypoints, listed, strict=True):
+                if value == value:  # an unknown depth is NaN
+                    keypoint[name] = value
+    data: dict[str, Any] = {"camera": image.camera.to_dict(), "keypoints": keypoints}
+    if image.image is not None:
+        data["image"] = written_path(image.image, folder=folder)
+    for name, value in image.evidence.given.items():
+        if isinstance(value, Path):
+            data[name] = written_path(value, folder=folder)
+        else:
+            data[name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return data
+
+
+def fill_xyz(data: Any) -> Any:
+    """The parsed form of a file, with zeros for the ``xyz`` of keypoints that have none."""
+    if not isinstance(data, Mapping):
+        return data
+    if isinstance(views := data.get("views"), list):
+        return {**data, "views": [fill_xyz(view) for view in views]}
+    keypoints = data.get("keypoints")
+    if not isinstance(keypoints, list):
+        return data
+    filled = [
+        {"xyz": [0.0, 0.0, 0.0], **each} if isinstance(each, Mapping) else each
+        for each in keypoints
+    ]
+    return {**data, "keypoints": filled}
+
+
+def _column(keypoints: Sequence[Keypoint], name: str) -> Any:
+    """One optional field of all keypoints as a list; None where none has it."""
+    values = [getattr(keypoint, name) for keypoint in keypoints]
+    missing = [row for row, value in enumerate(values) if value is None]
+    if len(missing) == len(values):
+        return None
+    if missing:
+        raise DataError(
+            "missing, though other keypoints have it",
+            where=f"keypoints[{missing[0]}].{name}",
+            fix="give it for all keypoints or for none",
+        )
+    return values
+
+
+def _depths(keypoints: Sequence[Keypoint]) -> FloatArray | None:
+    """Depths of the keypoints, NaN where unknown; None where all are."""
+    depths = [np.nan if each.depth is None else each.depth for each in keypoints]
+    return np.array(depths) if np.isfinite(depths).any() else None

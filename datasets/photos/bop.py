@@ -1,0 +1,256 @@
+"""BOP: poses of known models in photos, as one scene's folder or as a whole data set.
+
+Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018; the format is
+bop_toolkit's ``docs/bop_datasets_format.md``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta, Raw
+
+from cadalign.datasets.photos.bop_models import BopModels
+from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.photo import DepthImage, Photo, PhotoObject, Truth, existing
+from cadalign.datasets.photos.records import parse, read_table
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.documents import Finite, ForeignDocument, NotNegative, Point3, Positive, convert
+from cadalign.io.images import photo_size
+
+MILLIMETRES = 1e-3
+TRUTH = "scene_gt.json"
+_CAMERAS = "scene_camera.json"
+_INFO = "scene_gt_info.json"
+_CAMERA = "camera.json"
+_COLOR_FOLDERS = ("rgb", "gray")
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif")
+_Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
+
+
+class _Pose(ForeignDocument):
+    cam_R_m2c: _Nine
+    cam_t_m2c: Point3
+    obj_id: Annotated[int, Meta(ge=0, le=10**6)]
+
+
+class _Info(ForeignDocument):
+    bbox_obj: tuple[Finite, Finite, Finite, Finite] | None = None
+    visib_fract: Finite | None = None
+
+
+class _FrameCamera(ForeignDocument):
+    cam_K: _Nine
+    depth_scale: NotNegative = 1.0
+
+
+class _SceneCamera(ForeignDocument):
+    """The camera of all photos; ``width`` and ``height`` may be missing."""
+
+    fx: Positive
+    fy: Positive
+    cx: Finite
+    cy: Finite
+    width: Positive | None = None
+    height: Positive | None = None
+    depth_scale: NotNegative = 1.0
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The tables of a scene's folder; the values of each are parsed when they are asked for."""
+
+    folder: Path
+    truth: dict[str, Raw]
+    cameras: dict[str, Raw]
+    info: dict[str, Raw]
+
+
+class Bop(PhotoDataset):
+    """Photos with the poses of known models, in BOP's format.
+
+    ::
+
+        <root>/models/obj_000001.ply, models_info.json        also models_eval, models_cad
+        <root>/<split>/<scene>/scene_gt.json, scene_camera.json, scene_gt_info.json,
+                               rgb/000000.png (or gray), depth/, mask/, mask_visib/
+
+    ``root`` may be the data set, a split, or one scene. Of a scene, ``scene_gt.json`` alone is
+    necessary with a camera: ``scene_camera.json``, or ``camera.json`` in the scene or above it.
+    Models are looked for in the scene's folder and the three above it.
+
+    Lengths are millimetres. Integer pixels are pixel centres, as in bop_toolkit. Symmetries are
+    ``models_info.json``'s. The mask is that of the visible pixels. Categories are the models' ids,
+    ``obj_000001``. A model's box is its truth's box.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder.
+
+    Raises
+    ------
+    DataError
+        If there is no scene, or no table of a scene can be read.
+    """
+
+    kind = "BOP"
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = Path(root)
+        scenes = tuple(find_scenes(folder))
+        if not scenes:
+            raise DataError(
+                f"there is no {TRUTH} in this folder, nor one or two below",
+                where=str(folder),
+                fix="give a BOP data set, one of its splits, or a scene",
+            )
+        self._photos: list[tuple[Path, str]] = []
+        names, bad = [], {}
+        for scene in scenes:
+            try:
+                keys = list(read_table(scene / TRUTH))
+            except DataError as error:
+                bad[str(scene)] = error
+                continue
+            prefix = "" if scene == folder else f"{scene.relative_to(folder).as_posix()}/"
+            self._photos += [(scene, key) for key in keys]
+            names += [f"{prefix}{key}" for key in keys]
+        if not names and bad:
+            raise next(iter(bad.values()))
+        super().__init__(folder, names)
+        self.problems |= bad
+        self._scene: _Scene | None = None
+        self._models: BopModels | None = None
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        folder, key = self._photos[index]
+        # Photos come scene by scene; tables and models of one scene are kept.
+        if self._scene is None or self._scene.folder != folder:
+            self._scene = _read_scene(folder)
+            models = BopModels.find(folder)
+            self._models = models if self._models != models else self._models
+        scene, models = self._scene, self._models
+        image = _image(folder, _COLOR_FOLDERS, key)
+        camera, depth_scale = _camera(scene, key, image)
+        poses: list[Any] = parse(scene.truth[key], list[Any], path=folder / TRUTH, where=key)
+        infos: list[_Info] = []
+        if key in scene.info:
+            infos = parse(scene.info[key], list[_Info], path=folder / _INFO, where=key)
+
+        def read_object(number: int, pose: Any) -> PhotoObject:
+            found = _object(number, convert(pose, _Pose), models)
+            if number < len(infos):
+                found = _with_info(found, infos[number])
+            name = f"{int(key):06d}_{number:06d}.png"
+            masks = (existing(folder / kind / name) for kind in ("mask_visib", "mask"))
+            return replace(found, mask_path=next(filter(None, masks), None))
+
+        objects, problems = read_each(poses, read_object, where=f"{folder / TRUTH}, {key}")
+        depth_path = _image(folder, ("depth",), key)
+        depth = None if depth_path is None else DepthImage(depth_path, depth_scale)
+        return Photo(self.names[index], image, camera, objects, depth=depth, problems=problems)
+
+
+def find_scenes(folder: Path) -> Iterator[Path]:
+    """List the folders with a ``scene_gt.json``: this one, or those one or two below it."""
+    if (folder / TRUTH).is_file():
+        yield folder
+        return
+    for pattern in ("*", "*/*"):
+        yield from sorted(path.parent for path in folder.glob(f"{pattern}/{TRUTH}"))
+
+
+def _read_scene(folder: Path) -> _Scene:
+    tables = {name: folder / name for name in (_CAMERAS, _INFO)}
+    found = {name: read_table(path) if path.is_file() else {} for name, path in tables.items()}
+    return _Scene(folder, read_table(folder / TRUTH), found[_CAMERAS], found[_INFO])
+
+
+def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
+    if not key.isdecimal():
+        raise DataError(f"{key!r} is not the number of an image", where=str(folder / TRUTH))
+    for kind in kinds:
+        for suffix in _IMAGES:
+            path = folder / kind / f"{int(key):06d}{suffix}"
+            if path.is_file():
+                return path
+    return None
+
+
+def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None, float]:
+    """The photo's camera, None where its size is not known; and the depth's scale."""
+    common, path = _common_camera(scene.folder)
+    size = photo_size(image) if image is not None else None
+    if size is None and common is not None and common.width and common.height:
+        size = int(common.width), int(common.height)
+    if key in scene.cameras:
+        found = parse(scene.cameras[key], _FrameCamera, path=scene.folder / _CAMERAS, where=key)
+        k = found.cam_K
+        values, scale = (k[0], k[4], k[2], k[5]), found.depth_scale
+    elif common is not None:
+        values, scale = (common.fx, common.fy, common.cx, common.cy), common.depth_scale
+    else:
+        raise DataError(
+            f"no camera of photo {key}: neither {_CAMERAS} nor {_CAMERA} has it",
+            where=str(scene.folder),
+        )
+    if size is None:
+        return None, scale
+    try:
+        return Camera(*size, *values), scale
+    except InputError as error:
+        where = path if key not in scene.cameras else scene.folder / _CAMERAS
+        raise DataError(error.what, where=f"{where}, {key}") from None
+
+
+def _common_camera(folder: Path) -> tuple[_SceneCamera | None, Path | None]:
+    """The camera of all photos of a scene: its own, or that of a folder above it."""
+    for place in (folder, *folder.parents[:2]):
+        path = place / _CAMERA
+        if path.is_file():
+            table = read_table(path)
+            whole: dict[str, Any] = {
+                name: parse(value, Any, path=path, where=name) for name, value in table.items()
+            }
+            if "fx" not in whole:
+                continue
+            from cadalign.io.documents import in_file
+
+            with in_file(path):
+                return convert(whole, _SceneCamera), path
+    return None, None
+
+
+def _object(number: int, pose: _Pose, models: BopModels | None) -> PhotoObject:
+    matrix = np.reshape(pose.cam_R_m2c, (3, 3)).astype(float)
+    alignment = Alignment(nearest_rotation(matrix), np.array(pose.cam_t_m2c), np.ones(3))
+    model = None if models is None else models.model(pose.obj_id)
+    box = None
+    if model is not None and model.bounds is not None:
+        box = Box.from_model(model.bounds, alignment)
+    found = PhotoObject(
+        object_id=str(number),
+        category=f"obj_{pose.obj_id:06d}",
+        truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
+        model=model,
+    )
+    return found if models is None else replace(found, symmetry=models.symmetry(pose.obj_id))
+
+
+def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:
+    bbox = None
+    if info.bbox_obj is not None and min(info.bbox_obj[2:]) > 0:
+        left, top, width, height = info.bbox_obj
+        bbox = np.array([left, top, left + width, top + height])
+    return replace(found, bbox=bbox, visible_fraction=info.visib_fract)

@@ -1,0 +1,224 @@
+"""Lazy iteration over photos, in which no bad record stops the rest."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from cadalign.datasets.photos.photo import Photo, PhotoObject
+from cadalign.errors import CadalignError, DataError
+
+logger = logging.getLogger("cadalign")
+
+_Record = TypeVar("_Record")
+# Warnings of one data set that are logged; `problems` has all.
+_LOGGED = 20
+
+
+@dataclass(frozen=True)
+class PhotoSummary:
+    """Counts of what a data set of photos holds.
+
+    Parameters
+    ----------
+    kind : str
+        The data set's format.
+    root : Path
+        Its folder.
+    records : int
+        Photos that its annotations list.
+    photos : int
+        Those that can be read.
+    images : int
+        Those whose image is there.
+    objects : int
+        Objects in them.
+    categories : dict
+        Number of objects of each category, the most frequent first.
+    with_keypoints, with_model, with_pose, with_mask : int
+        Objects that have these; a box counts as a pose.
+    problems : tuple of str
+        Why records or objects could not be read.
+    """
+
+    kind: str
+    root: Path
+    records: int
+    photos: int
+    images: int
+    objects: int
+    categories: dict[str, int]
+    with_keypoints: int
+    with_model: int
+    with_pose: int
+    with_mask: int
+    problems: tuple[str, ...]
+
+
+class PhotoDataset(ABC):
+    """A data set of photos.
+
+    Photos are read one at a time when they are asked for. ``len`` counts the records listed;
+    iterating gives the readable ones, with a warning (logger "cadalign") for each of the others,
+    and for objects that could not be read in a photo. `problems` holds the reasons met so far, by
+    name. Asking for one photo by its number or name raises the reason.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    names : sequence of str
+        The photos' names.
+
+    Examples
+    --------
+    >>> for photo in cadalign.datasets.open("lmo"):  # doctest: +SKIP
+    ...     for found in photo.objects:
+    ...         print(photo.name, found.category, found.truth.cam_from_model)
+    """
+
+    kind: str = "photos"
+    """Name of the format."""
+
+    def __init__(self, root: Path, names: Iterable[str]) -> None:
+        self.root = root
+        self.names = tuple(names)
+        """The photos' names, in the annotations' order."""
+        self.problems: dict[str, DataError] = {}
+        """Why records or objects could not be read, of those read so far, by name."""
+
+    @abstractmethod
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0; raises `DataError` if its record is bad."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, key: int | str) -> Photo:
+        """The photo of a number or name.
+
+        Raises
+        ------
+        DataError
+            If its record is bad, or there is none of this name.
+        IndexError
+            If the number is out of range.
+        """
+        if isinstance(key, str):
+            if key not in self.names:
+                raise DataError(f"no photo {key!r}", where=str(self.root))
+            key = self.names.index(key)
+        if not -len(self) <= key < len(self):
+            raise IndexError(f"{len(self)} photos, asked for number {key}")
+        return self._read(key % len(self))
+
+    def __iter__(self) -> Iterator[Photo]:
+        for index, name in enumerate(self.names):
+            try:
+                photo = self._read(index)
+            except DataError as error:
+                self._tell(name, error)
+                continue
+            for number, problem in enumerate(photo.problems):
+                self._tell(f"{name}, problem {number + 1}", problem)
+            yield photo
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.root)!r}): {len(self)} photos"
+
+    def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
+        """Read all records, not the images, and count what there is.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the number of photos read after each.
+        """
+        photos = images = 0
+        objects: Counter[str] = Counter()
+        having: Counter[str] = Counter()
+        for photo in self:
+            photos += 1
+            images += photo.image is not None
+            for found in photo.objects:
+                objects[found.category] += 1
+                having.update(_parts(found))
+            if progress is not None:
+                progress(photos)
+        return PhotoSummary(
+            kind=self.kind,
+            root=self.root,
+            records=len(self),
+            photos=photos,
+            images=images,
+            objects=objects.total(),
+            categories=dict(objects.most_common()),
+            with_keypoints=having["keypoints"],
+            with_model=having["model"],
+            with_pose=having["pose"],
+            with_mask=having["mask"],
+            problems=tuple(str(problem) for problem in self.problems.values()),
+        )
+
+    def _read(self, index: int) -> Photo:
+        try:
+            return self.read(index)
+        except DataError:
+            raise
+        except CadalignError as error:  # a value that a camera or a pose refuses
+            where = f"{self.root}, {self.names[index]}"
+            where += f": {error.where}" if error.where else ""
+            raise DataError(error.what, where=where, fix=error.fix) from None
+
+    def _tell(self, name: str, error: DataError) -> None:
+        if name not in self.problems and len(self.problems) <= _LOGGED:
+            more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
+            logger.warning("%s: left out: %s%s", self.kind, error, more)
+        self.problems[name] = error
+
+
+def _parts(found: PhotoObject) -> Iterator[str]:
+    if found.keypoints is not None:
+        yield "keypoints"
+    if found.model is not None:
+        yield "model"
+    if found.truth.cam_from_model is not None or found.truth.box is not None:
+        yield "pose"
+    if found.mask_path is not None:
+        yield "mask"
+
+
+def read_each(
+    records: Iterable[_Record], read: Callable[[int, _Record], PhotoObject | None], *, where: str
+) -> tuple[tuple[PhotoObject, ...], tuple[DataError, ...]]:
+    """Read a photo's objects, and the reasons why some could not be read.
+
+    Parameters
+    ----------
+    records : iterable
+        The objects' records.
+    read : callable
+        Makes the object of a number and a record; None for one that is left out on purpose.
+    where : str
+        The place of the records, for messages.
+    """
+    found: list[PhotoObject] = []
+    problems: list[DataError] = []
+    for number, record in enumerate(records):
+        try:
+            each = read(number, record)
+        except CadalignError as error:
+            place = f"{where}, object {number}"
+            if error.where:
+                has_file = error.where.startswith(where)
+                place = error.where if has_file else f"{place}: {error.where}"
+            problems.append(DataError(error.what, where=place, fix=error.fix))
+            continue
+        if each is not None:
+            found.append(each)
+    return tuple(found), tuple(problems)

@@ -1,0 +1,268 @@
+"""Objectron: boxes with nine degrees of freedom in the frames of phone videos.
+
+Ahmadyan et al., "Objectron: A Large Scale Dataset of Object-Centric Videos in the Wild with Pose
+Annotations", CVPR 2021.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.objectron_files import (
+    Annotation,
+    ArCamera,
+    Sequence,
+    WorldObject,
+    read_sequence,
+)
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    ImageReader,
+    ModelFiles,
+    NamedPoints,
+    Photo,
+    PhotoKeypoints,
+    PhotoObject,
+    Truth,
+)
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.documents import convert
+from cadalign.io.images import ByteImage
+
+ANNOTATIONS = "annotations"
+_GEOMETRY = "geometry.pbdata"
+_LEVELS = ("", "*/", "*/*/", "*/*/*/")
+# Objects come first in a JSON file, and there are few.
+_BEGINNING = 2**16
+_BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
+# The centre, then the corners: the sign of z changes first, that of x last.
+_UNIT_BOX = np.array(
+    [[0, 0, 0], *([x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5))],
+    dtype=float,
+)
+_NAMES = ("center", *(f"corner {number}" for number in range(1, 9)))
+# The photo is upright, the sensor on its side: the sensor's y (up) is the photo's x (right), its x
+# (right) the photo's y (down), and it looks along -z.
+_CV_FROM_SENSOR = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_VISIBLE = 0.1
+
+
+@dataclass(frozen=True)
+class VideoFrame:
+    """A frame of a video file.
+
+    Parameters
+    ----------
+    path : Path
+        The video.
+    number : int
+        The frame, from 0.
+    """
+
+    path: Path
+    number: int
+
+    def read(self) -> ByteImage:
+        """Read the frame upright, (h, w, 3) uint8.
+
+        Raises
+        ------
+        DataError
+            If the video has no such frame, or cannot be read.
+        """
+        import cv2  # on first use: it takes longer to import than all the rest
+
+        video = cv2.VideoCapture(str(self.path))
+        try:
+            video.set(cv2.CAP_PROP_POS_FRAMES, self.number)
+            is_read, pixels = video.read()
+        finally:
+            video.release()
+        if not is_read:
+            raise DataError(f"frame {self.number} cannot be read", where=str(self.path))
+        if pixels.shape[0] < pixels.shape[1]:  # the file's note on rotation was not heeded
+            pixels = np.rot90(pixels, k=-1)
+        return np.ascontiguousarray(pixels[:, :, ::-1], dtype=np.uint8)
+
+
+class Objectron(PhotoDataset):
+    """Frames of Objectron's videos.
+
+    ::
+
+        annotations/<class>/batch-<i>/<j>.pbdata          (or .json)
+        videos/<class>/batch-<i>/<j>/video.MOV
+
+    or such annotation files up to four levels below ``root``, each with frames in a folder of its
+    name, ``<j>/<frame id>.jpg`` or ``.png``, or ``<j>/video.MOV``. Files are the official protocol
+    buffers, or the same messages as JSON; see `cadalign.datasets.photos.objectron_files`.
+
+    The truth is complete: the model is the unit box around the origin, its stretch the sides in
+    metres. The keypoints are the box's centre and corners, also those that the object hides. Photos
+    are upright, while the annotated camera is the sensor's, which lies on its side.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder.
+
+    Raises
+    ------
+    DataError
+        If there are no annotation files, or none can be read.
+    """
+
+    kind = "Objectron"
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = Path(root)
+        paths = list_annotations(folder)
+        if not paths:
+            raise DataError(
+                "there are no annotation files (.pbdata)",
+                where=str(folder),
+                fix="give the folder of Objectron's annotations",
+            )
+        self._frames: list[tuple[Path, int]] = []
+        names, bad = [], {}
+        for path in paths:
+            try:
+                count = len(read_sequence(path).frames)
+            except DataError as error:
+                bad[str(path)] = error
+                continue
+            stem = path.relative_to(folder).with_suffix("").as_posix()
+            self._frames += [(path, number) for number in range(count)]
+            names += [f"{stem}/{number}" for number in range(count)]
+        if not names:
+            raise next(iter(bad.values()))
+        super().__init__(folder, names)
+        self.problems |= bad
+        self._sequence: Sequence | None = None
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        path, number = self._frames[index]
+        if self._sequence is None or self._sequence.path != path:
+            self._sequence = read_sequence(path)
+        sequence = self._sequence
+        frame = sequence.frame(number)
+        camera = _camera(frame.camera)
+        cam_from_world = _cam_from_world(frame.camera)
+        objects, problems = read_each(
+            frame.annotations,
+            partial(_object, sequence=sequence, camera=camera, cam_from_world=cam_from_world),
+            where=f"{path}: frame_annotations[{number}]",
+        )
+        image = _image(self.root, path, frame.frame_id)
+        return Photo(self.names[index], image, camera, objects, problems=problems)
+
+
+def list_annotations(folder: Path) -> list[Path]:
+    """List the annotation files: ``.pbdata``, and ``.json`` in ``annotations``; four levels."""
+    found = [path for level in _LEVELS for path in folder.glob(f"{level}*.pbdata")]
+    found += [path for level in _LEVELS for path in (folder / ANNOTATIONS).glob(f"{level}*.json")]
+    return sorted(path for path in found if path.name != _GEOMETRY)
+
+
+def has_annotations(folder: Path) -> bool:
+    """True if there are annotation files, as told by their ending, or their content where JSON."""
+    return any(path.suffix == ".pbdata" or _is_sequence(path) for path in list_annotations(folder))
+
+
+def _is_sequence(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        begin = file.read(_BEGINNING)
+        return b"frame_annotations" in begin or b"frameAnnotations" in begin
+    return False
+
+
+def _object(
+    number: int, entry: Any, *, sequence: Sequence, camera: Camera, cam_from_world: Alignment
+) -> PhotoObject:
+    annotation: Annotation = convert(entry, Annotation)
+    found = _find(sequence, annotation.object_id)
+    world_from_model = Alignment(
+        nearest_rotation(np.reshape(found.rotation, (3, 3)).astype(float)),
+        np.array(found.translation),
+        np.array(found.scale),
+    )
+    cam_from_model = cam_from_world @ world_from_model
+    return PhotoObject(
+        object_id=str(number),
+        category=found.category,
+        truth=Truth(cam_from_model, Box.from_model(_BOUNDS, cam_from_model), metres=1.0),
+        keypoints=_keypoints(annotation, camera),
+        model=CadModel(
+            "unit box", ModelFiles(None, NamedPoints(_NAMES, _UNIT_BOX)), bounds=_BOUNDS
+        ),
+        visible_fraction=float(np.clip(annotation.visibility, 0.0, 1.0)),
+        flags=frozenset() if annotation.visibility > _VISIBLE else frozenset({"occluded"}),
+    )
+
+
+def _find(sequence: Sequence, object_id: int) -> WorldObject:
+    for number in range(len(sequence.objects)):
+        found = sequence.object(number)
+        if found.id == object_id:
+            return found
+    raise InputError(f"there is no object {object_id}", where="object_id")
+
+
+def _keypoints(annotation: Annotation, camera: Camera) -> PhotoKeypoints:
+    if len(annotation.keypoints) != len(_NAMES):
+        raise InputError(f"{len(annotation.keypoints)}, expected {len(_NAMES)}", where="keypoints")
+    ordered = sorted(annotation.keypoints, key=lambda each: each.id)
+    share = np.array([(each.point_2d.x, each.point_2d.y) for each in ordered])
+    pixels = share * (camera.width, camera.height) - PIXEL_CENTRE
+    return PhotoKeypoints(pixels, _NAMES, np.ones(len(_NAMES), dtype=bool))
+
+
+def _camera(found: ArCamera) -> Camera:
+    """The upright photo's camera, from the projection matrix of the sensor on its side."""
+    width, height = found.image_resolution_height, found.image_resolution_width
+    projection = np.reshape(found.projection_matrix, (4, 4))
+    # Across the sensor, which is down the photo, from -1 to 1: P[0, 0] x / -z - P[0, 2].
+    fx, fy = projection[1, 1] * width / 2, projection[0, 0] * height / 2
+    cx = (1 - projection[1, 2]) * width / 2 - PIXEL_CENTRE
+    cy = (1 - projection[0, 2]) * height / 2 - PIXEL_CENTRE
+    return Camera(width, height, float(fx), float(fy), float(cx), float(cy))
+
+
+def _cam_from_world(found: ArCamera) -> Alignment:
+    view: FloatArray = np.reshape(found.view_matrix, (4, 4)).astype(float)
+    rotation = _CV_FROM_SENSOR @ nearest_rotation(view[:3, :3])
+    return Alignment(rotation, _CV_FROM_SENSOR @ view[:3, 3], np.ones(3))
+
+
+def _image(root: Path, annotation: Path, frame_id: int) -> Path | ImageReader | None:
+    for folder in _image_folders(root, annotation):
+        for name in (f"{frame_id}", f"{frame_id:06d}"):
+            for suffix in (".jpg", ".png"):
+                if (folder / f"{name}{suffix}").is_file():
+                    return folder / f"{name}{suffix}"
+        if (folder / "video.MOV").is_file():
+            return VideoFrame(folder / "video.MOV", frame_id)
+    return None
+
+
+def _image_folders(root: Path, annotation: Path) -> Iterator[Path]:
+    yield annotation.with_suffix("")
+    place = annotation.with_suffix("").relative_to(root)
+    if place.parts[0] == ANNOTATIONS:
+        yield root / Path("videos", *place.parts[1:])

@@ -1,0 +1,195 @@
+"""Objectron's annotation files: protocol buffers, or the same messages as JSON.
+
+The messages are those of ``annotation_data.proto``, ``object.proto`` and
+``a_r_capture_metadata.proto``. In JSON, the fields have the names of the messages or their
+camel-case forms, as protobuf's ``MessageToJson`` writes them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from cadalign.datasets.photos.protobuf import Field, decode, entries
+from cadalign.errors import DataError, InputError
+from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json
+from cadalign.io.files import reading
+
+_POINT_2D = {1: Field("x", "float"), 2: Field("y", "float"), 3: Field("depth", "float")}
+_KEYPOINT = {1: Field("id", "int"), 3: Field("point_2d", _POINT_2D)}
+_ANNOTATION = {
+    1: Field("object_id", "int"),
+    2: Field("keypoints", _KEYPOINT, repeated=True),
+    3: Field("visibility", "float"),
+}
+_CAMERA = {
+    5: Field("image_resolution_width", "int"),
+    6: Field("image_resolution_height", "int"),
+    8: Field("projection_matrix", "float", repeated=True),
+    9: Field("view_matrix", "float", repeated=True),
+}
+_FRAME = {
+    1: Field("frame_id", "int"),
+    2: Field("annotations", _ANNOTATION, repeated=True),
+    3: Field("camera", _CAMERA),
+}
+_OBJECT = {
+    1: Field("id", "int"),
+    2: Field("category", "text"),
+    4: Field("rotation", "float", repeated=True),
+    5: Field("translation", "float", repeated=True),
+    6: Field("scale", "float", repeated=True),
+}
+_OBJECTS, _FRAMES = 1, 2
+# MessageToJson's name of a field whose name has a digit after an underscore.
+_JSON_NAMES = {"point2d": "point_2d"}
+_CAPITAL = re.compile(r"(?<=[a-z0-9])([A-Z])")
+
+_Three = Annotated[list[Finite], Meta(min_length=3, max_length=3)]
+_Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
+_Sixteen = Annotated[list[Finite], Meta(min_length=16, max_length=16)]
+
+
+class Point2D(ForeignDocument):
+    """A point in the photo, held upright: 0 at its left and upper border, 1 at the others."""
+
+    x: Finite = 0.0
+    y: Finite = 0.0
+
+
+class Keypoint(ForeignDocument):
+    """One of the nine keypoints of a box: its centre, id 0, and its corners."""
+
+    point_2d: Point2D
+    id: int = 0
+
+
+class Annotation(ForeignDocument):
+    """An object in a frame."""
+
+    keypoints: list[Keypoint]
+    object_id: int = 0
+    visibility: Finite = 1.0
+
+
+class ArCamera(ForeignDocument):
+    """ARKit's camera: of the sensor, which lies on its side."""
+
+    image_resolution_width: Annotated[int, Meta(ge=1, le=2**20)]
+    image_resolution_height: Annotated[int, Meta(ge=1, le=2**20)]
+    projection_matrix: _Sixteen
+    view_matrix: _Sixteen
+
+
+class Frame(ForeignDocument):
+    """A frame of the video."""
+
+    camera: ArCamera
+    annotations: list[Any] = msgspec.field(default_factory=list)
+    frame_id: int = 0
+
+
+class WorldObject(ForeignDocument):
+    """An object: a box in the world's coordinates [m]."""
+
+    rotation: _Nine
+    translation: _Three
+    scale: _Three
+    id: int = 0
+    category: str = "object"
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A sequence's objects and frames, not yet checked.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    objects, frames : tuple
+        Messages as bytes, or as parsed JSON.
+    """
+
+    path: Path
+    objects: tuple[Any, ...]
+    frames: tuple[Any, ...]
+
+    def frame(self, number: int) -> Frame:
+        """Decode a frame.
+
+        Raises
+        ------
+        DataError
+            If it is no valid frame.
+        """
+        where = f"frame_annotations[{number}]"
+        found: Frame = self._convert(self.frames[number], _FRAME, Frame, where)
+        return found
+
+    def object(self, number: int) -> WorldObject:
+        """Decode an object; see `frame`."""
+        where = f"objects[{number}]"
+        found: WorldObject = self._convert(self.objects[number], _OBJECT, WorldObject, where)
+        return found
+
+    def _convert(self, message: Any, fields: dict[int, Field], kind: Any, where: str) -> Any:
+        with in_file(self.path):
+            try:
+                data = decode(message, fields) if isinstance(message, bytes) else message
+            except InputError as error:
+                raise DataError(error.what, where=where) from None
+            return convert(data, kind, where)
+
+
+def read_sequence(path: Path) -> Sequence:
+    """Read an annotation file, ``.pbdata`` or ``.json``; its messages are decoded later.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or is no such file.
+    """
+    if path.suffix == ".json":
+        data = _snake_case(read_json(path))
+        if not isinstance(data, dict) or not isinstance(data.get("frame_annotations"), list):
+            raise DataError("there are no frame_annotations", where=str(path))
+        objects = data.get("objects", [])
+        return Sequence(
+            path,
+            tuple(objects if isinstance(objects, list) else ()),
+            tuple(data["frame_annotations"]),
+        )
+    with reading(path):
+        content = path.read_bytes()
+    messages: dict[int, list[bytes]] = {_OBJECTS: [], _FRAMES: []}
+    try:
+        for number, _, value in entries(content):
+            if number in messages and isinstance(value, bytes):
+                messages[number].append(value)
+    except InputError as error:
+        raise DataError(error.what, where=str(path), fix="get it again") from None
+    if not messages[_FRAMES]:
+        raise DataError("there are no frame_annotations", where=str(path))
+    return Sequence(path, tuple(messages[_OBJECTS]), tuple(messages[_FRAMES]))
+
+
+def _snake_case(value: Any) -> Any:
+    """JSON with the names of the messages' fields in the place of their camel-case forms."""
+    if isinstance(value, list):
+        return [_snake_case(each) for each in value]
+    if isinstance(value, dict):
+        return {
+            _JSON_NAMES.get(name, _CAPITAL.sub(_lower, name)): _snake_case(each)
+            for name, each in value.items()
+        }
+    return value
+
+
+def _lower(found: re.Match[str]) -> str:
+    return f"_{found[1].lower()}"

@@ -1,0 +1,238 @@
+"""PASCAL3D+ and ObjectNet3D: objects in photos with viewpoints, and CAD models with anchors.
+
+Xiang et al., "Beyond PASCAL: A Benchmark for 3D Object Detection in the Wild", WACV 2014;
+Xiang et al., "ObjectNet3D: A Large Scale Database for 3D Object Recognition", ECCV 2016.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.mat_files import MatStruct, read_structs
+from cadalign.datasets.photos.pascal3d_cad import PascalCad
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    Photo,
+    PhotoKeypoints,
+    PhotoObject,
+    Truth,
+)
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.io.images import photo_size
+
+ANNOTATIONS = "Annotations"
+# MATLAB counts pixels from 1.
+_FIRST_PIXEL = 1.0
+# The focal length, in pixels, that annotations without one were made with.
+_VIEWPORT = 3000.0
+_VISIBLE = 1
+_CAD_FOLDERS = ("CAD", "CAD/mat", "cad")
+_IMAGE_FOLDERS = ("Images", "images")
+_IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
+_FLAGS = ("truncated", "occluded", "difficult")
+
+
+@dataclass(frozen=True)
+class _Record:
+    """An annotation file, and the category whose objects it annotates; None for all."""
+
+    path: Path
+    category: str | None
+
+
+class Pascal3D(PhotoDataset):
+    """PASCAL3D+, or ObjectNet3D.
+
+    ::
+
+        Annotations/<category>_<source>/<image>.mat    Images/<category>_<source>/<image>.jpg
+        Annotations/<image>.mat                        Images/<image>.JPEG     (ObjectNet3D)
+        CAD/<category>.mat                             CAD/mat/<category>.mat  (ObjectNet3D)
+
+    The focal length of the photos is not known. Viewpoints were annotated under a conventional one
+    (3000 px) and with the principal point at the object: `Truth.camera` is that camera, under
+    which `Truth.cam_from_model` fits the photo. Its rotation counts; lengths have no unit. Objects
+    without a continuous viewpoint (distance 0) have no pose. Anchors that are visible are the
+    keypoints. In PASCAL3D+ only the objects of the folder's category are taken.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder.
+
+    Raises
+    ------
+    DataError
+        If there are no annotations.
+    """
+
+    kind = "PASCAL3D+"
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = Path(root)
+        self._records = tuple(_list_records(folder / ANNOTATIONS))
+        if not self._records:
+            raise DataError(
+                f"there are no {ANNOTATIONS}/*.mat nor {ANNOTATIONS}/*/*.mat",
+                where=str(folder),
+                fix="give the folder of PASCAL3D+ or ObjectNet3D",
+            )
+        names = (
+            record.path.relative_to(folder / ANNOTATIONS).with_suffix("").as_posix()
+            for record in self._records
+        )
+        super().__init__(folder, names)
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        record = self._records[index]
+        found = read_structs(record.path, "record")[0]
+        name = self.names[index]
+        image = find_image(self.root, name)
+        camera = Camera.without_focal(*_size(found, image))
+
+        def read_object(number: int, each: MatStruct) -> PhotoObject | None:
+            category = each.text("class")
+            if record.category not in (None, category):
+                return None
+            return _object(number, category, each, camera, cad_folder(self.root))
+
+        objects, problems = read_each(found.structs("objects"), read_object, where=str(record.path))
+        return Photo(name, image, camera, objects, problems=problems)
+
+
+def find_image(root: Path, name: str) -> Path | None:
+    """Find the image of an annotation, named without its ending; None where it is missing."""
+    for folder in _IMAGE_FOLDERS:
+        for suffix in _IMAGES:
+            path = root / folder / f"{name}{suffix}"
+            if path.is_file():
+                return path
+    return None
+
+
+def cad_folder(root: Path) -> Path | None:
+    """Find the folder of the CAD models, None where there is none."""
+    folders = (root / name for name in _CAD_FOLDERS)
+    return next((folder for folder in folders if any(folder.glob("*.mat"))), None)
+
+
+def cad_model(folder: Path | None, category: str, index: int) -> CadModel | None:
+    """The CAD model of a number from 1; None where the category has no file."""
+    if folder is None or not (folder / f"{category}.mat").is_file():
+        return None
+    return CadModel(
+        f"{category}/{index:02d}", PascalCad(folder / f"{category}.mat", category, index)
+    )
+
+
+def _list_records(folder: Path) -> Iterator[_Record]:
+    for path in sorted(folder.glob("*.mat")):
+        yield _Record(path, None)
+    for path in sorted(folder.glob("*/*.mat")):
+        yield _Record(path, path.parent.name.rpartition("_")[0] or None)
+
+
+def _size(record: MatStruct, image: Path | None) -> tuple[int, int]:
+    if image is not None:
+        return photo_size(image)
+    size = record.struct("size")
+    if size is not None:
+        return int(size.number("width")), int(size.number("height"))
+    try:
+        width, height = record.array("imgsize").ravel()[:2]
+    except (InputError, ValueError):
+        raise DataError(
+            "the image is missing, and its size is unknown", where=record.where
+        ) from None
+    return int(width), int(height)
+
+
+def _object(
+    number: int, category: str, found: MatStruct, camera: Camera, cads: Path | None
+) -> PhotoObject:
+    index = int(found.number("cad_index", default=0.0))
+    corners = found.array("bbox").ravel() - _FIRST_PIXEL
+    if len(corners) != 4:
+        raise InputError(f"{len(corners)} numbers are not a rectangle", where="bbox")
+    flags = (name for name in _FLAGS if found.number(name, default=0.0))
+    viewpoint = found.struct("viewpoint")
+    return PhotoObject(
+        object_id=str(number),
+        category=category,
+        truth=Truth() if viewpoint is None else _truth(viewpoint, camera),
+        keypoints=_anchors(found.struct("anchors")),
+        model=cad_model(cads, category, index) if index >= 1 else None,
+        bbox=corners,
+        flags=frozenset(flags),
+    )
+
+
+def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
+    """The anchors that are visible."""
+    marked: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {}
+    for name in () if anchors is None else anchors.names:
+        each = None if anchors is None else anchors.struct(name)
+        if each is None or each.number("status", default=0.0) != _VISIBLE:
+            continue
+        location = each.array("location", 2)
+        if len(location) == 1:
+            marked[name] = location[0] - _FIRST_PIXEL
+    if not marked:
+        return None
+    points = np.array(list(marked.values()))
+    return PhotoKeypoints(points, tuple(marked), np.ones(len(points), dtype=bool))
+
+
+def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
+    """The pose, as PASCAL3D+'s ``project_3d.m`` projects the model.
+
+    The camera stands at azimuth, elevation and distance around the model, looks at its origin along
+    -z with y up, and is then turned by theta about its axis.
+    """
+    distance = viewpoint.number("distance", default=0.0)
+    if distance == 0:
+        return Truth()
+    azimuth, elevation, theta = (
+        np.radians(viewpoint.number(name)) for name in ("azimuth", "elevation", "theta")
+    )
+    focal = viewpoint.number("focal", default=1.0) * viewpoint.number("viewport", _VIEWPORT)
+    center = distance * np.array(
+        [
+            np.cos(elevation) * np.sin(azimuth),
+            -np.cos(elevation) * np.cos(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    tilt = elevation - np.pi / 2
+    upright = _about_x(tilt) @ _about_z(-azimuth)
+    rotation = OPENGL_AXES[:, None] * (_about_z(theta) @ upright)
+    annotated = Camera(
+        camera.width,
+        camera.height,
+        focal,
+        focal,
+        viewpoint.number("px") - _FIRST_PIXEL,
+        viewpoint.number("py") - _FIRST_PIXEL,
+    )
+    pose = Alignment(rotation, -rotation @ center, np.ones(3))
+    return Truth(cam_from_model=pose, camera=annotated)
+
+
+def _about_x(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+
+
+def _about_z(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])

@@ -1,0 +1,330 @@
+"""One photo of a data set: image, camera, and the objects in it with their truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
+from cadalign.datasets.meshes.load import load_mesh
+from cadalign.errors import DataError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.images import ByteImage, open_photo, read_photo
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoKeypoints:
+    """The keypoints of an object that are marked in a photo.
+
+    Parameters
+    ----------
+    points_2d : (k, 2) float
+        Pixels; integers are pixel centres.
+    names : tuple of k str
+        What each one is called: the model's keypoint of the same name is the same point.
+    visible : (k,) bool
+        False for a keypoint that is marked though something hides it.
+    scores : (k,) float, optional
+        How sure a detector is of each.
+
+    Raises
+    ------
+    DataError
+        If lengths don't match.
+    InputError
+        If a value is not finite.
+    """
+
+    points_2d: FloatArray
+    names: tuple[str, ...]
+    visible: BoolArray
+    scores: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        points = as_points(self.points_2d, name="keypoints", dimension=2)
+        visible = np.asarray(self.visible, dtype=bool)
+        count = len(points)
+        if len(self.names) != count or visible.shape != (count,):
+            what = f"{count} keypoints, {len(self.names)} names, {len(visible)} visibilities"
+            raise DataError(what, where="keypoints")
+        if self.scores is not None:
+            scores = as_floats(self.scores, name="scores", shape=(count,))
+            object.__setattr__(self, "scores", scores)
+        object.__setattr__(self, "points_2d", points)
+        object.__setattr__(self, "visible", visible)
+
+    def __len__(self) -> int:
+        return len(self.points_2d)
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPoints:
+    """Keypoints of a model.
+
+    Parameters
+    ----------
+    names : tuple of k str
+        What each one is called; no name occurs twice.
+    xyz : (k, 3) float
+        Where they lie [model units].
+    """
+
+    names: tuple[str, ...]
+    xyz: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+class ModelSource(Protocol):
+    """Where a CAD model's mesh and keypoints are read from, each when it is asked for."""
+
+    def load_mesh(self) -> Mesh | None:
+        """Read the mesh; None where there is none."""
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """Read the named keypoints; None where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFiles:
+    """A model whose mesh is a file of its own.
+
+    Parameters
+    ----------
+    mesh_path : Path or None
+        The mesh file, None where there is none.
+    keypoints : NamedPoints, optional
+        The keypoints that the annotation gives.
+    """
+
+    mesh_path: Path | None
+    keypoints: NamedPoints | None = None
+
+    def load_mesh(self) -> Mesh | None:
+        """Read the mesh file."""
+        return None if self.mesh_path is None else load_mesh(self.mesh_path)
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """The annotation's keypoints."""
+        return self.keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class CadModel:
+    """The CAD model that an object is aligned with, read when it is asked for.
+
+    Parameters
+    ----------
+    model_id : str
+        The model's id in its data set.
+    source : ModelSource
+        Where mesh and keypoints are read from.
+    bounds : (2, 3) float, optional
+        The bounding box's lowest and highest corner, where the annotation gives it
+        [model units].
+    diameter : float, optional
+        The largest distance of two of the model's points, where the data set gives it.
+    """
+
+    model_id: str
+    source: ModelSource
+    bounds: FloatArray | None = None
+    diameter: float | None = None
+
+    def load_mesh(self) -> Mesh:
+        """Read the mesh.
+
+        Raises
+        ------
+        DataError
+            If there is none, or it cannot be read.
+        """
+        mesh = self.source.load_mesh()
+        if mesh is None:
+            raise DataError("there is no mesh of this model", where=f"model {self.model_id}")
+        return mesh
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """Read the named keypoints; None where the data set has none.
+
+        Raises
+        ------
+        DataError
+            If they cannot be read.
+        """
+        return self.source.load_keypoints()
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is known of an object's pose; anything may be missing.
+
+    Parameters
+    ----------
+    cam_from_model : Alignment, optional
+        Pose and stretch of the CAD model in the camera frame, where all of it is annotated.
+    box : Box, optional
+        The object's oriented box in the camera frame.
+    camera : Camera, optional
+        The camera that the pose was annotated with, where it is not the photo's: the pose fits the
+        photo under this camera, and its translation and focal length are conventions.
+    metres : float, optional
+        Length of one unit of the camera frame [m]; None where the size is not known.
+    """
+
+    cam_from_model: Alignment | None = None
+    box: Box | None = None
+    camera: Camera | None = None
+    metres: float | None = None
+
+    @property
+    def rotation(self) -> FloatArray | None:
+        """The rotation from model to camera, (3, 3) float; None where it is not known."""
+        if self.cam_from_model is not None:
+            return self.cam_from_model.rotation
+        return None if self.box is None else self.box.rotation
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoObject:
+    """One object in a photo.
+
+    Parameters
+    ----------
+    object_id : str
+        The object's name within its photo.
+    category : str
+        The data set's name of its category.
+    truth : Truth
+        What is known of its pose.
+    keypoints : PhotoKeypoints, optional
+        Keypoints marked in the photo.
+    model : CadModel, optional
+        The CAD model annotated for it.
+    symmetry : Symmetry
+        Motions that take the model to itself.
+    mask_path : Path, optional
+        An image of the object's pixels; see `read_mask`.
+    bbox : (4,) float, optional
+        Left, top, right and bottom of its rectangle in the photo [px].
+    visible_fraction : float, optional
+        Share of its silhouette that is seen, 0 to 1.
+    flags : frozenset of str
+        Some of "truncated", "occluded", "difficult".
+    """
+
+    object_id: str
+    category: str
+    truth: Truth = field(default_factory=Truth)
+    keypoints: PhotoKeypoints | None = None
+    model: CadModel | None = None
+    symmetry: Symmetry = field(default_factory=Symmetry.none)
+    mask_path: Path | None = None
+    bbox: FloatArray | None = None
+    visible_fraction: float | None = None
+    flags: frozenset[str] = frozenset()
+
+    def read_mask(self) -> BoolArray:
+        """Read the object's pixels, (h, w) bool.
+
+        Raises
+        ------
+        DataError
+            If there is no mask, or it cannot be read.
+        """
+        if self.mask_path is None:
+            raise DataError("this object has no mask", where=f"object {self.object_id}")
+        with open_photo(self.mask_path) as image:
+            return np.asarray(image.convert("L")) > 0
+
+
+class ImageReader(Protocol):
+    """An image that is no file of its own, such as a frame of a video."""
+
+    def read(self) -> ByteImage:
+        """Read the pixels, (h, w, 3) uint8."""
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """A depth image file.
+
+    Parameters
+    ----------
+    path : Path
+        A 16-bit PNG.
+    scale : float
+        Units of the camera frame that one step of its values is worth.
+    """
+
+    path: Path
+    scale: float
+
+    def read(self) -> FloatArray:
+        """Read the camera's z at each pixel, (h, w) float; 0 where it was not measured.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read.
+        """
+        with open_photo(self.path) as image:
+            values = np.asarray(image)
+        if values.ndim != 2:
+            raise DataError(f"{values.ndim} dimensions are not a depth image", where=str(self.path))
+        return np.asarray(values, dtype=np.float64) * self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """One photo with the objects in it.
+
+    Parameters
+    ----------
+    name : str
+        The photo's name within its data set; no other has it.
+    image : Path or ImageReader or None
+        The image, None where it is not there.
+    camera : Camera or None
+        Its camera, `Camera.without_focal` where the focal length is unknown; None where not even
+        the image's size is.
+    objects : tuple of PhotoObject
+        The objects whose annotation could be read.
+    depth : DepthImage, optional
+        The photo's depth image.
+    problems : tuple of DataError
+        Why further objects of this photo could not be read.
+    """
+
+    name: str
+    image: Path | ImageReader | None
+    camera: Camera | None
+    objects: tuple[PhotoObject, ...]
+    depth: DepthImage | None = None
+    problems: tuple[DataError, ...] = ()
+
+    def read_image(self) -> npt.NDArray[np.uint8]:
+        """Read the photo's pixels, (h, w, 3) uint8.
+
+        Raises
+        ------
+        DataError
+            If there is no image, or it cannot be read.
+        """
+        if self.image is None:
+            raise DataError("the image of this photo is not there", where=self.name)
+        return read_photo(self.image) if isinstance(self.image, Path) else self.image.read()
+
+
+def existing(path: Path) -> Path | None:
+    """The path if there is such a file, else None."""
+    return path if path.is_file() else None

@@ -1,0 +1,89 @@
+"""A file of posed photos: `poses.json` names each photo's camera, model and pose.
+
+::
+
+    {"handal/000001.jpg": {"model": "handal/obj_000010.ply",
+                           "cam_from_model": 4 x 4 rows of numbers,
+                           "camera": {"fx", "fy", "cx", "cy", "width", "height"}}}
+
+Paths are relative to the file; models and translations are in millimetres, as in BOP.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    ModelFiles,
+    Photo,
+    PhotoObject,
+    Truth,
+    existing,
+)
+from cadalign.datasets.photos.records import parse, read_table
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.documents import Finite, ForeignDocument, PathText, Positive
+
+POSES = "poses.json"
+_Row = tuple[Finite, Finite, Finite, Finite]
+
+
+class _Camera(ForeignDocument):
+    fx: Positive
+    fy: Positive
+    cx: Finite
+    cy: Finite
+    width: Positive
+    height: Positive
+
+
+class _Entry(ForeignDocument):
+    model: PathText
+    cam_from_model: tuple[_Row, _Row, _Row, _Row]
+    camera: _Camera
+
+
+class PosedPhotos(PhotoDataset):
+    """Photos of one object each, as ``poses.json`` lists them; see the module's documentation.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder of ``poses.json``.
+
+    Raises
+    ------
+    DataError
+        If the file is missing or cannot be read.
+    """
+
+    kind = "posed photos (BOP's units)"
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        self._table = read_table(Path(root, POSES))
+        super().__init__(Path(root), self._table)
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        name = self.names[index]
+        entry: _Entry = parse(self._table[name], _Entry, path=self.root / POSES, where=name)
+        found = entry.camera
+        size = int(found.width), int(found.height)
+        camera = Camera(*size, found.fx, found.fy, found.cx, found.cy)
+        matrix = np.array(entry.cam_from_model)
+        alignment = Alignment(nearest_rotation(matrix[:3, :3]), matrix[:3, 3], np.ones(3))
+        model = Path(entry.model)
+        shown = PhotoObject(
+            object_id="0",
+            category=model.stem,
+            truth=Truth(cam_from_model=alignment, metres=1e-3),
+            model=CadModel(model.stem, ModelFiles(existing(self.root / model))),
+        )
+        return Photo(name, existing(self.root / name), camera, (shown,))

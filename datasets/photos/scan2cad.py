@@ -1,0 +1,286 @@
+"""Scan2CAD: ShapeNet models aligned, with nine degrees of freedom, to objects in ScanNet scenes.
+
+Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 2019.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta, Raw
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets.models.categories import name_of_synset
+from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    ModelFiles,
+    NamedPoints,
+    Photo,
+    PhotoKeypoints,
+    PhotoObject,
+    Truth,
+    existing,
+)
+from cadalign.datasets.photos.records import parse, read_list
+from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames
+from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
+
+FULL = "full_annotations.json"
+# One scan's annotations, as in the repository and its derivatives.
+_SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
+_FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
+_MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
+_MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
+_FOLDS: dict[str, int | None] = {
+    "__SYM_NONE": 1,
+    "__SYM_ROTATE_UP_2": 2,
+    "__SYM_ROTATE_UP_4": 4,
+    "__SYM_ROTATE_UP_INF": None,
+}
+_UP = (0.0, 1.0, 0.0)
+# Corners nearer than this are as good as behind the camera [m].
+_NEAR = 0.05
+
+
+class _Trs(ForeignDocument):
+    translation: Point3
+    rotation: tuple[Finite, Finite, Finite, Finite]
+    scale: tuple[Positive, Positive, Positive]
+
+    def alignment(self) -> Alignment:
+        rotation = rotation_from_quat_wxyz(np.array(self.rotation))
+        return Alignment(rotation, np.array(self.translation), np.array(self.scale))
+
+
+class _Points(ForeignDocument):
+    position: list[Finite]
+
+    def xyz(self) -> FloatArray:
+        if len(self.position) % 3:
+            raise InputError(f"{len(self.position)} numbers are not x, y, z of points")
+        return np.reshape(self.position, (-1, 3)).astype(float)
+
+
+class _Model(ForeignDocument):
+    trs: _Trs
+    id_cad: Id
+    catid_cad: Id
+    sym: str = "__SYM_NONE"
+    bbox: tuple[Positive, Positive, Positive] | None = None
+    center: Point3 | None = None
+    keypoints_cad: _Points | None = None
+    keypoints_scan: _Points | None = None
+
+
+class _Head(ForeignDocument):
+    id_scan: Annotated[str, Meta(pattern=r"\Ascene[^/\\\0]+\Z")]
+
+
+class _Scan(_Head):
+    trs: _Trs
+    aligned_models: list[Any]
+
+
+@dataclass(frozen=True)
+class _Record:
+    """A frame, and the scan's entry in the annotations."""
+
+    entry: int
+    frame: ScanNetFrame
+
+
+class Scan2CAD(PhotoDataset):
+    """Frames of ScanNet scenes with the CAD models that annotators aligned.
+
+    Read are the official ``full_annotations.json``, or one scan's annotations in the same form
+    (``annot.json``, ``samples/annot.json``, ``example_annotation.json``); ScanNet's frames as
+    `cadalign.datasets.photos.scannet.list_frames` describes; models as
+    ``<synset>/<id>/models/model_normalized.obj`` or without the synset's folder.
+
+    The truth is complete: pose and stretch along each axis, in metres. Keypoints are the pairs
+    of the annotators: on the CAD model, and on the scan, projected into the photo. Whether
+    something hides them is not known. A photo holds the objects whose box reaches into the
+    image. A model's symmetry axis runs through the centre of its box.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder of the annotations, or the annotation file itself.
+    scannet : str or path-like, optional
+        The folder of ScanNet's scenes; by default ``scans``, ``scannet`` and the like below
+        ``root``.
+    shapenet : str or path-like, optional
+        ShapeNetCore.v2; by default ``ShapeNetCore.v2``, ``shapenet``, ``Meshes`` and the like.
+    every : int
+        Take each scene's frames 0, every, 2 every and so on: a scene has thousands.
+
+    Raises
+    ------
+    DataError
+        If there are no annotations, they cannot be read, or there is no frame of any scan.
+    """
+
+    kind = "Scan2CAD"
+
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        *,
+        scannet: str | os.PathLike[str] | None = None,
+        shapenet: str | os.PathLike[str] | None = None,
+        every: int = 1,
+    ) -> None:
+        folder, self.annotations = _annotation_file(Path(root))
+        self._entries = read_list(self.annotations)
+        frames = [folder / name for name in _FRAME_FOLDERS] if scannet is None else [Path(scannet)]
+        models = [folder / name for name in _MODEL_FOLDERS]
+        self._models = models if shapenet is None else [Path(shapenet)]
+        self._records: list[_Record] = []
+        names, bad = [], {}
+        for number, entry in enumerate(self._entries):
+            try:
+                scene = self._parse(number, entry, _Head).id_scan
+            except DataError as error:
+                bad[f"[{number}]"] = error
+                continue
+            for frame in list_frames(frames, scene)[::every]:
+                self._records.append(_Record(number, frame))
+                names.append(f"{scene}/{frame.frame_id}")
+        super().__init__(folder, names)
+        self.problems |= bad
+        if not names:
+            raise DataError(
+                f"no frame of the {len(self._entries) - len(bad)} annotated scans is here",
+                where=str(self.annotations),
+                fix="give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)",
+            )
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        record = self._records[index]
+        scan = self._parse(record.entry, self._entries[record.entry], _Scan)
+        camera = record.frame.camera()
+        cam_from_world = record.frame.cam_from_scan() @ _inverse(scan.trs.alignment())
+
+        def read_object(number: int, model: Any) -> PhotoObject | None:
+            found: _Model = convert(model, _Model)
+            return _object(str(number), found, cam_from_world, camera, self._models)
+
+        objects, problems = read_each(
+            scan.aligned_models, read_object, where=f"{self.annotations}, {self.names[index]}"
+        )
+        image = record.frame.image_path
+        return Photo(self.names[index], image, camera, objects, problems=problems)
+
+    def _parse(self, number: int, entry: Raw, kind: Any) -> Any:
+        return parse(entry, kind, path=self.annotations, where=f"[{number}]")
+
+
+def _object(
+    object_id: str,
+    found: _Model,
+    cam_from_world: Alignment,
+    camera: Camera,
+    folders: Iterable[Path],
+) -> PhotoObject | None:
+    """An object of the scan as a photo shows it; None where its box is not in the image."""
+    world_from_model = found.trs.alignment()
+    cam_from_model = cam_from_world @ world_from_model
+    if found.sym not in _FOLDS:
+        known = ", ".join(_FOLDS)
+        raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
+    center = np.array(found.center or (0.0, 0.0, 0.0))
+    bounds = box = bbox = None
+    if found.bbox is not None:
+        half = np.array(found.bbox)
+        bounds = np.array([center - half, center + half])
+        box = Box.from_model(bounds, cam_from_model)
+        bbox = _rectangle(box, camera)
+        if bbox is None:
+            return None
+    mesh = _mesh_path(folders, found.catid_cad, found.id_cad)
+    keypoints, points = _keypoints(found, world_from_model, cam_from_world, camera)
+    return PhotoObject(
+        object_id=object_id,
+        category=name_of_synset(found.catid_cad),
+        truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
+        keypoints=keypoints,
+        model=CadModel(found.id_cad, ModelFiles(mesh, points), bounds=bounds),
+        symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),
+        bbox=bbox,
+    )
+
+
+def _keypoints(
+    found: _Model, world_from_model: Alignment, cam_from_world: Alignment, camera: Camera
+) -> tuple[PhotoKeypoints | None, NamedPoints | None]:
+    """The annotators' pairs: on the scan as pixels, where in the image; and on the CAD model."""
+    if found.keypoints_cad is None or found.keypoints_scan is None:
+        return None, None
+    on_model, on_scan = found.keypoints_cad.xyz(), found.keypoints_scan.xyz()
+    if len(on_model) != len(on_scan):
+        what = f"{len(on_scan)} points, but keypoints_cad has {len(on_model)}"
+        raise InputError(what, where="keypoints_scan")
+    names = tuple(str(number) for number in range(len(on_model)))
+    points = NamedPoints(names, world_from_model.inverse(on_model))
+    pixels = camera.project_where_ahead(cam_from_world.apply(on_scan))
+    inside = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
+    seen = tuple(name for name, is_seen in zip(names, inside, strict=True) if is_seen)
+    marked = PhotoKeypoints(pixels[inside], seen, np.ones(len(seen), dtype=bool))
+    return (marked if seen else None), points
+
+
+def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
+    """The image's part of the rectangle around a box; None where there is no such part."""
+    corners = box.corners[box.corners[:, 2] > _NEAR]
+    if box.center[2] <= 0 or not len(corners):
+        return None
+    pixels = camera.project(corners)
+    low = np.maximum(pixels.min(axis=0), -0.5)
+    high = np.minimum(pixels.max(axis=0), np.array([camera.width, camera.height]) - 0.5)
+    return np.concatenate([low, high]) if (low < high).all() else None
+
+
+def _mesh_path(folders: Iterable[Path], synset: str, model_id: str) -> Path | None:
+    for folder in folders:
+        for place in (folder / synset / model_id, folder / model_id):
+            found = next((place / file for file in _MESH_FILES if existing(place / file)), None)
+            if found is not None:
+                return found
+    return None
+
+
+def _inverse(alignment: Alignment) -> Alignment:
+    """The inverse of an alignment with equal scales."""
+    scale = alignment.scale
+    if np.ptp(scale) > 1e-9 * scale.max():
+        raise InputError(f"the scan has unequal scales {scale.tolist()}", where="trs.scale")
+    rotation = alignment.rotation.T
+    shift = -rotation @ alignment.translation / scale[0]
+    return Alignment(rotation, shift, 1 / scale)
+
+
+def _annotation_file(path: Path) -> tuple[Path, Path]:
+    """The folder and the annotation file that a path means."""
+    if path.is_file():
+        return path.parent, path
+    for name in (FULL, *_SAMPLES):
+        if (path / name).is_file():
+            return path, path / name
+    raise DataError(
+        f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here",
+        where=str(path),
+        fix="give the folder of Scan2CAD's annotations",
+    )

@@ -1,0 +1,100 @@
+"""Frames of ScanNet scenes: photos with intrinsics and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.datasets.photos.records import read_matrix
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.images import photo_size
+
+# The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
+_INTRINSICS = (Path("intrinsic", "intrinsic_color.txt"), Path("intrinsics_color.txt"))
+_IMAGES = (".jpg", ".jpeg", ".png")
+
+
+@dataclass(frozen=True)
+class ScanNetFrame:
+    """One frame of a ScanNet scene.
+
+    Parameters
+    ----------
+    frame_id : str
+        Its number, as its file writes it.
+    image_path, pose_path, intrinsics_path : Path
+        The photo, the camera's pose (4 x 4, the scan's coordinates from the camera's) and the
+        intrinsics (4 x 4) of photos of this size.
+    """
+
+    frame_id: str
+    image_path: Path
+    pose_path: Path
+    intrinsics_path: Path
+
+    def camera(self) -> Camera:
+        """Read the intrinsics; integer pixels are taken for pixel centres."""
+        matrix = read_matrix(self.intrinsics_path, (4, 4))
+        width, height = photo_size(self.image_path)
+        (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
+        try:
+            return Camera(width, height, fx, fy, cx, cy)
+        except InputError as error:
+            raise DataError(error.what, where=str(self.intrinsics_path)) from None
+
+    def cam_from_scan(self) -> Alignment:
+        """Read the pose: the camera's coordinates from the scan's [m].
+
+        Raises
+        ------
+        DataError
+            If it is no pose, such as ScanNet's -inf of a frame whose tracking was lost.
+        """
+        pose = read_matrix(self.pose_path, (4, 4))
+        try:
+            rotation = nearest_rotation(pose[:3, :3]).T
+        except InputError as error:
+            raise DataError(error.what, where=str(self.pose_path)) from None
+        return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
+
+
+def list_frames(folders: Iterable[Path], scene: str) -> tuple[ScanNetFrame, ...]:
+    """List a scene's frames, in the first folder that has any, in order of their numbers.
+
+    Two layouts are known::
+
+        <scene>/color/<frame>.jpg, pose/<frame>.txt, intrinsic/intrinsic_color.txt
+        scannet_<scene's number>_<frame>.jpg, ..._<frame>_pose.txt, scannet_<...>_intr.txt
+    """
+    for folder in folders:
+        found = (*_in_scene_folder(folder / scene), *_beside_each_other(folder, scene))
+        if found:
+            return tuple(sorted(found, key=lambda frame: (len(frame.frame_id), frame.frame_id)))
+    return ()
+
+
+def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
+    intrinsics = next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
+    if intrinsics is None:
+        return
+    for image in (folder / "color").glob("*"):
+        if image.suffix.lower() in _IMAGES:
+            yield ScanNetFrame(image.stem, image, folder / "pose" / f"{image.stem}.txt", intrinsics)
+
+
+def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
+    prefix = f"scannet_{scene.removeprefix('scene')}_"
+    intrinsics = folder / f"{prefix}intr.txt"
+    if not intrinsics.is_file():
+        return
+    for pose in folder.glob(f"{prefix}*_pose.txt"):
+        stem = pose.name.removesuffix("_pose.txt")
+        images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
+        image = next((path for path in images if path.is_file()), folder / f"{stem}.jpg")
+        yield ScanNetFrame(stem.removeprefix(prefix), image, pose, intrinsics)

@@ -1,0 +1,217 @@
+"""`cadalign fit` with several views and evidence beyond keypoints: numbers, table, pictures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from support.refusals import refusal_line
+from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
+
+from cadalign import AlignResult, Model, Size, View, align
+from cadalign.cli import main
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.render.drawing.overlay import EST_COLOR
+
+POINTS = keypoints()
+TRUTH = truth_of()
+UP = TRUTH.rotation[:, 1]
+
+
+def observed(angle: float = 0.0, rows: slice = slice(None), **evidence: Any) -> ObservedImage:
+    """An image of some keypoints from a place around the object, with half a pixel of noise."""
+    noise = np.random.default_rng(int(angle)).normal(0, 0.5, POINTS.shape[:1] + (2,))
+    pixels = CAMERA.project(in_camera(POINTS, TRUTH, around(angle))) + noise
+    ids = np.arange(len(POINTS))[rows]
+    return ObservedImage(
+        POINTS[rows], pixels[rows], CAMERA, semantic_ids=ids, evidence=ImageEvidence(**evidence)
+    )
+
+
+def write(folder: Path, *images: ObservedImage, **fields: Any) -> Path:
+    first, *others = images
+    Observation(**vars(first), others=tuple(others), **fields).save(folder / "a.json")
+    return folder / "a.json"
+
+
+def result_in(folder: Path) -> AlignResult:
+    return AlignResult.from_dict(json.loads((folder / "a_fit" / "fit.json").read_text()))
+
+
+def test_gravity_and_size_are_used_as_by_align(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    height = float(np.ptp(POINTS[:, 1]) * TRUTH.scale[1])
+    path = write(tmp_path, observed(up=UP, up_sigma_deg=2.0), size=KnownSize(height=height))
+    assert main(["fit", str(path)]) == 0
+    view = View(CAMERA, observed().points_2d, up=UP, up_sigma_deg=2.0)
+    expected = align(Model(points_3d=POINTS), view, size=Size(height=height))
+    assert result_in(tmp_path).alignment == expected.alignment
+    out = capsys.readouterr().out
+    assert out.startswith(f"{expected}\n")
+    lines = out[len(str(expected)) :].strip("\n").split("\n")
+    assert [line.strip().split("  ")[0] for line in lines] == [
+        "standard deviations",
+        "with all evidence",
+        "without views[0].points_2d",
+        "without views[0].up",
+        "without size",
+    ]
+    assert lines[0].split()[2:] == ["rotation", "position", "x", "y", "z"]
+    assert lines[4].split()[-3:] == ["unknown"] * 3  # one image does not tell the size
+
+
+def test_json_lists_the_contributions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path, observed(up=UP))
+    assert main(["fit", str(path), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data == json.loads((tmp_path / "a_fit" / "fit.json").read_text())
+    names = [piece["name"] for piece in data["contributions"]]
+    assert names == ["views[0].points_2d", "views[0].up"]
+    without_up = data["contributions"][1]["std_without"]
+    assert without_up["rotation_deg"] > data["std"]["rotation_deg"]
+    assert data["contributions"][0]["std_without"]["rotation_deg"] is None
+
+
+def test_views_of_a_rig_share_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places = (0.0, 20.0, 40.0)
+    rows = (slice(0, 6), slice(3, 9), slice(9, 10))
+    images = [
+        observed(angle, row, cam_from_rig=around(angle))
+        for angle, row in zip(places, rows, strict=True)
+    ]
+    path = write(tmp_path, *images)
+    assert main(["fit", str(path), "--sigma", "0.5"]) == 0
+    found = result_in(tmp_path)
+    views = [
+        View(CAMERA, image.points_2d, ids=range(10)[row], sigma=0.5, cam_from_rig=around(angle))
+        for image, angle, row in zip(images, places, rows, strict=True)
+    ]
+    assert found.alignment == align(Model(points_3d=POINTS), views).alignment
+    np.testing.assert_allclose(found.alignment.scale, TRUTH.scale, rtol=0.03)
+    names = ["overlay.png", "overlay_1.png", "overlay_2.png"]
+    assert sorted(each.name for each in (tmp_path / "a_fit").iterdir()) == ["fit.json", *names]
+    pictures = [cv2.imread(str(tmp_path / "a_fit" / name)) for name in names]
+    for picture in pictures:
+        assert picture is not None
+        near = np.abs(picture[..., ::-1].astype(int) - EST_COLOR).max(axis=2) < 40
+        assert near.sum() > 20
+    assert (pictures[0] != pictures[1]).any()
+    captured = capsys.readouterr()
+    assert "without views[2].points_2d" in captured.out
+    assert f"Pictures: {tmp_path / 'a_fit' / 'overlay.png'}, " in captured.err
+
+
+def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) -> None:
+    images = [replace(observed(angle), semantic_ids=None) for angle in (0.0, 25.0)]
+    images[1] = replace(
+        images[1], points_3d=images[1].points_3d[::-1], points_2d=images[1].points_2d[::-1]
+    )
+    assert main(["fit", str(write(tmp_path, *images))]) == 0
+    views = [View(CAMERA, observed(angle).points_2d) for angle in (0.0, 25.0)]
+    expected = align(Model(points_3d=POINTS), views).alignment
+    found = result_in(tmp_path).alignment
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-6)
+    np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-6)
+
+
+def test_depth_image_is_read_with_its_scale(tmp_path: Path) -> None:
+    depth = in_camera(POINTS, TRUTH, np.eye(4))[:, 2]
+    image = np.zeros((480, 640), dtype=np.uint16)
+    for (u, v), value in zip(observed().points_2d.round().astype(int), depth, strict=True):
+        image[v - 4 : v + 5, u - 4 : u + 5] = round(1000 * value)
+    cv2.imwrite(str(tmp_path / "depth.png"), image)
+    path = write(
+        tmp_path, observed(depth=tmp_path / "depth.png", depth_scale=0.001, depth_sigma=0.005)
+    )
+    assert main(["fit", str(path)]) == 0
+    np.testing.assert_allclose(result_in(tmp_path).alignment.scale, TRUTH.scale, rtol=0.05)
+
+
+def test_depths_of_keypoints_are_used(tmp_path: Path) -> None:
+    depths = in_camera(POINTS, TRUTH, np.eye(4))[:, 2]
+    depths[3:] = np.nan
+    path = write(tmp_path, replace(observed(), depths=depths))
+    assert main(["fit", str(path)]) == 0
+    found = result_in(tmp_path).alignment
+    expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d, depth=depths))
+    assert found == expected.alignment
+
+
+# --- refusals ----------------------------------------------------------------------------------
+
+
+def test_mask_of_another_size_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((6, 8), 255, dtype=np.uint8))
+    path = write(tmp_path, observed(), observed(25.0, mask=tmp_path / "mask.png"))
+    assert refusal_line(capsys, "fit", path).startswith(
+        f"{path}: views[1].mask: the mask is 8 x 6, the camera 640 x 480; "
+    )
+
+
+def test_image_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, observed(depth=tmp_path / "none.png"))
+    assert f"{tmp_path / 'none.png'}: no such file" in refusal_line(capsys, "fit", path)
+
+
+def test_pose_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(
+        tmp_path, observed(cam_from_rig=np.eye(4)), observed(25.0, cam_from_rig=2 * np.eye(4))
+    )
+    assert refusal_line(capsys, "fit", path).startswith(
+        f"{path}: views[1].cam_from_rig: not a rigid motion; "
+    )
+
+
+def test_motion_of_some_views_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, observed(cam_from_rig=np.eye(4)), observed(25.0))
+    assert refusal_line(capsys, "fit", path).startswith(
+        f"{path}: views[1].cam_from_rig: only some views have a known pose"
+    )
+
+
+def test_one_keypoint_at_two_points_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = replace(observed(25.0), points_3d=POINTS + [[0, 0, 1e-3]])
+    path = write(tmp_path, observed(), moved)
+    assert refusal_line(capsys, "fit", path) == (
+        f"{path}: views[1].keypoints[0].xyz: differs from that of keypoint 0 in a view before; "
+        "give the same point of the model"
+    )
+
+
+@pytest.mark.parametrize(
+    "flags", [["--similar"], ["--focal", "known"], ["--no-exif"], ["--method", "aepnp"]]
+)
+def test_options_without_effect_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
+) -> None:
+    path = write(tmp_path, observed(up=UP))
+    assert refusal_line(capsys, "fit", path, *flags) == (
+        f"{flags[0]}: has no effect together with the file's up; leave out one of the two"
+    )
+
+
+def test_unknown_focal_length_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, observed(up=UP))
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"camera": {"width": 640, "height": 480}}))
+    assert refusal_line(capsys, "fit", path).startswith(
+        f"{path}: camera: the focal length is unknown, and is not estimated together with the "
+        "file's up; "
+    )

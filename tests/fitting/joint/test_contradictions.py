@@ -1,0 +1,101 @@
+"""Warnings that name the piece of evidence which contradicts the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.scenes import around, in_camera, keypoints, rig, seen, truth_of, turned
+
+from cadalign import Model, Size, View, align
+
+SEEDS = 40
+Case = tuple[list[View], Size | None]
+
+
+def wrong_motion(points: np.ndarray, rng: np.random.Generator) -> Case:
+    """Four views, the third of which was taken from elsewhere than its pose says."""
+    angles = [-30, -10, 10, 30]
+    views = rig(points, truth_of(), angles, rng)
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(np.radians(5) * _unit(rng)).as_matrix()
+    error[:3, 3] = 0.2 * _unit(rng)
+    views[2] = View(views[2].camera, views[2].points_2d, cam_from_rig=error @ views[2].cam_from_rig)
+    return views, None
+
+
+def wrong_depth(points: np.ndarray, rng: np.random.Generator) -> Case:
+    views = rig(points, truth_of(), [0, 20, 40], rng)
+    depth = in_camera(points, truth_of(), np.eye(4))[:, 2]
+    noise = 1 + 0.005 * rng.normal(size=len(depth))
+    told = {"depth": 1.05 * depth * noise, "depth_sigma": 0.005}
+    views[0] = View(views[0].camera, views[0].points_2d, cam_from_rig=np.eye(4), **told)
+    return views, None
+
+
+def wrong_gravity(points: np.ndarray, rng: np.random.Generator) -> Case:
+    up = turned(truth_of().rotation[:, 1], 20, rng)
+    return [seen(points, truth_of((1.0, 0.7, 1.5)), np.eye(4), rng, up=up)], None
+
+
+def consistent(points: np.ndarray, rng: np.random.Generator) -> Case:
+    truth = truth_of()
+    views = rig(points, truth, [-20, 0, 20], rng)
+    depth = in_camera(points, truth, around(-20))[:, 2]
+    noisy = depth * (1 + 0.01 * rng.normal(size=len(depth)))
+    axes = np.linalg.svd((around(-20)[:3, :3] @ truth.rotation[:, 1])[None])[2][1:]
+    up = around(-20)[:3, :3] @ truth.rotation[:, 1] + np.radians(rng.normal(size=2)) @ axes
+    views[0] = View(
+        views[0].camera, views[0].points_2d, cam_from_rig=around(-20), depth=noisy, up=up
+    )
+    width = np.ptp(points[:, 0]) * truth.scale[0] * (1 + 0.01 * rng.normal())
+    return views, Size(width=width)
+
+
+def _unit(rng: np.random.Generator) -> np.ndarray:
+    vector = rng.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def warnings_of(
+    build: Callable[[np.ndarray, np.random.Generator], Case], seeds: range
+) -> list[tuple[str, ...]]:
+    points = keypoints(9)
+    found = []
+    for seed in seeds:
+        views, size = build(points, np.random.default_rng(seed))
+        found.append(align(Model(points_3d=points), views, size=size).warnings)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("build", "name"),
+    [
+        (wrong_motion, "views[2].cam_from_rig"),
+        (wrong_depth, "views[0].depth"),
+        (wrong_gravity, "views[0].up"),
+    ],
+)
+def test_the_wrong_piece_is_named(
+    build: Callable[[np.ndarray, np.random.Generator], Case], name: str
+) -> None:
+    found = warnings_of(build, range(SEEDS))
+    named = [any(text.startswith(f"{name} contradicts") for text in each) for each in found]
+    assert np.mean(named) >= 0.95
+
+
+def test_consistent_evidence_is_not_accused() -> None:
+    found = warnings_of(consistent, range(100))
+    assert sum(any("contradict" in text for text in each) for each in found) <= 2
+
+
+def test_two_sources_of_the_size_accuse_each_other() -> None:
+    points, truth, rng = keypoints(9), truth_of(), np.random.default_rng(0)
+    depth = 1000 * in_camera(points, truth, np.eye(4))[:, 2]
+    width = np.ptp(points[:, 0]) * truth.scale[0]
+    view = seen(points, truth, np.eye(4), rng, depth=depth)
+    warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
+    assert any("views[0].depth" in text and "size" in text for text in warnings)
+    assert any("millimetres" in text for text in warnings)

@@ -1,0 +1,77 @@
+"""Symmetries: discrete motions, axes, their products, and rotation errors up to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.geometry.symmetry import Symmetry, SymmetryAxis, symmetric_rotation_error
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def pose(rotation):
+    return Alignment(rotation.as_matrix(), [0, 0, 1], [1, 1, 1])
+
+
+@pytest.mark.parametrize("fold", [1, 2, 3, 4, 6])
+def test_rotations_by_equal_angles_are_a_group(fold):
+    poses = Symmetry.around((0, 3, 0), fold=fold, offset=(0.1, 5, -0.2)).poses()
+    assert len(poses) == fold
+    for first in poses:
+        np.testing.assert_allclose(first @ [0.1, 0, -0.2, 1], [0.1, 0, -0.2, 1], atol=1e-12)
+        for second in poses:
+            gaps = np.abs(poses - first @ second).max(axis=(1, 2))
+            assert gaps.min() < 1e-12
+
+
+def test_axes_are_taken_in_steps_with_every_discrete_motion():
+    """ceil(pi / 0.1) = 32 steps, each after the identity and after the flip."""
+    symmetry = Symmetry(FLIP[None], (SymmetryAxis(np.array([0, 1.0, 0]), np.zeros(3)),))
+    poses = symmetry.poses(max_step=0.1)
+    assert len(poses) == 64
+    np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(poses[32], FLIP, atol=1e-12)
+    step = Rotation.from_rotvec([0, 2 * np.pi / 32, 0]).as_matrix()
+    np.testing.assert_allclose(poses[1][:3, :3], step, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=3)
+    symmetry = Symmetry(FLIP[None], (SymmetryAxis(direction, rng.normal(size=3)),))
+    est, gt = pose(Rotation.random(random_state=seed)), pose(Rotation.random(random_state=seed + 9))
+    exact = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)
+    tried = [
+        rotation_error(est=est, gt=Alignment(gt.rotation @ motion[:3, :3], [0, 0, 1], [1, 1, 1]))
+        for motion in symmetry.poses(max_step=0.002)
+    ]
+    assert exact <= min(tried) + 1e-9
+    assert exact == pytest.approx(min(tried), abs=0.01)
+
+
+def test_without_symmetry_it_is_the_rotation_error():
+    est, gt = pose(Rotation.from_euler("y", 25, degrees=True)), pose(Rotation.identity())
+    assert symmetric_rotation_error(est=est, gt=gt, symmetry=Symmetry.none()) == pytest.approx(25)
+    # 25 deg is 25 from 0 and 20 from 45, of the rotations by 0, 45, 90, ... deg.
+    eight = Symmetry.around((0, 1, 0), fold=8)
+    assert symmetric_rotation_error(est=est, gt=gt, symmetry=eight) == pytest.approx(20)
+
+
+def test_what_is_no_motion_is_refused():
+    with pytest.raises(InputError, match="not rigid"):
+        Symmetry(np.diag([1.0, 1, -1, 1])[None])
+    with pytest.raises(InputError, match="not rigid"):
+        Symmetry(np.diag([2.0, 1, 1, 1])[None])
+    with pytest.raises(InputError, match="no direction"):
+        SymmetryAxis(np.zeros(3), np.zeros(3))
+    with pytest.raises(InputError, match="not a rotation"):
+        nearest_rotation(np.diag([1.0, 1, -1]))
+    with pytest.raises(InputError, match="not a rotation"):
+        nearest_rotation(np.full((3, 3), np.inf))

@@ -1,0 +1,198 @@
+"""Observation files with several views and with evidence beyond keypoints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.files import replaced, write_json
+
+from cadalign import Camera
+from cadalign.errors import DataError, InputError
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+
+CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [500.0, 500.0, 320.0, 240.0]}
+KEYPOINTS = [
+    {"xyz": [0.1 * i, 0.2, -0.3 * i], "uv": [10.0 * i, 20.0], "semantic_id": i} for i in range(4)
+]
+EVIDENCE: dict[str, Any] = {
+    "mask": "masks/a.png",
+    "mask_sigma": 1.5,
+    "depth": "a.depth.png",
+    "depth_scale": 0.001,
+    "depth_sigma": 0.02,
+    "up": [0.0, -1.0, 0.1],
+    "up_sigma_deg": 2.0,
+    "camera_height": 1.4,
+    "camera_height_sigma": 0.03,
+}
+ONE: dict[str, Any] = {
+    "camera": CAMERA,
+    "keypoints": KEYPOINTS,
+    "image": "a.jpg",
+    **EVIDENCE,
+    "model": "chair.obj",
+    "shape": "chair.shape",
+    "size": {"height": 0.9, "length": 0.5, "sigma": [0.01, 0.02, 0.03]},
+    "fit": {"sigma": 2.0},
+}
+_SHARED: dict[str, Any] = {
+    "views": [
+        {"camera": CAMERA, "keypoints": KEYPOINTS, **EVIDENCE, "cam_from_rig": np.eye(4).tolist()},
+        {"camera": CAMERA, "keypoints": KEYPOINTS[:1], "cam_from_rig": np.eye(4).tolist()},
+        {"camera": CAMERA, "keypoints": [], "mask": "b.png", "cam_from_rig": np.eye(4).tolist()},
+    ],
+    "model": "chair.obj",
+    "size": {"width": 0.4},
+}
+SEVERAL = json.loads(json.dumps(_SHARED))  # in which no two views share a list
+
+
+def test_evidence_of_one_image_arrives(tmp_path: Path) -> None:
+    observation = Observation.load(write_json(tmp_path / "a.json", ONE))
+    evidence = observation.evidence
+    assert (evidence.mask, evidence.depth) == (tmp_path / "masks/a.png", tmp_path / "a.depth.png")
+    assert (evidence.mask_sigma, evidence.depth_scale, evidence.depth_sigma) == (1.5, 0.001, 0.02)
+    assert evidence.up is not None
+    assert evidence.up.tolist() == [0.0, -1.0, 0.1]
+    assert (evidence.up_sigma_deg, evidence.camera_height) == (2.0, 1.4)
+    assert evidence.camera_height_sigma == 0.03
+    assert observation.size is not None
+    assert observation.size.given == {"height": 0.9, "length": 0.5, "sigma": [0.01, 0.02, 0.03]}
+    assert observation.shape == tmp_path / "chair.shape"
+    assert observation.views == (observation,)
+    assert not observation.is_plain
+
+
+def test_views_arrive(tmp_path: Path) -> None:
+    observation = Observation.load(write_json(tmp_path / "a.json", SEVERAL))
+    assert [len(view.points_2d) for view in observation.views] == [4, 1, 0]
+    assert observation.model == tmp_path / "chair.obj"
+    assert observation.others[1].evidence.mask == tmp_path / "b.png"
+    for view in observation.views:
+        assert view.evidence.cam_from_rig is not None
+        assert view.evidence.cam_from_rig.tolist() == np.eye(4).tolist()
+
+
+@pytest.mark.parametrize("data", [ONE, SEVERAL])
+def test_what_is_read_is_written_again(tmp_path: Path, data: dict[str, Any]) -> None:
+    path = write_json(tmp_path / "a.json", data)
+    assert Observation.load(path).to_dict(folder=tmp_path) == data
+
+
+def test_plain_observation_is_written_without_new_fields() -> None:
+    data = {"camera": CAMERA, "keypoints": KEYPOINTS, "image": "a.jpg"}
+    observation = Observation.from_dict(data)
+    assert observation.is_plain
+    assert list(observation.to_dict()) == ["camera", "keypoints", "image"]
+    assert observation.to_dict() == data
+
+
+def test_unknown_depths_of_keypoints_are_left_out() -> None:
+    keypoints = [*KEYPOINTS[:3], KEYPOINTS[3] | {"depth": 2.5}]
+    data = {"camera": CAMERA, "keypoints": keypoints, "depth_sigma": 0.01}
+    observation = Observation.from_dict(data)
+    assert observation.depths is not None
+    np.testing.assert_array_equal(observation.depths, [np.nan, np.nan, np.nan, 2.5])
+    assert observation.to_dict() == data
+    assert not observation.is_plain
+
+
+def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
+    data = replaced(SEVERAL, "views.1.keypoints.0.xyz", ...)
+    path = write_json(tmp_path / "a.json", data)
+    assert not Observation.load(path, needs_xyz=False).others[0].points_3d.any()
+    with pytest.raises(DataError, match=r"views\[1\]\.keypoints\[0\]\.xyz: missing"):
+        Observation.load(path)
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (ONE | {"mask": 5}, "{path}: mask: 5 is not a text"),
+        (ONE | {"mask": ""}, "{path}: mask: '' is not a path"),
+        (ONE | {"mask_sigma": 0}, "{path}: mask_sigma: 0 is not a positive number"),
+        (replaced(ONE, "mask", ...), "{path}: mask_sigma: given without mask; give mask, too"),
+        (ONE | {"depth_scale": -1}, "{path}: depth_scale: -1 is not a positive number"),
+        (replaced(ONE, "depth", ...), "{path}: depth_scale: given without depth; give depth, too"),
+        (ONE | {"up": [0, 1]}, "{path}: up: [0, 1] is not a list of 3"),
+        (
+            ONE | {"up": [0, float("inf"), 1]},
+            "{path}: up[1]: inf is not a finite number",
+        ),
+        (replaced(ONE, "up", ...), "{path}: up_sigma_deg: given without up; give up, too"),
+        (ONE | {"camera_height": "1 m"}, "{path}: camera_height: '1 m' is not a finite number"),
+        (ONE | {"cam_from_rig": np.eye(3).tolist()}, "{path}: cam_from_rig: "),
+        (
+            ONE | {"size": {"depth": 3}},
+            "{path}: size: unknown field 'depth'; known are height, length, sigma, width",
+        ),
+        (
+            ONE | {"size": {"sigma": 0.1}},
+            "{path}: size: no length is given; give width, height or length",
+        ),
+        (ONE | {"size": {"width": 0}}, "{path}: size.width: 0 is not a positive number"),
+        (
+            ONE | {"size": {"width": 1, "sigma": [0.1, 0.1]}},
+            "{path}: size.sigma: 2 numbers; give one, or one for each of 3 lengths",
+        ),
+        (
+            replaced(ONE, "keypoints.2.depth", 1.0),
+            "{path}: depth: a depth image and depths of keypoints are given; "
+            "leave out one of the two",
+        ),
+        (
+            {"camera": CAMERA, "keypoints": KEYPOINTS, "depth_sigma": 0.1},
+            "{path}: depth_sigma: given without depth; give depth, too",
+        ),
+        (SEVERAL | {"views": []}, "{path}: views: [] is not a list of at least 1"),
+        (SEVERAL | {"views": {}}, "{path}: views: {{}} is not a list"),
+        (
+            SEVERAL | {"camera": CAMERA},
+            "{path}: top level: unknown field 'camera'; known are fit, model, shape, size, views",
+        ),
+        (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
+        (
+            replaced(SEVERAL, "views.1.camera.params.0", 0),
+            "{path}: views[1].camera.fx: the focal length is 0; "
+            "give the calibrated focal length in pixels",
+        ),
+        (
+            replaced(SEVERAL, "views.0.keypoints.2.semantic_id", ...),
+            "{path}: views[0].keypoints[2].semantic_id: missing, though other keypoints have it; "
+            "give it for all keypoints or for none",
+        ),
+        (
+            replaced(SEVERAL, "views.2.mask", ...) | {"fit": {"sigma": [1.0]}},
+            "{path}: fit.sigma: a list, but there are several views; "
+            "give one for all, or `sigma` of every keypoint",
+        ),
+        (
+            replaced(SEVERAL, "views.1.up_sigma_deg", 3),
+            "{path}: views[1].up_sigma_deg: given without up; give up, too",
+        ),
+    ],
+)
+def test_malformed_evidence_is_refused_by_file_and_field(
+    tmp_path: Path, data: Any, text: str
+) -> None:
+    path = write_json(tmp_path / "observation.json", data)
+    with pytest.raises(DataError) as caught:
+        Observation.load(path)
+    message, expected = str(caught.value), text.format(path=path)
+    assert message.startswith(expected) if expected.endswith(" ") else message == expected
+
+
+def test_arrays_of_evidence_are_checked() -> None:
+    camera = Camera.from_dict(CAMERA)
+    points = np.zeros((2, 3)), np.zeros((2, 2))
+    with pytest.raises(InputError, match=r"depths: shape \(3,\), expected \(2,\)"):
+        ObservedImage(*points, camera, depths=np.ones(3))
+    with pytest.raises(InputError, match="cam_from_rig: "):
+        ImageEvidence(cam_from_rig=np.eye(3))
+    with pytest.raises(InputError, match="no length is given"):
+        KnownSize()

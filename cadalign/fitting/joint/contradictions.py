@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.fitting.joint.agreement import depth_factor
-from cadalign.fitting.joint.pieces import Piece, pieces_of, without
+from cadalign.fitting.joint.agreement import depth_factor, plane_distances
+from cadalign.fitting.joint.pieces import Piece, kept_rows, pieces_of, without
 from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.fitting.joint.summary import name_of
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
@@ -25,6 +25,7 @@ from cadalign.solvers.joint.system import empty_system, evaluate_joint
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
 _LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown of
+_HIDDEN = 6.0  # [sigma], of a depth from most others of its image
 _WRONG_UNIT = 100.0  # factor between measured and expected depths
 _PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
 _AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
@@ -64,6 +65,10 @@ def contradictions(
         return ()
     evidence, basis = reduce_modes(evidence)
     state = state._replace(coefficients=state.coefficients @ basis)
+    if len(evidence.planes.point):
+        evidence = _without_hidden(evidence, state)
+        state = copy_state(state)
+        cost, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
     whole = _determined(evidence, state)
     trials = []
     for piece in pieces:
@@ -89,6 +94,17 @@ def contradictions(
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
     return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _without_hidden(evidence: Evidence, state: State) -> Evidence:
+    """The evidence without depths that differ from most of their image: of something else."""
+    expected, measured, weights, images = plane_distances(evidence, state)
+    kept = np.ones(len(images), dtype=bool)
+    for view in np.unique(images):
+        rows = images == view
+        factor = np.median(measured[rows] / expected[rows])
+        kept[rows] = np.abs(measured / factor - expected)[rows] * weights[rows] < _HIDDEN
+    return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
 def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:

@@ -17,6 +17,7 @@ from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.solvers.joint.evidence import Evidence
 
 _GRID = 400
+_SCREENED = 64
 _MOST = 16
 _ROUNDS = 3  # of weighting by the depths of the last
 _LEAST_EQUATIONS = 12
@@ -47,7 +48,7 @@ def metric_starts(evidence: Evidence, rotations: FloatArray) -> tuple[FloatArray
     if linear is not None:
         proposed.insert(0, linear[None])
     if not len(rotations):
-        proposed.append(_rotation_grid())
+        proposed.append(_screened(evidence, rows, _rotation_grid()))
     candidates = np.concatenate(proposed)
     systems = [_given_rotation(evidence, rows, rotation) for rotation in candidates]
     found = [each for each in systems if each is not None]
@@ -163,6 +164,24 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
     if not (scales > _LEAST_SCALE).all() or not (depths > 0).all() or not np.isfinite(cost):
         return None
     return _Placed(rotation, found[:3], np.log(scales), cost + _cost_of_up(evidence, rotation))
+
+
+def _screened(evidence: Evidence, rows: _Rows, rotations: FloatArray) -> FloatArray:
+    """The rotations (S, 3, 3) with the least algebraic error, unweighted by depth."""
+    basis = _scale_basis(evidence)
+    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
+    in_rig = np.einsum("ni,nij->nj", rows.normals, turns)
+    by_scale = (in_rig @ rotations) * rows.points
+    same = np.broadcast_to(in_rig, by_scale.shape)
+    left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
+    right = (rows.right - (rows.normals * shifts).sum(axis=1)) * rows.weights
+    normal = left.swapaxes(1, 2) @ left
+    ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    normal = normal + ridge * np.eye(left.shape[2])
+    found = np.linalg.solve(normal, (left.swapaxes(1, 2) @ right)[:, :, None])
+    errors = (((left @ found)[:, :, 0] - right) ** 2).sum(axis=1)
+    costs = errors + [_cost_of_up(evidence, rotation) for rotation in rotations]
+    return np.asarray(rotations[np.argsort(costs)[:_SCREENED]])
 
 
 def _scale_basis(evidence: Evidence) -> FloatArray:

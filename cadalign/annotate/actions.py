@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.annotate.document import FocalChoice, Pixel
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text
 
 if TYPE_CHECKING:
@@ -143,6 +143,30 @@ class Rename(Action):
         return Outcome(self.pair)
 
 
+class Identify(Action):
+    """Say which keypoint of the category's shape the model point of a pair is."""
+
+    pair: Index
+    label: Index | Text
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        keypoint = state.document.pair(self.pair).keypoint
+        shape = session.shape
+        if keypoint is None or shape is None or self.label not in shape.ids:
+            raise InputError(
+                f"{quote(self.label)} is no keypoint of the shape", where="label", fix="choose one"
+            )
+        registry = session.registry
+        if shape.is_named:
+            registry.rename(keypoint, str(self.label))
+            return Outcome(self.pair)
+        point = registry[keypoint]
+        own = point.name if point.name != f"point {keypoint}" else f"keypoint {self.label}"
+        known = registry.add_as(int(self.label), replace(point, name=own))
+        state.history.record(state.document.exchange_keypoint(self.pair, known))
+        return Outcome(self.pair)
+
+
 class Focal(Action):
     """Choose a known or an estimated focal length."""
 
@@ -186,11 +210,15 @@ ACTIONS: dict[str, type[Action]] = {
     "release": Release,
     "delete": Delete,
     "rename": Rename,
+    "identify": Identify,
     "focal": Focal,
     "undo": Undo,
     "redo": Redo,
 }
 """Actions by the name that the page sends as ``do``."""
+
+RENAMING = ("rename", "identify")
+"""Those that may change the names of keypoints instead of the document."""
 
 
 def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:

@@ -18,7 +18,7 @@ from cadalign.fitting.outliers import Rows, find_outliers
 from cadalign.fitting.result import FitResult
 
 LEAST_PAIRS = 4
-_LEAST_SIGMA = 1.0
+LEAST_SIGMA = 1.0  # of clicks [px]
 _ROBUST_ROUNDS = 3
 _ROBUST_SHARE = 2.0  # of the median residual
 _LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, if the pairs leave it open
@@ -39,10 +39,20 @@ class LiveAlignment:
     provisional: bool
     fit_options: Mapping[str, Any]  # with which `cadalign fit` finds ``cautious``
 
+    @property
+    def shown(self) -> FitResult | None:
+        """The result that is shown and saved."""
+        return self.cautious
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Projected minus placed points (n, 2) [px] of the result that is shown."""
+        return np.empty((0, 2)) if self.cautious is None else self.cautious.residuals
+
     @classmethod
     def missing(cls, message: str) -> LiveAlignment:
         """No alignment, for the reason that the message gives."""
-        return cls(None, None, message, {}, _LEAST_SIGMA, provisional=False, fit_options={})
+        return cls(None, None, message, {}, LEAST_SIGMA, provisional=False, fit_options={})
 
 
 def align(
@@ -60,7 +70,7 @@ def align(
             f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
     fitter = _Fitter(points_3d, points_2d, intrinsics, choice, None)
-    given = _LEAST_SIGMA if sigma is None else sigma
+    given = LEAST_SIGMA if sigma is None else sigma
     message = ""
     if not choice.known and count <= LEAST_PAIRS:
         fitter = replace(fitter, choice=replace(choice, known=True))
@@ -79,7 +89,7 @@ def align(
     unknowns = 8 if result.covariance is None else len(result.covariance)
     estimated = _estimate_sigma(result, sigma, redundancy=2 * count - unknowns)
     cautious, options = result, dict[str, Any]()
-    if estimated > _LEAST_SIGMA:
+    if estimated > LEAST_SIGMA:
         # A model that is only similar to the object has larger residuals than the clicks' noise.
         scaled = None if sigma is None else estimated * sigma
         options = {"sigma": None if scaled is None else scaled.tolist()}
@@ -92,7 +102,7 @@ def align(
         cautious=cautious,
         message=message,
         outliers=find_outliers(points_3d, points_2d, fitter.fit_rows, unknowns=unknowns),
-        sigma=max(_LEAST_SIGMA, estimated),
+        sigma=max(LEAST_SIGMA, estimated),
         provisional=bool(message),
         fit_options={} if message else options,
     )
@@ -122,12 +132,12 @@ class _Fitter:
 
     def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
         """Fit some pairs; see `cadalign.fitting.outliers.FitRows`."""
-        result = self._fit(rows, _LEAST_SIGMA, "linear")
+        result = self._fit(rows, LEAST_SIGMA, "linear")
         if robust:
             # sigma=None iterates until nothing changes, which takes ten times as long.
             for _ in range(_ROBUST_ROUNDS):
                 median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
-                sigma = max(_LEAST_SIGMA, median / _ROBUST_SHARE)
+                sigma = max(LEAST_SIGMA, median / _ROBUST_SHARE)
                 result = self._fit(rows, sigma, "cauchy")
         return result
 

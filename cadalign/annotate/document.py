@@ -97,6 +97,10 @@ class Document:
             return self.delete(number)
         return self._with(replace(pair, keypoint=None))
 
+    def exchange_keypoint(self, number: int, keypoint: int) -> Document:
+        """Replace the model half of a pair, of which it keeps the photo half."""
+        return self._with(replace(self.pair(number), keypoint=keypoint))
+
     def delete(self, number: int) -> Document:
         """Delete a pair."""
         gone = self.pair(number)

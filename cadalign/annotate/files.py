@@ -3,13 +3,14 @@
 Beside the observation `photo.json` there may be
 
 - `photo_fit/fit.json`, the alignment as `cadalign fit` finds and writes it,
-- `photo.unfinished.json`, pairs with only one half placed.
+- `photo.unfinished.json`, pairs with only one half placed, and those whose keypoint the category's
+  shape lacks, so that `cadalign fit` could not use them.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,20 @@ import numpy as np
 from cadalign.annotate.document import Document, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.names import unfinished_file
+from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
+from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Document as JsonDocument
 from cadalign.io.documents import (
     Labelled,
+    NotNegative,
     PathText,
     Point2,
+    Positive,
     convert,
     in_file,
     path_from,
@@ -46,9 +51,11 @@ SAME_PLACE = 1e-6
 
 
 class _Half(Labelled, kw_only=True):
-    """Pair with only the photo half or the model half."""
+    """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
 
     uv: Point2 | None = None
+    sigma: Positive | None = None
+    confidence: NotNegative | None = None
 
     def __post_init__(self) -> None:
         if self.uv is None and self.semantic_id is None:
@@ -56,7 +63,7 @@ class _Half(Labelled, kw_only=True):
 
 
 class _Unfinished(JsonDocument):
-    """File of the pairs with only one half placed."""
+    """File of the pairs that the observation lacks."""
 
     pairs: list[_Half]
     format: str = ""
@@ -72,7 +79,7 @@ class AnnotationFiles:
 
     @property
     def unfinished(self) -> Path:
-        """File of the pairs with only one half placed."""
+        """File of the pairs that the observation lacks."""
         return unfinished_file(self.observation)
 
     @property
@@ -97,17 +104,19 @@ class AnnotationFiles:
         self._refuse_other_fit()
         return document, camera
 
-    def write(
+    def observation_of(
         self,
-        document: Document,
+        pairs: Sequence[Pair],
         registry: KeypointRegistry,
         camera: Camera,
         fit_options: Mapping[str, Any],
-    ) -> None:
-        """Write the photo's observation and its unfinished pairs; raises DataError on failure."""
-        pairs = document.complete_pairs
+        shape: ObjectShape | None = None,
+    ) -> Observation:
+        """The observation of some complete pairs."""
         keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
-        observation = Observation(
+        if shape is not None and shape.sigma is not None:
+            fit_options = {**fit_options, "shape_sigma": shape.sigma}
+        return Observation(
             points_3d=registry.xyz(keypoints),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=camera,
@@ -118,20 +127,29 @@ class AnnotationFiles:
             image=self.image,
             model=self.model,
             fit_options=fit_options,
+            shape=None if shape is None else shape.path,
         )
+
+    def write(
+        self,
+        document: Document,
+        registry: KeypointRegistry,
+        camera: Camera,
+        fit_options: Mapping[str, Any],
+        shape: ObjectShape | None = None,
+    ) -> None:
+        """Write the photo's observation and other pairs; raises DataError on failure."""
+        used = known_pairs(document, registry, shape)
+        observation = self.observation_of(used, registry, camera, fit_options, shape)
         observation.save(self.observation)
-        halves = [pair for pair in document.pairs if not pair.complete]
-        if halves:
-            entries = [
-                {"semantic_id": pair.keypoint} if pair.uv is None else {"uv": list(pair.uv)}
-                for pair in halves
-            ]
-            write_json(self.unfinished, {"format": _UNFINISHED, "pairs": entries})
+        others = [_written(pair) for pair in document.pairs if pair not in used]
+        if others:
+            write_json(self.unfinished, {"format": _UNFINISHED, "pairs": others})
         else:
             with writing(self.unfinished):
                 self.unfinished.unlink(missing_ok=True)
 
-    def write_fit(self, result: FitResult | None) -> None:
+    def write_fit(self, result: FitResult | AlignResult | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
         with writing(self.fit):
             if result is None:
@@ -172,8 +190,36 @@ class AnnotationFiles:
             observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=model)
         else:
             observation = Observation.load(self.observation)
+        if not observation.is_plain:
+            raise DataError(
+                "has evidence beyond keypoints in one image, which the annotator would not keep",
+                where=str(self.observation),
+                fix="give another --observation",
+            )
         refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
+
+
+def known_pairs(
+    document: Document, registry: KeypointRegistry, shape: ObjectShape | None
+) -> tuple[Pair, ...]:
+    """Complete pairs whose keypoints the shape knows; all of them without a shape."""
+    return tuple(
+        pair
+        for pair in document.complete_pairs
+        if shape is None or shape.id_of(registry[pair.keypoint or 0]) is not None
+    )
+
+
+def _written(pair: Pair) -> dict[str, Any]:
+    """A pair that the observation lacks, as an entry of the other file."""
+    fields = {
+        "semantic_id": pair.keypoint,
+        "uv": None if pair.uv is None else list(pair.uv),
+        "sigma": pair.sigma,
+        "confidence": pair.confidence,
+    }
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def filled(values: Iterable[float | None]) -> FloatArray | None:
@@ -259,10 +305,12 @@ def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> 
             f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to start without them"
         )
     for half in data.pairs:
-        pair = Pair(document.next_number, uv=half.uv)
-        if half.uv is None:
-            if half.semantic_id not in registry or half.semantic_id in document.keypoints:
-                continue  # its other half was saved, or the keypoints file was deleted
-            pair = replace(pair, keypoint=half.semantic_id)
+        keypoint = half.semantic_id
+        if keypoint not in registry or keypoint in document.keypoints:
+            keypoint = None  # it was saved in another pair, or the keypoints file was deleted
+        if half.uv is None and keypoint is None:
+            continue
+        number = document.next_number
+        pair = Pair(number, half.uv, keypoint, sigma=half.sigma, confidence=half.confidence)
         document = document.append(pair)
     return document

@@ -17,11 +17,15 @@ _LONGEST_NAME = 80
 class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
-    The attribute ``given`` holds the semantic ids of those given with the model.
+    The attribute ``given`` holds the semantic ids of those given with the model. New points don't
+    get ids that are ``reserved``.
     """
 
-    def __init__(self, given: Iterable[ModelKeypoint] = ()) -> None:
+    def __init__(
+        self, given: Iterable[ModelKeypoint] = (), *, reserved: Iterable[int] = ()
+    ) -> None:
         self._points: dict[int, ModelKeypoint] = {}
+        self._last_reserved = max(reserved, default=0)
         # Points with an id come first, so that new ids differ from theirs.
         ordered = sorted(given, key=lambda point: point.semantic_id is None)
         self.given = frozenset(self.add(point) for point in ordered)
@@ -51,10 +55,20 @@ class KeypointRegistry:
         """Add a point and return its semantic id; missing ids and names are assigned."""
         number = point.semantic_id
         if number is None:
-            number = 1 + max(self._points, default=0)
+            number = 1 + max(self._last_reserved, *self._points, 0)
         name = self._free_name(point.name or f"point {number}")
         self._points[number] = replace(point, semantic_id=number, name=name)
         return number
+
+    def add_as(self, semantic_id: int, point: ModelKeypoint) -> int:
+        """Add a point under an id; raises InputError if another has it."""
+        if semantic_id in self:
+            raise InputError(
+                f"the model has its keypoint {semantic_id} already",
+                where="label",
+                fix="click on that one",
+            )
+        return self.add(replace(point, semantic_id=semantic_id))
 
     def merge(self, points: Iterable[ModelKeypoint], *, tolerance: float) -> None:
         """Add points of an earlier session, which then count as given.

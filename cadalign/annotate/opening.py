@@ -18,6 +18,7 @@ from cadalign.annotate.names import (
     refuse_collisions,
     unfinished_file,
 )
+from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import Photo, find_photos, intrinsics_of, read_camera
 from cadalign.annotate.session import PhotoState, Session
@@ -91,21 +92,24 @@ def open_session(
     camera = None if options.camera is None else read_camera(options.camera)
     cad = CadModel(load_mesh(model))
     source = options.keypoints or keypoints_file(model, model.parent)
-    registry = _open_registry(files.keypoints, source, model, cad)
+    shape = ObjectShape.open(options)
+    registry = _open_registry(files.keypoints, source, model, cad, shape)
     photo_states = [
         _open_photo_state(photo, file, model, camera, registry, cad.diagonal)
         for photo, file in zip(files.photos, files.observations, strict=True)
     ]
-    return Session(cad, registry, photo_states, files.keypoints, before_saving)
+    return Session(cad, registry, photo_states, files.keypoints, before_saving, shape)
 
 
-def _open_registry(own: Path, source: Path, model: Path, cad: CadModel) -> KeypointRegistry:
+def _open_registry(
+    own: Path, source: Path, model: Path, cad: CadModel, shape: ObjectShape | None
+) -> KeypointRegistry:
     """Read the keypoints given with the model and those of earlier sessions."""
     mesh = cad.scene.mesh
     given: tuple[ModelKeypoint, ...] = ()
     if source != own and (source != keypoints_file(model, model.parent) or source.exists()):
         given = ModelKeypoints.load(source, mesh=mesh, model=model).keypoints
-    registry = KeypointRegistry(given)
+    registry = KeypointRegistry(given, reserved=() if shape is None else shape.reserved)
     if own.exists():
         earlier = ModelKeypoints.load(own, mesh=mesh, model=model)
         refuse_other_model(earlier.model, model, where=own)

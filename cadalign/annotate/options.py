@@ -23,3 +23,9 @@ class SessionOptions:
     length is estimated."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
+    shape: Path | None = None
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
+    keypoints that it knows by semantic id or name."""
+    shape_sigma: float | None = None
+    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
+    positions on the object about those on the stretched model [model units]."""

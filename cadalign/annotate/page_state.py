@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import Outcome
-from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
 from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
-from cadalign.annotate.session import PhotoState, Session
+from cadalign.annotate.session import Live, PhotoState, Session
+from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.annotate.shape_text import facts_of_shape, notes_of_shape
 from cadalign.annotate.suggestion import Suggestion
-from cadalign.annotate.wireframe import box_lines
-from cadalign.arrays import FloatArray
 
 
 def page_state(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
@@ -50,7 +50,8 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
             },
             "pairs": _pairs(session, state, live),
             "keypoints": _keypoints(session, state),
-            "alignment": _alignment(session, live),
+            "shape": _shape(session),
+            "alignment": _alignment(session, state, live),
             "suggestion": _suggestion(session, suggestion),
         }
 
@@ -67,7 +68,7 @@ def _moved(state: PhotoState) -> str:
     )
 
 
-def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
+def _pairs(session: Session, state: PhotoState, live: Live) -> list[dict[str, Any]]:
     pairs, row = [], 0
     for position, pair in enumerate(state.document.pairs, start=1):
         point = None if pair.keypoint is None else session.registry[pair.keypoint]
@@ -80,10 +81,11 @@ def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dic
             "xyz": None if point is None else session.model.to_display(point.xyz).tolist(),
             "residual": None,
             "off": None,
+            "counts": point is None or session.shape is None or session.shape.knows(point),
         }
         if pair.complete:
-            if live.cautious is not None:
-                residual = live.cautious.residuals[row]
+            if live.shown is not None:
+                residual = live.residuals[row]
                 entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
                 entry["off"] = live.outliers.get(row)
             row += 1
@@ -104,22 +106,44 @@ def _keypoints(session: Session, state: PhotoState) -> list[dict[str, Any]]:
     ]
 
 
-def _alignment(session: Session, live: LiveAlignment) -> dict[str, Any]:
-    result = live.cautious
+def _shape(session: Session) -> dict[str, Any] | None:
+    """The object's shape, and its keypoints that the model lacks."""
+    shape = session.shape
+    if shape is None:
+        return None
+    known = {shape.id_of(point) for _, point in session.registry}
+    return {
+        "category": None if shape.learned is None else shape.learned.category,
+        "missing": [label for label in shape.ids if label not in known],
+    }
+
+
+def _alignment(session: Session, state: PhotoState, live: Live) -> dict[str, Any]:
+    result = live.shown
     if result is None:
         return {"status": "none" if session.ready else "preparing", "message": live.message}
-    camera = result.camera
+    if isinstance(live, LiveShape):
+        assert session.shape is not None
+        assert live.camera is not None
+        camera = live.camera
+        facts, notes = facts_of_shape(live, session.shape), notes_of_shape(live, session.shape)
+        used = state.document.keypoints
+        drawing = drawing_of_shape(live, session.shape, session.registry, used)
+    else:
+        assert live.cautious is not None
+        camera = live.cautious.camera
+        facts, notes = facts_of(live), notes_of(live)
+        drawing = drawing_of_fit(live.cautious, session.wireframe)
     return {
         "status": "done",
         "message": "",
-        "facts": [asdict(fact) for fact in facts_of(live)],
-        "notes": notes_of(live),
+        "facts": [asdict(fact) for fact in facts],
+        "notes": notes,
         "alignment": result.alignment.to_dict(),
         "eye": session.model.to_display(result.alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
         "focal": camera.fx,
         "rms": result.rms,
-        "box": _flat(box_lines(session.model.scene.bounds, camera, result.alignment)),
-        "lines": _flat(session.wireframe.seen_in(camera, result.alignment)),
+        **drawing,
     }
 
 
@@ -133,9 +157,3 @@ def _suggestion(session: Session, suggestion: Suggestion | None) -> dict[str, An
         "uv": suggestion.uv,
         "text": next_best_text(suggestion.next_best, point.name or "The marked corner"),
     }
-
-
-def _flat(lines: FloatArray) -> list[float]:
-    """Lines (k, 2, 2) as x1, y1, x2, y2, ... to a tenth of a pixel."""
-    inside = lines[(np.abs(lines) < 1e6).all(axis=(1, 2))]
-    return np.round(inside, 1).ravel().tolist()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.suggestion import NextBest
+from cadalign.annotate.suggestion import NextBest, Unmarked
 from cadalign.fitting.result import FitResult
 
 UNKNOWNS = (
@@ -18,8 +18,8 @@ UNKNOWNS = (
 )
 """Names of the unknowns of a covariance, for a sentence."""
 _ROTATIONS = 3
-_UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
-_UNDETERMINED = "not determined", "these pairs leave it open"
+UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
+UNDETERMINED = "not determined", "these pairs leave it open"
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
         return ()
     facts = [_stretch(result, axis) for axis in result.stretched_axes]
     if result.std is not None:
-        facts.append(Fact("Rotation", f"known to ± {_short(result.std.rotation_deg)}°", ""))
+        facts.append(Fact("Rotation", f"known to ± {short(result.std.rotation_deg)}°", ""))
     facts += [_distance(result), _focal(result)]
     if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
         note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
         note = f"rms; the standard deviations above are {note}"
-        facts.append(Fact("Pairs agree to", f"{_short(result.rms)} px", note))
+        facts.append(Fact("Pairs agree to", f"{short(result.rms)} px", note))
     return tuple(facts)
 
 
@@ -62,10 +62,13 @@ def notes_of(live: LiveAlignment) -> tuple[str, ...]:
     return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
 
 
-def next_best_text(next_best: NextBest, name: str) -> str:
-    """Name of the next-best keypoint, and the uncertainty that it would leave."""
+def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
+    """Name of the next-best keypoint, and what is gained by it."""
+    if isinstance(next_best, Unmarked):
+        deviation = short(next_best.deviation)
+        return f"{name}: so far known to ± {deviation} px; it would tell most about pose and shape"
     factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
-    before, after = (_short(factor * std) + unit for std in (next_best.before, next_best.after))
+    before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
     unknown = UNKNOWNS[next_best.unknown]
     return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
 
@@ -75,14 +78,14 @@ def _stretch(result: FitResult, axis: str) -> Fact:
     label = f"Stretch along {axis}"
     std = result.std
     relative = 0.0 if std is None else std.scale["xyz".index(axis)]
-    if relative > _UNCERTAIN:
-        return Fact(label, *_UNDETERMINED)
+    if relative > UNCERTAIN:
+        return Fact(label, *UNDETERMINED)
     percent = 100 * (value - 1)
     if abs(percent) < 0.5:
         note = "as long as the model"
     else:
         note = f"{abs(percent):.0f} % {'longer' if percent > 0 else 'shorter'} than the model"
-    uncertainty = f" ± {_short(value * relative)}" if std is not None else ""
+    uncertainty = f" ± {short(value * relative)}" if std is not None else ""
     if relative > 0 and abs(percent) < 100 * relative:
         note = "the model's length lies within the standard deviation"
     return Fact(label, f"{value:.3g}{uncertainty}", note)
@@ -96,7 +99,7 @@ def _distance(result: FitResult) -> Fact:
         return Fact("Distance", f"{distance:.3g} model units", "")
     along = translation / distance
     std = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
-    return Fact("Distance", f"{distance:.3g} ± {_short(std)}", "model units")
+    return Fact("Distance", f"{distance:.3g} ± {short(std)}", "model units")
 
 
 def _focal(result: FitResult) -> Fact:
@@ -104,11 +107,11 @@ def _focal(result: FitResult) -> Fact:
     if covariance is None or len(covariance) < 9:
         return Fact("Focal length", f"{focal:.0f} px", "taken as known")
     relative = math.sqrt(max(float(covariance[8, 8]), 0.0))
-    if relative > _UNCERTAIN:
-        return Fact("Focal length", *_UNDETERMINED)
-    return Fact("Focal length", f"{focal:.0f} ± {_short(focal * relative)} px", "estimated")
+    if relative > UNCERTAIN:
+        return Fact("Focal length", *UNDETERMINED)
+    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", "estimated")
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """Two digits, without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

@@ -11,18 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.actions import ACTIONS, Outcome
+from cadalign.annotate.actions import ACTIONS, RENAMING, Outcome
 from cadalign.annotate.alignment import LiveAlignment, align
 from cadalign.annotate.document import Document, FocalChoice, History
-from cadalign.annotate.files import AnnotationFiles, filled, write_keypoints
+from cadalign.annotate.files import AnnotationFiles, filled, known_pairs, write_keypoints
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
+from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.photos import Intrinsics, Photo
-from cadalign.annotate.suggestion import Suggestion, suggest
+from cadalign.annotate.shape_alignment import LiveShape, align_shape
+from cadalign.annotate.suggestion import Suggestion, suggest, suggest_of_shape
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.io.documents import convert
+
+Live = LiveAlignment | LiveShape
+"""Alignment of the pairs placed so far, of the stretched model or of the object's own shape."""
 
 
 @dataclass
@@ -37,9 +42,7 @@ class PhotoState:
     save_error: str = ""
     fit_pending: bool = False
     """True if the alignment's file is still to be written, since the solvers were not ready."""
-    _live: tuple[Document, LiveAlignment, Suggestion | None] | None = field(
-        default=None, repr=False
-    )
+    _live: tuple[Document, Live, Suggestion | None] | None = field(default=None, repr=False)
 
     @property
     def document(self) -> Document:
@@ -56,10 +59,11 @@ class Session:
     photos: list[PhotoState]
     keypoints_path: Path  # file to which the model's keypoints are written
     before_saving: Callable[[], None]  # raises a CadalignError where nothing may be written
+    shape: ObjectShape | None = None  # the object's, if it is estimated
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 
     def __post_init__(self) -> None:
-        self.wireframe = Wireframe(self.model)
+        self.wireframe = Wireframe.of_model(self.model)
         self.lock = threading.RLock()
 
     def warm_up(self) -> None:
@@ -86,24 +90,39 @@ class Session:
             raise InputError(f"there is no photo {number + 1}", where="image")
         return self.photos[number]
 
-    def live(self, state: PhotoState) -> tuple[LiveAlignment, Suggestion | None]:
+    def live(self, state: PhotoState) -> tuple[Live, Suggestion | None]:
         """Compute the alignment and the next-best keypoint of the current annotation."""
         document = state.document
         if state._live is not None and state._live[0] is document:
             return state._live[1:]
         if not self.ready:
             return LiveAlignment.missing("Solvers and model are being prepared."), None
-        pairs = document.complete_pairs
-        live = align(
-            self.registry.xyz(pair.keypoint for pair in pairs if pair.keypoint is not None),
-            np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
-            filled(pair.sigma for pair in pairs),
-            state.intrinsics,
-            document.focal,
-        )
-        suggestion = suggest(self.model, self.registry, document.keypoints, live)
+        live, suggestion = self._align(state)
         state._live = (document, live, suggestion)
         return live, suggestion
+
+    def _align(self, state: PhotoState) -> tuple[Live, Suggestion | None]:
+        document, registry = state.document, self.registry
+        pairs = document.complete_pairs
+        keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
+        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
+        if self.shape is not None:
+            known = known_pairs(document, registry, self.shape)
+            camera = state.intrinsics.with_focal(document.focal)
+            own = {self.shape.id_of(point): point for _, point in registry}
+            live = align_shape(
+                self.shape,
+                self.wireframe,
+                state.files.observation_of(known, registry, camera, {}) if known else None,
+                [registry[keypoint] for keypoint in keypoints],
+                uv,
+                anchors={label: point for label, point in own.items() if label is not None},
+                assumed_focal=not document.focal.known,
+            )
+            return live, suggest_of_shape(live, self.shape, registry, document.keypoints)
+        sigma = filled(pair.sigma for pair in pairs)
+        plain = align(registry.xyz(keypoints), uv, sigma, state.intrinsics, document.focal)
+        return plain, suggest(self.model, registry, document.keypoints, plain)
 
     def act(self, number: int, action: Mapping[str, Any]) -> Outcome:
         """Do an action, its name ``do`` and its arguments, on a photo and save its changes."""
@@ -119,7 +138,7 @@ class Session:
                 )
             before = state.document
             outcome: Outcome = convert(action, kind).apply(self, state)
-            if state.document is not before or name == "rename":
+            if state.document is not before or name in RENAMING:
                 self.save(state)
             return outcome
 
@@ -157,15 +176,14 @@ class Session:
         state.fit_pending = not ready
         live, _ = self.live(state)
         # An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
-        result = None if live.provisional else live.cautious
+        result = None if live.provisional else live.shown
         used = frozenset[int]().union(*(other.document.keypoints for other in self.photos))
         try:
             self.before_saving()
             # First the keypoints, which the observation names.
             write_keypoints(self.keypoints_path, self.registry, used, state.files.model)
-            state.files.write(
-                document, self.registry, state.intrinsics.to_write(document.focal), live.fit_options
-            )
+            camera = state.intrinsics.to_write(document.focal)
+            state.files.write(document, self.registry, camera, live.fit_options, self.shape)
             if ready:
                 state.files.write_fit(result)
         except CadalignError as error:

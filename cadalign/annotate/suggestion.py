@@ -10,13 +10,17 @@ import numpy as np
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
+from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.fitting.prediction import predicted_covariances, projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import projected_covariances
 from cadalign.render.views.visibility import visible_keypoints
 
+_BENEATH = 0.02  # depth of visible keypoints beneath the warped surface [diagonals]
 _APART = 0.02  # least distance of a corner from marked points [diagonals]
 
 
@@ -34,12 +38,19 @@ class NextBest:
 
 
 @dataclass(frozen=True)
+class Unmarked:
+    """A keypoint that is not marked, and the standard deviation of its place in the photo [px]."""
+
+    deviation: float
+
+
+@dataclass(frozen=True)
 class Suggestion:
     """The next-best keypoint of the model, or a corner of the surface without a semantic id."""
 
     point: ModelKeypoint
     uv: tuple[float, float]  # its predicted place in the photo [px]
-    next_best: NextBest
+    next_best: NextBest | Unmarked
 
 
 def suggest(
@@ -66,6 +77,39 @@ def suggest(
             ((u, v),) = camera.project(alignment.apply(points[chosen : chosen + 1])).tolist()
             return Suggestion(candidates[chosen], (u, v), next_best)
     return None
+
+
+def suggest_of_shape(
+    live: LiveShape, shape: ObjectShape, registry: KeypointRegistry, used: Collection[int]
+) -> Suggestion | None:
+    """Choose the visible keypoint whose measurement tells most about pose and shape.
+
+    That is its mutual information with them, log det(I + C / sigma^2) / 2 for the predicted
+    covariance C of its place in the photo.
+    """
+    result, camera, warped = live.shown, live.camera, live.warped
+    if result is None or camera is None or warped is None:
+        return None
+    own = {
+        shape.id_of(point): point
+        for number, point in registry
+        if number not in used and shape.id_of(point) in result.ids
+    }
+    rows = np.array([row for row, label in enumerate(result.ids) if label in own], dtype=np.int64)
+    points = result.points_3d[rows]
+    seen = visible_keypoints(
+        warped.wireframe.scene, points, camera, result.alignment, tolerance=_BENEATH
+    )
+    rows = rows[seen]
+    if not len(rows):
+        return None
+    in_camera = result.alignment.apply(result.points_3d[rows])
+    covariances = projected_covariances(in_camera, result.points_cam_covariance[rows], camera)
+    gain = np.linalg.slogdet(np.eye(2) + covariances / live.sigma**2)[1]
+    best = int(np.argmax(np.round(gain, 9)))
+    ((u, v),) = camera.project(in_camera[best : best + 1]).tolist()
+    deviation = float(np.sqrt(np.trace(covariances[best])))
+    return Suggestion(own[result.ids[rows[best]]], (u, v), Unmarked(deviation))
 
 
 def find_next_best(

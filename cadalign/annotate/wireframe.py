@@ -1,20 +1,22 @@
-"""Wireframe of a stretched model over a photo: visible creases, borders and silhouette edges."""
+"""Wireframe of a stretched or warped model over a photo: creases, borders and silhouette edges."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cadalign.annotate.model import CadModel
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, simplify
+from cadalign.render.scene import Scene
 from cadalign.render.views.visibility import visible_keypoints
+from cadalign.shapes.warp import warp_mesh
 
 _MOST_FACES = 30_000
 _MOST_CREASES = 1500
@@ -26,30 +28,60 @@ _BOX_PIECES = 16
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Smooth edges, which show only on the silhouette, and lines that always show."""
+    """Smooth edges, which show only on the silhouette, and creases, which always show.
 
-    ends: FloatArray  # (e, 2, 3)
-    beside: FloatArray  # (e, 2, 3), the third corners of the adjacent triangles
-    lines: FloatArray  # (l, 2, 3)
+    As numbers of vertices: of their ends (k, 2), and of the third corners (k, 2) of the triangles
+    beside smooth ones.
+    """
+
+    smooth: IntArray
+    beside: IntArray
+    creases: IntArray
 
 
+@dataclass(frozen=True, eq=False)
 class Wireframe:
-    """Lines of a model, prepared once."""
+    """Lines of a model, prepared once; ``scene`` is the surface that hides them."""
 
-    def __init__(self, model: CadModel) -> None:
-        self._scene = model.scene
-        self._piece = _LONGEST * model.diagonal
-        self._edges = _find_edges(model.scene.mesh, self._piece)
+    scene: Scene
+    _mesh: Mesh  # simplified, each vertex once
+    _edges: _Edges
+    _piece: float  # length of a line [model units]
+
+    @classmethod
+    def of_model(cls, model: CadModel) -> Wireframe:
+        """The lines of a model as it is."""
+        small = simplify(model.scene.mesh, max_faces=_MOST_FACES)
+        # Faces of real models seldom share vertices: weld those in one place.
+        welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
+        mesh = Mesh(welded.vertices, welded.faces)
+        return cls(model.scene, mesh, _find_edges(mesh), _LONGEST * model.diagonal)
+
+    def warped(
+        self, source: FloatArray, target: FloatArray, bounds: FloatArray, *, carried: FloatArray
+    ) -> tuple[Wireframe, FloatArray]:
+        """Warp the lines, and points on the surface (k, 3); see `cadalign.shapes.warp.warp_mesh`.
+
+        The simplified mesh hides the lines.
+        """
+        mesh = self._mesh
+        together = Mesh(np.concatenate([mesh.vertices, carried]), mesh.faces)
+        moved = warp_mesh(together, source, target, bounds=bounds).vertices
+        vertices, points = np.split(moved, [len(mesh.vertices)])
+        warped = Mesh(vertices, mesh.faces)
+        return replace(self, scene=Scene(warped), _mesh=warped), points
 
     def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
         """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
-        edges = self._edges
+        vertices, edges = self._mesh.vertices, self._edges
         eye = alignment.inverse(np.zeros((1, 3)))[0]
-        outline = edges.ends[_is_outline(edges, eye)]
-        lines = np.concatenate([edges.lines, _cut(outline, self._piece)])[:_MOST_LINES]
+        ends = vertices[edges.smooth]
+        outline = ends[_is_outline(ends, vertices[edges.beside], eye)]
+        lines = np.concatenate([vertices[edges.creases], outline])
+        lines = _cut(lines, self._piece)[:_MOST_LINES]
         if not len(lines):
             return np.empty((0, 2, 2))
-        seen = visible_keypoints(self._scene, lines.mean(axis=1), camera, alignment)
+        seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
         return _project_lines(lines[seen], camera, alignment)
 
 
@@ -73,29 +105,28 @@ def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> F
     return camera.project(ends.reshape(-1, 3)).reshape(-1, 2, 2)
 
 
-def _is_outline(edges: _Edges, eye: FloatArray) -> BoolArray:
+def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolArray:
     """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
 
-    The third corners are compared, not the normals: triangles of real models face either way.
-    Stretching does not change sides, so model coordinates suffice.
+    ``ends`` (e, 2, 3) and the third corners ``beside`` (e, 2, 3) are compared, not the normals:
+    triangles of real models face either way. Stretching does not change sides, so model coordinates
+    suffice.
     """
-    start = edges.ends[:, 0]
-    sight = np.cross(start - eye, edges.ends[:, 1] - eye)
-    sides = np.einsum("eck,ek->ec", edges.beside - start[:, None], sight)
+    start = ends[:, 0]
+    sight = np.cross(start - eye, ends[:, 1] - eye)
+    sides = np.einsum("eck,ek->ec", beside - start[:, None], sight)
     return np.asarray(sides[:, 0] * sides[:, 1] > 0)
 
 
-def _find_edges(mesh: Mesh, piece: float) -> _Edges:
-    small = simplify(mesh, max_faces=_MOST_FACES)
-    # Faces of real models seldom share vertices: weld those in one place.
-    welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
-    edges = mesh_edges(welded.vertices, welded.faces, crease_angle=_CREASE_DEG)
-    ends = welded.vertices[edges.ends]
-    lines = ends[edges.creased]
-    longest = np.argsort(-np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1), kind="stable")
-    lines = lines[np.sort(longest[:_MOST_CREASES])]
-    beside = welded.vertices[edges.opposite[~edges.creased]]
-    return _Edges(ends[~edges.creased], beside, _cut(lines, piece))
+def _find_edges(mesh: Mesh) -> _Edges:
+    edges = mesh_edges(mesh.vertices, mesh.faces, crease_angle=_CREASE_DEG)
+    creases = edges.ends[edges.creased]
+    length = np.linalg.norm(mesh.vertices[creases[:, 1]] - mesh.vertices[creases[:, 0]], axis=1)
+    longest = np.argsort(-length, kind="stable")
+    smooth = ~edges.creased
+    return _Edges(
+        edges.ends[smooth], edges.opposite[smooth], creases[np.sort(longest[:_MOST_CREASES])]
+    )
 
 
 def _cut(lines: FloatArray, piece: float) -> FloatArray:

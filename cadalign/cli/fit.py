@@ -96,7 +96,8 @@ class Fit(ObservationCommand):
         status = console.status("fitting (the first time after an installation takes a minute)")
         result: FitResult | AlignResult
         observation = self._load()
-        is_joint = self.shape_of(observation) is not None or self.shape_sigma is not None
+        command = self._with_stored_sigma(observation)
+        is_joint = command.shape_of(observation) is not None or command.shape_sigma is not None
         if observation.is_plain and not is_joint:
             result, picture = self._fit(observation, console, status)
             data, table, pictures = result.to_dict(), "", [picture]
@@ -104,7 +105,7 @@ class Fit(ObservationCommand):
             from cadalign.cli.contributions import list_contributions, tabulate_contributions
             from cadalign.cli.fit_joint import fit_joint
 
-            result, pictures = fit_joint(self, observation, status)
+            result, pictures = fit_joint(command, observation, status)
             data = result.to_dict() | list_contributions(result)
             table = tabulate_contributions(result)
         out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
@@ -131,6 +132,12 @@ class Fit(ObservationCommand):
         if self.shape is not None or self.shape_sigma is not None or not self.stored:
             return self.shape
         return observation.shape
+
+    def _with_stored_sigma(self, observation: Observation) -> Fit:
+        """The command with the file's ``shape_sigma``, unless flags say otherwise."""
+        if not self.stored or self.shape is not None or self.shape_sigma is not None:
+            return self
+        return replace(self, shape_sigma=observation.fit_options.get("shape_sigma"))
 
     def sigma_for_all(self, observation: Observation) -> Sigma | None:
         """The given or stored deviation in place of the keypoints' own, if there is one."""
@@ -174,7 +181,8 @@ class Fit(ObservationCommand):
         """Options of the fit: those of the flags, otherwise those of the file."""
         from cadalign.io.documents import in_file, within
 
-        given = observation.fit_options if self.stored else {}
+        given = dict(observation.fit_options) if self.stored else {}
+        given.pop("shape_sigma", None)  # which is not an option of the plain fit
         with in_file(self.observation), within("fit"):
             stored = FitOptions(**given)
         set_by_flags = {

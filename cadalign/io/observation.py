@@ -23,7 +23,8 @@ with integers at pixel centres, of the photo as it is seen: turned upright where
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``.
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``; and
+``shape_sigma`` of `cadalign.Model`, for a model that is only similar.
 
 Evidence beyond keypoints stands beside them, each field optional, deviations and scales as
 `cadalign.View` and `cadalign.Size` describe them::

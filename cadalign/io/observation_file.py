@@ -59,6 +59,7 @@ class FitFields(Document):
     scale_prior_sigma: Positive | UnsetType | None = UNSET
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
+    shape_sigma: Positive | UnsetType = UNSET
 
 
 class SizeFields(Document):

@@ -105,6 +105,13 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     """The columns of a run's results as lists."""
     table = run.results
     wanted = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
+    optional = ("visibility", "symmetry")
     numbers = ("stretch_y", "stretch_z", *(metric.key for metric in metrics))
-    cells = {name: table[name].to_pylist() for name in (*wanted, "visibility", "symmetry")}
-    return cells | {name: compact(run.column(name)) for name in numbers}
+    cells = {name: table[name].to_pylist() for name in wanted}
+    for name in optional:
+        known = name in table.column_names
+        cells[name] = table[name].to_pylist() if known else [""] * len(table)
+    for name in numbers:
+        known = name in table.column_names
+        cells[name] = compact(run.column(name)) if known else [None] * len(table)
+    return cells

@@ -1,6 +1,6 @@
 """Files of cars' keypoints in KITTI's photos, as keypoint networks and their papers write them.
 
-``cars.json`` is a list of cars, each with its photo::
+``cars.json`` is a list of cars, each with its photo, which is listed once for each car in it::
 
     [{"image": "2_98.png", "K": 3 x 3, "bbox": [left, top, right, bottom],
       "dims_hwl": [h, w, l], "location_bottom_centre": [x, y, z], "rotation_y": -1.5,
@@ -180,7 +180,11 @@ def list_cars(path: Path) -> Iterator[KeypointFrame | DataError]:
         return
     for number, raw in enumerate(entries):
         place = f"[{number}]"
-        entry = parse(raw, Any, path=path, where=place)
+        try:
+            entry = parse(raw, Any, path=path, where=place)
+        except DataError as error:
+            yield error
+            continue
         image = entry.get("image") if isinstance(entry, dict) else None
         stem = Path(image).stem if isinstance(image, str) and "\0" not in image else str(number)
         yield KeypointFrame(f"{stem}#{number}", path, place, entry)

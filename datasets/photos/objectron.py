@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,9 @@ from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
 _GEOMETRY = "geometry.pbdata"
+_LEVELS = ("", "*/", "*/*/", "*/*/*/")
+# Objects come first in a JSON file, and there are few.
+_BEGINNING = 2**16
 _BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 # The centre, then the corners: the sign of z changes first, that of x last.
 _UNIT_BOX = np.array(
@@ -104,8 +108,8 @@ class Objectron(PhotoDataset):
         annotations/<class>/batch-<i>/<j>.pbdata          (or .json)
         videos/<class>/batch-<i>/<j>/video.MOV
 
-    or such annotation files anywhere below ``root``, each with frames in a folder of its name,
-    ``<j>/<frame id>.jpg`` or ``.png``, or ``<j>/video.MOV``. Files are the official protocol
+    or such annotation files up to four levels below ``root``, each with frames in a folder of its
+    name, ``<j>/<frame id>.jpg`` or ``.png``, or ``<j>/video.MOV``. Files are the official protocol
     buffers, or the same messages as JSON; see `cadalign.datasets.photos.objectron_files`.
 
     The truth is complete: the model is the unit box around the origin, its stretch the sides in
@@ -170,9 +174,22 @@ class Objectron(PhotoDataset):
 
 
 def list_annotations(folder: Path) -> list[Path]:
-    """List the annotation files below a folder: ``.pbdata``, and ``.json`` in ``annotations``."""
-    found = [path for path in folder.rglob("*.pbdata") if path.name != _GEOMETRY]
-    return sorted([*found, *(folder / ANNOTATIONS).rglob("*.json")])
+    """List the annotation files: ``.pbdata``, and ``.json`` in ``annotations``; four levels."""
+    found = [path for level in _LEVELS for path in folder.glob(f"{level}*.pbdata")]
+    found += [path for level in _LEVELS for path in (folder / ANNOTATIONS).glob(f"{level}*.json")]
+    return sorted(path for path in found if path.name != _GEOMETRY)
+
+
+def has_annotations(folder: Path) -> bool:
+    """True if there are annotation files, as told by their ending, or their content where JSON."""
+    return any(path.suffix == ".pbdata" or _is_sequence(path) for path in list_annotations(folder))
+
+
+def _is_sequence(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        begin = file.read(_BEGINNING)
+        return b"frame_annotations" in begin or b"frameAnnotations" in begin
+    return False
 
 
 def _object(

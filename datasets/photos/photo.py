@@ -37,8 +37,10 @@ class PhotoKeypoints:
 
     Raises
     ------
+    DataError
+        If lengths don't match.
     InputError
-        If lengths don't match, or a value is not finite.
+        If a value is not finite.
     """
 
     points_2d: FloatArray

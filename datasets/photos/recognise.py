@@ -11,7 +11,7 @@ from cadalign.datasets.photos import bop, pascal3d, pascal3d_detections, pix3d, 
 from cadalign.datasets.photos.bop import Bop
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.kitti import KittiCars
-from cadalign.datasets.photos.objectron import Objectron, list_annotations
+from cadalign.datasets.photos.objectron import Objectron, has_annotations
 from cadalign.datasets.photos.pascal3d import Pascal3D
 from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
@@ -68,7 +68,7 @@ PHOTO_FORMATS = (
     PhotoFormat("posed photos: poses.json", _has(posed_photos.POSES), PosedPhotos),
     PhotoFormat(
         "Objectron: .pbdata files, or JSON files in annotations",
-        lambda folder: bool(list_annotations(folder)),
+        has_annotations,
         Objectron,
     ),
 )

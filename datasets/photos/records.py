@@ -40,9 +40,21 @@ def read_table(path: Path) -> dict[str, Raw]:
 
 
 def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
-    """Parse an entry as a declared type; errors name the file and the place in it."""
+    """Parse an entry as a declared type; errors name the file and the place in it.
+
+    Raises
+    ------
+    DataError
+        If it is not of this type, or no valid JSON.
+    """
+    try:
+        data = msgspec.json.decode(raw)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"not valid JSON: {brief(error)}", where=f"{path}: {where}") from None
+    except RecursionError:
+        raise DataError("nested too deeply", where=f"{path}: {where}") from None
     with in_file(path):
-        return convert(msgspec.json.decode(raw), kind, where)
+        return convert(data, kind, where)
 
 
 def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:

@@ -176,7 +176,7 @@ def test_two_million_faces_are_shown_decimated_and_picked_exactly() -> None:
         assert point is not None
         assert point.face_index is not None
         assert np.linalg.norm(point.xyz - target) < 1e-4 * model.diagonal
-    Wireframe(model)
+    Wireframe.of_model(model)
 
 
 # --- the lines over the photo ----------------------------------------------------------------
@@ -188,7 +188,7 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
     model = CadModel(box_mesh())
     turn = np.array([[0.8, 0, 0.6], [0.36, 0.8, -0.48], [-0.48, 0.6, 0.64]])
     alignment = Alignment(turn, [0, -0.5, 9], [1, 1.2, 0.7])
-    lines = Wireframe(model).seen_in(CAMERA, alignment)
+    lines = Wireframe.of_model(model).seen_in(CAMERA, alignment)
     assert lines.shape[1:] == (2, 2)
     corners = CAMERA.project(alignment.apply(model.scene.mesh.vertices))
     # Of a box's 8 corners one is hidden, and three of its edges.
@@ -203,7 +203,7 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
 def test_wireframe_shows_the_outline_of_smooth_models() -> None:
     model = CadModel(sphere(40))
     alignment = Alignment(np.eye(3), [-3, 1, 4], [1, 1, 1])  # the sphere's centre at depth 6
-    lines = Wireframe(model).seen_in(CAMERA, alignment)
+    lines = Wireframe.of_model(model).seen_in(CAMERA, alignment)
     assert len(lines) > 40
     ends = CAMERA.normalize(lines.reshape(-1, 2))
     angle = np.arctan(np.linalg.norm(ends, axis=1))
@@ -213,7 +213,7 @@ def test_wireframe_shows_the_outline_of_smooth_models() -> None:
 def test_lines_behind_the_camera_are_left_out() -> None:
     model = CadModel(box_mesh())
     behind = Alignment(np.eye(3), [0, 0, -9], [1, 1, 1])
-    assert Wireframe(model).seen_in(CAMERA, behind).shape == (0, 2, 2)
+    assert Wireframe.of_model(model).seen_in(CAMERA, behind).shape == (0, 2, 2)
     assert box_lines(model.scene.bounds, CAMERA, behind).shape == (0, 2, 2)
 
 

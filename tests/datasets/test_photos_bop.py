@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
 from support.files import write_json
-from support.photo_data import TETRAHEDRON_PLY, bop_pose, rigid, write_bop, write_photo, write_text
+from support.photo_data import (
+    TETRAHEDRON_PLY,
+    assert_damage_is_told,
+    bop_pose,
+    rigid,
+    write_bop,
+    write_photo,
+    write_text,
+)
 
 import cadalign.datasets
 from cadalign.datasets import Bop, PosedPhotos
@@ -113,6 +122,22 @@ def test_a_file_of_posed_photos(tmp_path):
     np.testing.assert_allclose(photo.objects[0].truth.cam_from_model.cam_from_model, pose)
     assert photo.objects[0].model.load_mesh() is not None
     assert "b.jpg.camera" in str(dataset.problems["b.jpg"])
+
+
+def test_damaged_files_are_told(tmp_path):
+    write_bop(tmp_path, photos=1)
+    assert_damage_is_told(tmp_path)
+
+
+@pytest.mark.slow
+def test_ten_thousand_photos_take_little_time(tmp_path):
+    write_bop(tmp_path, photos=10_000, images=False)
+    camera = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}
+    write_json(tmp_path / "camera.json", camera)
+    begin = time.process_time()
+    summary = Bop(tmp_path).summary()
+    assert time.process_time() - begin < 60
+    assert (summary.photos, summary.objects, summary.images) == (10_000, 10_000, 0)
 
 
 def test_the_table_of_six_photos_stands_still(real_data):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from support.files import write_json
-from support.photo_data import write_photo, write_text
+from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import KittiCars
@@ -132,6 +134,25 @@ def test_bad_lines_and_calibrations_do_not_stop_the_others(tmp_path):
     text = " ".join(map(str, dataset.problems.values()))
     assert "P2 is not a 3 x 4 matrix" in text
     assert "0003.txt, line 2" in text
+
+
+def test_damaged_files_are_told(tmp_path):
+    write_text(tmp_path / "label_2" / "0.txt", CAR)
+    write_text(tmp_path / "calib" / "0.txt", P2)
+    write_photo(tmp_path / "image_2" / "0.png")
+    write_text(tmp_path / "label_02" / "0003.txt", f"0 1 {CAR}\n1 1 {CAR}\n")
+    write_json(tmp_path / "cars.json", [car_entry()])
+    assert_damage_is_told(tmp_path)
+
+
+@pytest.mark.slow
+def test_ten_thousand_labels_take_little_time(tmp_path):
+    lines = [f"{number} 1 {CAR if number % 100 != 7 else CAR[:20]}" for number in range(10_000)]
+    write_text(tmp_path / "label_02" / "0003.txt", "\n".join(lines))
+    begin = time.process_time()
+    summary = KittiCars(tmp_path).summary()
+    assert time.process_time() - begin < 60
+    assert (summary.photos, summary.objects, len(summary.problems)) == (9900, 9900, 100)
 
 
 def test_a_folder_without_labels_is_refused(tmp_path):

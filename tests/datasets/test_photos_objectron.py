@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.files import write_json
-from support.photo_data import message, rigid, write_photo, write_text
+from support.photo_data import assert_damage_is_told, message, rigid, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Objectron
@@ -178,6 +178,13 @@ def test_every_truncation_of_a_file_is_told(tmp_path):
         path = write_bytes(tmp_path / "x.pbdata", good[:length])
         with pytest.raises(DataError, match=r"x\.pbdata"):
             read_sequence(path).frame(0)
+
+
+def test_damaged_files_are_told(tmp_path):
+    write_bytes(tmp_path / "annotations" / "cup" / "batch-1" / "3.pbdata", sequence_bytes())
+    write_json(tmp_path / "annotations" / "cup" / "batch-1" / "4.json", sequence_json())
+    write_photo(tmp_path / "annotations" / "cup" / "batch-1" / "3" / "3.jpg", 48, 64)
+    assert_damage_is_told(tmp_path)
 
 
 def test_decoding_follows_the_wire_format():

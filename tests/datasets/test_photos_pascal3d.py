@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from support.files import write_json
-from support.photo_data import write_photo, write_text
+from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Pascal3D, Pascal3DDetections
@@ -159,6 +159,10 @@ def test_cad_files_are_checked_when_they_are_read(root):
         model.load_mesh()
     with pytest.raises(DataError, match="faces"):
         type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
+
+
+def test_damaged_files_are_told(root):
+    assert_damage_is_told(root)
 
 
 def test_nothing_there_is_told(tmp_path):

@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from support.files import TETRAHEDRON, write_json
-from support.photo_data import rigid, write_photo, write_text
+from support.photo_data import assert_damage_is_told, rigid, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Pix3D
@@ -108,6 +108,10 @@ def test_damaged_files_are_told(root):
         cadalign.datasets.open(root)
     with pytest.raises(DataError, match="no such file"):
         Pix3D(root)
+
+
+def test_any_damage_is_told(root):
+    assert_damage_is_told(root)
 
 
 @pytest.mark.slow

@@ -8,7 +8,14 @@ import logging
 import numpy as np
 import pytest
 from support.files import replaced
-from support.photo_data import rigid, scan2cad_model, write_photo, write_scan2cad, write_text
+from support.photo_data import (
+    assert_damage_is_told,
+    rigid,
+    scan2cad_model,
+    write_photo,
+    write_scan2cad,
+    write_text,
+)
 
 import cadalign.datasets
 from cadalign.datasets import Scan2CAD
@@ -148,6 +155,11 @@ def test_annotations_cut_short_are_told(root, content):
     path.write_text(content)
     with pytest.raises(DataError, match=r"full_annotations\.json"):
         Scan2CAD(root)
+
+
+def test_damaged_files_are_told(tmp_path):
+    write_scan2cad(tmp_path, frames=1)
+    assert_damage_is_told(tmp_path)
 
 
 def test_the_sample_has_the_known_truth(real_data):

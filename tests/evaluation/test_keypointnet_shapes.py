@@ -19,6 +19,7 @@ from cadalign import Alignment, Box, ShapeModel, evaluate
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.aligned import box_alignment
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.shapes.examples import Example
 
@@ -94,6 +95,14 @@ def test_records_hold_the_estimated_box(root: Path, shapes: Path, tmp_path: Path
         shift = np.linalg.norm(est.center / est.center[2] - gt.center / gt.center[2])
         assert shift < 0.05
         assert estimate["rms_px"] == pytest.approx(chosen.rms_px[row["model_id"]], abs=1e-3)
+        source, target = (np.array(estimate["warp"][end]) for end in ("from", "to"))
+        gaps = np.linalg.norm(source[:, None] - record["points_3d"], axis=2)
+        assert gaps.min(axis=0).max() < 1e-6  # all keypoints that were given
+        seen = target[gaps.argmin(axis=0)]
+        residuals = KEYPOINT_CAMERA.project(poses[0].apply(seen)) - record["points_2d"]
+        rms = np.sqrt((residuals**2).sum(axis=1).mean())
+        assert rms == pytest.approx(estimate["rms_px"], abs=1e-2)
+        assert all("warp" in other for other in estimate["alternatives"])
 
 
 def test_the_page_shows_the_method_and_errors_up_to_scale(

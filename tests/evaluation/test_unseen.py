@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.pages import embedded_payload
 
+from cadalign import Alignment, Box
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
@@ -23,9 +25,11 @@ from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.unseen.calibration import probability_level
 from cadalign.evaluation.unseen.options import METHODS, UnseenOptions
+from cadalign.evaluation.unseen.records import keep_preview
 from cadalign.evaluation.unseen.spec import SPEC
-from cadalign.evaluation.unseen.tasks import UnseenTasks, observe_object
-from cadalign.report import headline_text
+from cadalign.evaluation.unseen.tasks import UnseenTask, UnseenTasks, observe_object
+from cadalign.geometry.metrics import box_iou
+from cadalign.report import headline_text, write_report
 
 SYNSET = "03001627"
 BASE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -80,6 +84,54 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 def column(folder: RunFolder, name: str, method: str) -> np.ndarray:
     cells = Run.open(folder.path).cells
     return np.asarray(cells[name][cells["method"] == method].astype(float))
+
+
+class TestRecords:
+    def test_hold_what_the_metrics_are_of(self, finished: RunFolder) -> None:
+        """Pose, box and warped keypoints of every method."""
+        errors = {
+            (row["model_id"], row["method"]): (row["keypoint_error"], row["box_iou"])
+            for row in read_table(finished.results).to_pylist()
+        }
+        records = read_table(finished.records).to_pylist()
+        assert len(records) == OBJECTS
+        for row in records:
+            record = json.loads(row["exhibit"])
+            gt = pose(record["gt"])
+            assert [each["method"] for each in record["estimates"]] == list(METHODS)
+            for estimate in record["estimates"]:
+                found = pose(estimate)
+                truth, est = (np.array(estimate["warp"][end]) for end in ("from", "to"))
+                est, truth = found.apply(est), gt.apply(truth)
+                factor = (est * truth).sum() / (est * est).sum()
+                error = np.sqrt(((factor * est - truth) ** 2).sum(axis=1).mean())
+                boxes = (Box.from_model(record["bounds"], each) for each in (found, gt))
+                expected = errors[row["model_id"], estimate["method"]]
+                assert error == pytest.approx(expected[0], abs=1e-4)
+                assert box_iou(**dict(zip(("est", "gt"), boxes, strict=True))) == pytest.approx(
+                    expected[1], abs=1e-4
+                )
+                assert estimate["rms_px"] >= 0
+
+    def test_are_on_the_page(self, finished: RunFolder, tmp_path: Path) -> None:
+        written = write_report([finished.path], tmp_path / "report.html")
+        page = embedded_payload(written.path)
+        assert len(page["exhibits"]) == OBJECTS
+        assert "keypoint_error" in [metric["key"] for metric in page["metrics"]]
+
+    def test_mesh_previews_are_kept_on_demand(self, tmp_path: Path, sample_root: Path) -> None:
+        folder = RunFolder(tmp_path)
+        options = UnseenOptions(sample_root, split="all", train="none", meshes=True)
+        model = KeypointNet(sample_root)["chair", "sample_chair_000"]
+        task = UnseenTask("chair", model.model_id, 0, model.keypoints.xyz, np.arange(1))
+        keep_preview(folder, options.root, task)
+        (preview,) = folder.previews.iterdir()
+        assert preview.name == "chair_sample_chair_000.json"
+        assert json.loads(preview.read_text())["faces"]
+
+
+def pose(record: dict[str, Any]) -> Alignment:
+    return Alignment(np.reshape(record["rotation"], (3, 3)), record["translation"], record["scale"])
 
 
 class TestViews:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+import cadalign.datasets
+from cadalign.errors import DataError
 from support.files import TETRAHEDRON, write_json
 
 TETRAHEDRON_PLY = """ply
@@ -195,3 +198,49 @@ def field(number: int, value: Any) -> bytes:
 def message(*fields: tuple[int, Any]) -> bytes:
     """A message of fields."""
     return b"".join(field(number, value) for number, value in fields)
+
+
+# --- damage ----------------------------------------------------------------------------------
+
+
+def read_whole(root: Path) -> int:
+    """Open the data set in a folder and read all that it holds; the number of photos."""
+    dataset = cadalign.datasets.open(root)
+    count = 0
+    for photo in dataset:
+        count += 1
+        readers: list[Any] = [photo.read_image]
+        readers += [photo.depth.read] if photo.depth is not None else []
+        for found in photo.objects:
+            readers += [found.read_mask]
+            if found.model is not None:
+                readers += [found.model.load_mesh, found.model.load_keypoints]
+        for read in readers:
+            with suppress(DataError):
+                read()
+    return count
+
+
+def assert_damage_is_told(root: Path, *, seed: int = 0) -> None:
+    """Cut, change, empty and remove each file below a folder in turn: nothing but a DataError.
+
+    Raises
+    ------
+    AssertionError
+        If the whole data set has no photo.
+    """
+    assert read_whole(root) > 0
+    rng = np.random.default_rng(seed)
+    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+        good = path.read_bytes()
+        cuts = [good[: int(share * len(good))] for share in (0.0, 0.3, 0.6, 0.97)]
+        changed = np.frombuffer(good, dtype=np.uint8).copy()
+        changed[rng.integers(len(good), size=3)] = rng.integers(256, size=3)
+        for content in (*cuts, changed.tobytes(), None):
+            if content is None:
+                path.unlink()
+            else:
+                path.write_bytes(content)
+            with suppress(DataError):
+                read_whole(root)
+        path.write_bytes(good)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.result import AlignAlternative, AlignResult
 from cadalign.fitting.joint.view import View
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
@@ -19,12 +19,25 @@ from cadalign.shapes.model import ShapeModel
 _LEAST_SCALE = 1e-6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Deformation of the given model to the estimated shape.
+
+    ``source`` (k, 3) are keypoints of the given model, ``target`` (k, 3) their places on the
+    estimated object, in the model's coordinates: the alignment takes both into the camera's.
+    """
+
+    source: FloatArray
+    target: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class AlignedAlternative:
     """Another likely estimate; see `AlignedShape`."""
 
     alignment: Alignment
     relative_likelihood: float
+    warp: Warp
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,25 +48,34 @@ class AlignedShape:
     ----------
     alignment : Alignment
         Takes the box of the model that other methods are given to the estimated one.
-    std : Uncertainty
+    std : Uncertainty, optional
+        None for a method that states none.
     rms : float
         Of the residuals [px].
     sigma : float
         Standard deviation of the keypoints [px].
     warnings : tuple of str
     alternatives : tuple of AlignedAlternative
+    warp : Warp
+        What remains of the shape after the alignment.
     """
 
     alignment: Alignment
-    std: Uncertainty
+    std: Uncertainty | None
     rms: float
     sigma: float
     warnings: tuple[str, ...]
     alternatives: tuple[AlignedAlternative, ...]
+    warp: Warp
 
 
 def align_instance(
-    shape: ShapeModel, instance: Instance, own_ids: npt.ArrayLike, *, sigma: float
+    shape: ShapeModel,
+    instance: Instance,
+    own_ids: npt.ArrayLike,
+    own_xyz: npt.ArrayLike,
+    *,
+    sigma: float,
 ) -> AlignedShape:
     """Align a category's shape with an instance's keypoints, of which the shape knows.
 
@@ -64,6 +86,8 @@ def align_instance(
     own_ids : (k,) int
         Semantic ids of all keypoints of the instance's model, whose extent is its box where it has
         no mesh.
+    own_xyz : (k, 3) float
+        These keypoints as the image shows them.
     sigma : float
         Standard deviation of the keypoints [px].
 
@@ -80,7 +104,10 @@ def align_instance(
         sigma=sigma,
     )
     result = align(shape, view)
-    rows = np.isin(shape.ids, own_ids)
+    ids = np.asarray(own_ids)
+    rows = np.isin(shape.ids, ids)
+    given = np.asarray(own_xyz)[np.isin(ids, shape.ids)] / instance.gt.scale
+    order = shape.rows(ids[np.isin(ids, shape.ids)].tolist())
 
     def in_terms_of_the_model(
         alignment: Alignment, points: FloatArray, bounds: FloatArray
@@ -89,19 +116,24 @@ def align_instance(
             bounds = np.stack([points[rows].min(axis=0), points[rows].max(axis=0)])
         return box_alignment(alignment, bounds, model_bounds=instance.bounds)
 
+    def found(each: AlignResult | AlignAlternative) -> tuple[Alignment, Warp]:
+        alignment = in_terms_of_the_model(each.alignment, each.points_3d, each.bounds)
+        target = alignment.inverse(each.alignment.apply(each.points_3d[order]))
+        return alignment, Warp(given, target)
+
+    alignment, warp = found(result)
+    alternatives = []
+    for each in result.alternatives:
+        other, own_warp = found(each)
+        alternatives.append(AlignedAlternative(other, each.relative_likelihood, own_warp))
     return AlignedShape(
-        in_terms_of_the_model(result.alignment, result.points_3d, result.bounds),
+        alignment,
         result.std,
         _rms(result),
         sigma,
         result.warnings,
-        tuple(
-            AlignedAlternative(
-                in_terms_of_the_model(each.alignment, each.points_3d, each.bounds),
-                each.relative_likelihood,
-            )
-            for each in result.alternatives
-        ),
+        tuple(alternatives),
+        warp,
     )
 
 

@@ -19,9 +19,12 @@ A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON 
     }
 
 ``bounds`` and ``points_3d`` are those of the model that the methods were given, which is the
-dataset's times ``stretch``. The estimate of the method ``shape``, which is not given that model,
-takes the model's box to the estimated one; its ``std`` is that of lengths relative to the mean
-shape. ``std`` and ``sigma`` are null for methods that have none.
+dataset's times ``stretch``. Estimates of the object's own shape take the model's box to the
+estimated one; their ``std`` is that of lengths relative to the mean shape, or the model that was
+stretched. They and their alternatives have, besides,
+``"warp": {"from": [[3], ...], "to": [[3], ...]}``: keypoints of that model, and their places on the
+estimated object in the coordinates of the model, by which the model is warped before the pose.
+``std`` and ``sigma`` are null for methods that have none.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
-from cadalign.evaluation.instances.aligned import AlignedShape
+from cadalign.evaluation.instances.aligned import AlignedAlternative, AlignedShape
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -52,6 +55,7 @@ RECORD_COLUMNS: Columns = (
 # More than any picture can show, and little enough to store.
 _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
+_WARP_DIGITS = 6
 _LONGEST_NAME = 200  # bytes
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
@@ -115,12 +119,13 @@ def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     return {
         "method": method,
         **_pose(pose_of(estimate)),
-        "rms_px": round(outcome.values["rms_px"], _PIXEL_DIGITS),
+        **_warp(estimate),
+        "rms_px": _rms_px(outcome, estimate),
         "sigma": None if fit is None else fit.sigma,
         "std": None if fit is None or fit.std is None else vars(fit.std),
         "warnings": () if fit is None else fit.warnings,
         "alternatives": [
-            {**_pose(other.alignment), "likelihood": other.relative_likelihood}
+            {**_pose(other.alignment), **_warp(other), "likelihood": other.relative_likelihood}
             for other in (() if fit is None else fit.alternatives)
         ],
     }
@@ -131,6 +136,22 @@ def _pose(alignment: Alignment) -> dict[str, Any]:
     packed = [alignment.rotation.ravel(), alignment.translation, alignment.scale]
     values = _rounded(np.concatenate(packed))
     return {"rotation": values[:9], "translation": values[9:12], "scale": values[12:]}
+
+
+def _rms_px(outcome: Outcome, estimate: object) -> float | None:
+    """The residual of the result table, or else the estimate's own."""
+    rms = outcome.values.get("rms_px")
+    if rms is None and isinstance(estimate, AlignedShape):
+        rms = estimate.rms
+    return None if rms is None or not np.isfinite(rms) else round(rms, _PIXEL_DIGITS)
+
+
+def _warp(estimate: object) -> dict[str, Any]:
+    """The deformation of an estimated shape; nothing for the given model."""
+    if not isinstance(estimate, AlignedShape | AlignedAlternative):
+        return {}
+    ends = {"from": estimate.warp.source, "to": estimate.warp.target}
+    return {"warp": {name: _rounded(points, _WARP_DIGITS) for name, points in ends.items()}}
 
 
 def _rounded(values: FloatArray, digits: int = _MODEL_DIGITS) -> Any:

@@ -234,7 +234,8 @@ class KeypointNetExperiment:
         assert shape is not None
         sigma = self.options.noise_px or 1.0
         try:
-            return align_instance(shape, instance, task.semantic_ids, sigma=sigma)
+            own = task.semantic_ids, task.hull.xyz
+            return align_instance(shape, instance, *own, sigma=sigma)
         except CadalignError as error:
             return error
 

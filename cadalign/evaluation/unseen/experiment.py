@@ -43,14 +43,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale, reason_of
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.unseen.calibration import probability_level
 from cadalign.evaluation.unseen.learned import Learned
 from cadalign.evaluation.unseen.methods import ShapeEstimate, estimate_shape
 from cadalign.evaluation.unseen.options import UnseenOptions
+from cadalign.evaluation.unseen.records import keep_preview, sighting_record
 from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask, observe_object
 from cadalign.fitting.joint.align import align
 from cadalign.fitting.joint.model import Model
@@ -86,9 +90,11 @@ class UnseenExperiment:
 
     columns = COLUMNS
     timing_columns = (*_NAMES, ("seconds", float))
+    record_columns = RECORD_COLUMNS
 
     learned: Learned
     options: UnseenOptions
+    previews: RunFolder | None = None  # of the objects' meshes
 
     def warm_up(self) -> None:
         """Compile the kernels."""
@@ -104,22 +110,28 @@ class UnseenExperiment:
         overlap_up_to_scale(est=box, gt=box)
 
     def evaluate(self, tasks: Sequence[UnseenTask]) -> Rows:
-        """A row for every task and method."""
-        return Rows.of(outcome for task in tasks for outcome in self._outcomes(task))
+        """A row for every task and method, and a record for every task."""
+        return Rows.joined([self._rows(task) for task in tasks])
 
     def failure(self, task: UnseenTask, reason: str) -> Rows:
         """A failed row for every method."""
         return Rows.of(Outcome.failure(reason, task.names(name)) for name in self.options.methods)
 
-    def _outcomes(self, task: UnseenTask) -> list[Outcome]:
+    def _rows(self, task: UnseenTask) -> Rows:
         try:
             sighting = observe_object(task, self.options)
         except Exception as error:
-            reason = reason_of(error)
-            return [Outcome.failure(reason, task.names(name)) for name in self.options.methods]
-        return [self._outcome(task, sighting, method) for method in self.options.methods]
+            return self.failure(task, reason_of(error))
+        answers = [self._answer(task, sighting, method) for method in self.options.methods]
+        outcomes, estimates = zip(*answers, strict=True)
+        sigma = self.options.noise_px or 1.0
+        if self.previews is not None and task.view == 0:
+            keep_preview(self.previews, self.options.root, task)
+        return Rows.of(outcomes, [sighting_record(sighting, outcomes, estimates, sigma=sigma)])
 
-    def _outcome(self, task: UnseenTask, sighting: Sighting, method: str) -> Outcome:
+    def _answer(
+        self, task: UnseenTask, sighting: Sighting, method: str
+    ) -> tuple[Outcome, ShapeEstimate | CadalignError]:
         names, facts = task.names(method), {"keypoints": len(sighting.points_2d)}
         start = time.perf_counter()
         try:
@@ -127,8 +139,9 @@ class UnseenExperiment:
             seconds = time.perf_counter() - start
             values = facts | _errors(found, sighting)
         except Exception as error:
-            return Outcome.failure(reason_of(error), names, **facts)
-        return Outcome(names, values, seconds=seconds)
+            reason = reason_of(error)
+            return Outcome.failure(reason, names, **facts), DegenerateError(reason)
+        return Outcome(names, values, seconds=seconds), found
 
 
 def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:

@@ -50,6 +50,8 @@ class UnseenOptions(ModelOptions, NoiseOption):
     for those that agree."""
     views_per_model: int = 1
     """Number of views of each object."""
+    meshes: bool = False
+    """Keep small copies of the objects' meshes, which the report shows warped to the estimates."""
     methods: tuple[str, ...] = METHODS
     """random-rigid, random-stretched: a random model of the category; nearest: the best of the
     library; mean-rigid, mean-stretched: the category's mean; shape: its shape model; exact: the

@@ -14,7 +14,7 @@ from cadalign.evaluation.unseen.experiment import COLUMNS, UnseenExperiment
 from cadalign.evaluation.unseen.figures import plots
 from cadalign.evaluation.unseen.learned import learn
 from cadalign.evaluation.unseen.options import UnseenOptions
-from cadalign.evaluation.unseen.summary import HEADLINE, console_table, summarize
+from cadalign.evaluation.unseen.summary import GALLERY, HEADLINE, console_table, summarize
 from cadalign.evaluation.unseen.tasks import UnseenTask, UnseenTasks
 
 _CHUNK = 8
@@ -32,7 +32,8 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[UnseenTask]:
         "annotations": tasks.fingerprint(),
         "learned": learned.fingerprint(),
     }
-    return Plan(UnseenExperiment(learned, options), tasks, config, _CHUNK)
+    previews = folder if options.meshes else None
+    return Plan(UnseenExperiment(learned, options, previews), tasks, config, _CHUNK)
 
 
 def _describe(run: Run) -> str:
@@ -57,6 +58,11 @@ SPEC = Spec(
     plots=plots,
     title=partial(on_datasets, "unseen objects"),
     describe=_describe,
+    metrics=GALLERY,
+    about=(
+        "Green is the object with the box of its keypoints, red what a method found: the object "
+        "warped to the estimated keypoints, and their box."
+    ),
     note=(
         "Medians over the objects that did not fail; lengths in diagonals of the object. Up to "
         "scale: the estimate is scaled about the camera centre first, since one image does not "

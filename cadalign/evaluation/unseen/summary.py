@@ -40,6 +40,8 @@ _COVERAGE = (
     *(metrics.STRETCH_IN_68, metrics.STRETCH_IN_95),
     *(metrics.KEYPOINTS_IN_68, metrics.KEYPOINTS_IN_95),
 )
+GALLERY = _MEDIANS
+"""Errors of single objects."""
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, metrics.ROTATION, metrics.ROTATION_90),
     *(*_MEDIANS[1:], *_COVERAGE, metrics.QUERY_MILLISECONDS),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -31,7 +30,7 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
     """
     if isinstance(model, Model):
         if model.mesh is None:
-            fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
+            fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
             raise InputError("the model has no mesh, which a mask wants", where=where, fix=fix)
         if model.shape_sigma is None:
             return [RigidSurface(model.mesh)]
@@ -52,10 +51,13 @@ def _nearest_with_mesh(
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
         raise InputError("no training model has a mesh, which a mask wants", where=where, fix=fix)
-    each = [_only(training, row) for row in rows]
-    distances = [replace(model, training=alone).nearest(points_3d).distance for alone in each]
+    gaps = training.points_3d[rows].astype(np.float64) - points_3d
+    squares = (gaps**2).sum(axis=2)
+    known = np.isfinite(squares)
+    sums = np.where(known, squares, 0.0).sum(axis=1)
+    distances = np.where(known.any(axis=1), sums / np.maximum(known.sum(axis=1), 1), np.inf)
     order = np.argsort(distances, kind="stable")[:_MOST_MESHES]
-    return [each[k] for k in order]
+    return [_only(training, rows[k]) for k in order]
 
 
 def _only(training: TrainingShapes, row: int) -> TrainingShapes:
@@ -75,7 +77,7 @@ def _load(path: Path) -> Mesh:
     import trimesh  # takes long to import
 
     try:
-        loaded = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        loaded: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
         return Mesh(loaded.vertices, loaded.faces, source=str(path))
     except CadalignError:
         raise

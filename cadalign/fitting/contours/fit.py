@@ -19,7 +19,8 @@ from cadalign.fitting.contours.loop import (
 )
 from cadalign.fitting.contours.mask import mask_contour
 from cadalign.fitting.contours.residuals import MaskResiduals
-from cadalign.fitting.contours.surface import Surface
+from cadalign.fitting.contours.stack import with_displacement_modes
+from cadalign.fitting.contours.surface import RigidSurface, Surface
 from cadalign.fitting.joint.assemble import Minimum
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
@@ -36,6 +37,7 @@ _UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried 
 _LEAST_SUPPORT = 0.5  # share of the contour that must agree
 _LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
 _RELATIVE_TOLERANCE = 0.02
+_WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
 _INLIER = 3.5  # in deviations
 
@@ -67,9 +69,15 @@ class MaskFit(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A start, a surface, and where the rounds led; ``prior_score`` is that of the component."""
+    """A start, a surface, and where the rounds led.
+
+    ``evidence`` and ``state`` are those of the start, with displacements as modes where the surface
+    follows them; ``prior_score`` is that of the component.
+    """
 
     start: Minimum
+    evidence: Evidence
+    state: State
     prior_score: float
     surface: Surface
     settled: Settled
@@ -118,7 +126,13 @@ def fit_masks(
     used, left_out, warnings = list(contours), [], []
     best: list[_Candidate] = []
     while used:
-        best = _settled(likely[:_MOST_STARTS], keypoints, used, surfaces)
+        best = _settled(
+            likely[:_MOST_STARTS],
+            keypoints,
+            used,
+            surfaces,
+            follows_displacements=isinstance(model, Model),
+        )
         wrong = _contradicting(best, used)
         if wrong is None:
             break
@@ -150,24 +164,34 @@ def _settled(
     keypoints: int,
     contours: list[ViewContour],
     surfaces: list[Surface],
+    *,
+    follows_displacements: bool,
 ) -> list[_Candidate]:
-    """Every start with every surface; the scores are made comparable by the best one's noise."""
+    """Every start with the surface that fits best.
+
+    The scores of several starts are made comparable by the noise of the best one.
+    """
     found = []
     for start in starts:
         own = score_of(start.evidence, start.state, empty_system(start.evidence))
         extra = start.score - own if np.isfinite(start.score - own) else 0.0
+        evidence, state = start.evidence, start.state
+        if follows_displacements:
+            evidence, state = with_displacement_modes(evidence, state)
+        tried = []
         for surface in surfaces:
-            settled = settle(start.evidence, keypoints, start.state, contours, surface)
+            settled = settle(evidence, keypoints, state, contours, surface)
             if settled is not None:
-                found.append(_Candidate(start, extra, surface, settled))
+                tried.append(_Candidate(start, evidence, state, extra, surface, settled))
+        if tried:
+            found.append(min(tried, key=lambda each: _misfit(each.settled)))
     if len(found) > 1:
         reference = min(found, key=lambda each: _misfit(each.settled))
         noises = [fit.noise for fit in reference.settled.fits]
         again = []
         for each in found:
-            start = each.start
             settled = settle(
-                start.evidence, keypoints, each.settled.bare, contours, each.surface, noises
+                each.evidence, keypoints, each.settled.bare, contours, each.surface, noises
             )
             if settled is not None:
                 again.append(each._replace(settled=settled))
@@ -189,10 +213,12 @@ def _contradicting(
     if not candidates:
         return contours[0], "no part of the model's outline comes near its contour"
     best = candidates[0]
+    is_exact = isinstance(best.surface, RigidSurface)
+    relative = _RELATIVE_TOLERANCE if is_exact else _WARPED_TOLERANCE
     supports = []
     for contour, fit in zip(contours, best.settled.fits, strict=True):
         size = np.sqrt(np.prod(np.ptp(contour.contour.points, axis=0)))
-        tolerance = max(_LEAST_TOLERANCE, _RELATIVE_TOLERANCE * float(size))
+        tolerance = max(_LEAST_TOLERANCE, relative * float(size))
         supports.append(
             float((np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < tolerance).mean())
         )
@@ -210,15 +236,15 @@ def _tension(candidate: _Candidate) -> str | None:
     """Report other residuals that rise more than the masks' information explains."""
     from scipy.special import chdtri  # takes longer to import than all that is compiled
 
-    start = candidate.start
-    alone, joint = start.cost, _cost(start.evidence, candidate.settled.bare)
-    equations = 2 * len(start.evidence.sightings.point)
-    free = 6 * len(start.state.poses) + int(start.evidence.scales.free.sum())
+    evidence, state = candidate.evidence, candidate.state
+    alone, joint = _cost(evidence, state), _cost(evidence, candidate.settled.bare)
+    equations = 2 * len(evidence.sightings.point)
+    free = 6 * len(state.poses) + int(evidence.scales.free.sum())
     if not equations:
         return None
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
-    unknowns = min(free + len(start.state.coefficients), equations)
+    unknowns = min(free + len(state.coefficients), equations)
     if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
         return None
     times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))

@@ -77,6 +77,27 @@ def _moved(rows: IntArray, keypoints: int, total: int) -> IntArray:
     return np.where(rows >= keypoints, rows + total, rows)
 
 
+def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The same with the points' own displacements as modes, which a warped surface follows."""
+    shape = evidence.shape
+    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
+    if not len(rows):
+        return evidence, state
+    axes = np.tile(np.arange(3), len(rows) // 3)
+    own = np.zeros((len(rows), *shape.mean.shape))
+    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
+    moved = state.displacements[rows, axes] / np.exp(state.log_scales)[axes] / shape.spread[rows]
+    return (
+        evidence._replace(
+            shape=Shape(shape.mean, np.concatenate([shape.modes, own]), np.zeros_like(shape.spread))
+        ),
+        state._replace(
+            coefficients=np.concatenate([state.coefficients, moved]),
+            displacements=np.zeros_like(state.displacements),
+        ),
+    )
+
+
 def with_room(state: State, keypoints: int, rims: list[RimRows], offsets: FloatArray) -> State:
     """A state of the evidence without rims as one of the evidence with them.
 

@@ -113,7 +113,7 @@ function helpDialog() {
     h(
       "p",
       {},
-      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Every change is saved at once.",
+      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
     ),
     button("Close", () => dialog.close()),
   );

@@ -24,10 +24,10 @@ export class Panel {
 
   show(state, selected) {
     this.showAlignment(state.alignment);
-    this.showFocal(state.focal);
+    this.showFocal(state.focal, state.shape);
     this.showAdvice(state);
     this.showKeypoints(state.keypoints);
-    this.showPairs(state.pairs, selected);
+    this.showPairs(state, selected);
   }
 
   showAlignment(alignment) {
@@ -58,11 +58,12 @@ export class Panel {
       type: "number", min: "1", step: "any", inputMode: "decimal", "aria-label": "Focal length in pixels", onchange: choose,
     });
     this.note = h("p", { class: "soft" });
+    this.unknown = h("span");
     return h(
       "fieldset",
       { class: "focal" },
       h("legend", {}, "Focal length"),
-      h("label", {}, this.estimate, " unknown: estimate it"),
+      h("label", {}, this.estimate, this.unknown),
       h("label", {}, this.known, " known: ", this.pixels, " px"),
       this.note,
     );
@@ -75,7 +76,8 @@ export class Panel {
     this.handlers.act({ do: "focal", known, pixels: typed ? pixels : this.typedPixels ?? null });
   }
 
-  showFocal({ known, pixels, typed, note }) {
+  showFocal({ known, pixels, typed, note }, shape) {
+    this.unknown.textContent = shape ? " unknown: assume it" : " unknown: estimate it";
     this.known.checked = known;
     this.estimate.checked = !known;
     this.typedPixels = typed;
@@ -86,12 +88,12 @@ export class Panel {
     this.note.hidden = !note;
   }
 
-  showAdvice({ suggestion, alignment }) {
+  showAdvice({ suggestion, alignment, shape }) {
     if (!suggestion) {
       const text =
         alignment.status === "done"
-          ? "No other visible point would help."
-          : "Mark the same place in the photo and on the model; either comes first. Four pairs give the first alignment.";
+          ? nothingLeft(shape)
+          : `Mark the same place in the photo and on the model; either comes first. ${shape ? "Three" : "Four"} pairs give the first alignment.`;
       this.advice.replaceChildren(h("p", { class: "soft" }, text));
       return;
     }
@@ -126,15 +128,15 @@ export class Panel {
     return h("div", { class: "scroll" }, this.empty, this.table);
   }
 
-  showPairs(pairs, selected) {
+  showPairs({ pairs, shape }, selected) {
     this.empty.hidden = pairs.length > 0;
     this.table.hidden = pairs.length === 0;
     const focus = this.rows.contains(document.activeElement) ? document.activeElement.dataset.key : null;
-    this.rows.replaceChildren(...pairs.flatMap((pair) => this.row(pair, pair.pair === selected)));
+    this.rows.replaceChildren(...pairs.flatMap((pair) => this.row(pair, shape, pair.pair === selected)));
     if (focus) this.rows.querySelector(`[data-key="${focus}"]`)?.focus();
   }
 
-  row(pair, selected) {
+  row(pair, shape, selected) {
     const { act, select } = this.handlers;
     const number = button(String(pair.position), () => select(pair.pair), {
       class: pair.off === null ? "badge" : "badge wrong",
@@ -164,7 +166,31 @@ export class Panel {
         }),
       ),
     );
-    return pair.off === null ? [row] : [row, wrong(pair)];
+    const notes = pair.off === null ? [] : [wrong(pair)];
+    if (!pair.counts && shape.category) notes.push(this.identity(pair, shape));
+    return [row, ...notes];
+  }
+
+  /** The choice which keypoint of the shape a model point is that it does not know. */
+  identity(pair, { category, missing }) {
+    const choose = (event) => {
+      const label = missing[event.target.value];
+      if (label !== undefined) this.handlers.act({ do: "identify", pair: pair.pair, label });
+    };
+    const option = (text, value) => h("option", { value }, text);
+    const choice = h(
+      "select",
+      {
+        onchange: choose,
+        "aria-label": `Keypoint of ${category} that pair ${pair.position} is`,
+        "data-key": `identify ${pair.pair}`,
+      },
+      option("choose one", ""),
+      missing.map((label, at) => option(typeof label === "string" ? label : `keypoint ${label}`, at)),
+    );
+    const text = `Does not count: no keypoint of ${category} is known here`;
+    const ask = missing.length ? [". It is ", choice] : ".";
+    return h("tr", { class: "aside" }, h("td", { colSpan: 5 }, text, ask));
   }
 
   name(pair) {
@@ -178,6 +204,13 @@ export class Panel {
       onchange: (event) => this.handlers.act({ do: "rename", pair: pair.pair, name: event.target.value }),
     });
   }
+}
+
+/** Why no point is suggested. */
+function nothingLeft(shape) {
+  if (!shape) return "No other visible point would help.";
+  if (!shape.category) return "Every further pair helps; best far from the others.";
+  return `All visible keypoints of ${shape.category} that this model has are marked.`;
 }
 
 function wrong(pair) {

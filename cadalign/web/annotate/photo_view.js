@@ -7,6 +7,7 @@ const MOST_ZOOM = 64;
 const REACH = 16;
 const PIXELS_FROM = 4; // from this zoom on, pixels are shown as squares
 const BADGE_OFFSET = 17;
+const UNCERTAIN = "#ff96e1"; // estimated keypoints that are not marked, and their regions
 
 export class PhotoView {
   /**
@@ -180,8 +181,40 @@ export class PhotoView {
 
   drawAlignment(alignment) {
     if (alignment.status !== "done") return;
+    for (const region of alignment.faint_regions) this.strokeRegion(region, "rgb(255 150 225 / 30%)", 0.8);
     this.strokeLines(alignment.lines, "#35d0ff", 1.2);
     this.strokeLines(alignment.box, "#ff5a63", 2);
+    for (const region of alignment.regions) this.strokeRegion(region, "rgb(0 0 0 / 35%)", 2.6);
+    for (const region of alignment.regions) this.strokeRegion(region, UNCERTAIN, 1.2);
+    for (const { uv, state } of alignment.keypoints) {
+      if (state === "unmarked") this.drawRing(this.toView(uv));
+    }
+  }
+
+  /** Stroke a closed curve given as x1, y1, x2, y2, ... in pixels. */
+  strokeRegion(values, style, width) {
+    const { context } = this;
+    context.beginPath();
+    for (let k = 0; k < values.length; k += 2) {
+      const { x, y } = this.toView([values[k], values[k + 1]]);
+      context.lineTo(x, y);
+    }
+    context.closePath();
+    context.strokeStyle = style;
+    context.lineWidth = width;
+    context.stroke();
+  }
+
+  /** Where an estimated keypoint is that is not marked. */
+  drawRing({ x, y }) {
+    const { context } = this;
+    context.beginPath();
+    context.arc(x, y, 3.5, 0, 2 * Math.PI);
+    for (const [style, width] of [["rgb(0 0 0 / 60%)", 3.6], [UNCERTAIN, 1.8]]) {
+      context.strokeStyle = style;
+      context.lineWidth = width;
+      context.stroke();
+    }
   }
 
   /** Stroke lines given as x1, y1, x2, y2, ... in pixels. */

@@ -71,9 +71,9 @@ export function estimateTable(exhibit, estimate, label) {
       h("td", {}, deviation),
       h("td", {}, true_),
     );
-  // Deviations of the scale are relative; x is known.
+  // Deviations of the scale are relative; x is known unless the shape was estimated.
   const rows = [
-    ...[1, 2].map((axis) =>
+    ...(estimate.warp ? [0, 1, 2] : [1, 2]).map((axis) =>
       row(
         `scale ${AXES[axis]}`,
         number(scale[axis], 4),

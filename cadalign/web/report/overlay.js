@@ -1,6 +1,15 @@
 // Boxes, keypoints and wireframes drawn over a picture as SVG, in the picture's own pixels.
 import { h, svg } from "../common/dom.js";
-import { BOX_EDGES, cornersOf, matrixOf, pathOf, pixel, transform } from "./pose.js";
+import {
+  BOX_EDGES,
+  cornersOf,
+  matrixOf,
+  pathOf,
+  pixel,
+  shapeOf,
+  transform,
+  warped,
+} from "./pose.js";
 
 export const LAYERS = [
   { key: "g", label: "ground truth", kind: "gt" },
@@ -40,7 +49,7 @@ export function overlay(exhibit, { picture, estimate, wire = null, layers, label
   for (const [kind, pose] of poses) {
     if (!pose) continue;
     if (layers.has("w") && wire) {
-      const points = transform(matrixOf(pose, exhibit.stretch), wire.points);
+      const points = transform(matrixOf(pose), shapeOf(exhibit, pose, wire.points));
       drawing.append(svg("path", { class: `wire ${kind}`, d: pathOf(camera, points, wire.edges) }));
     }
     if (exhibit.bounds) drawing.append(...boxPaths(camera, exhibit.bounds, pose, kind));
@@ -57,14 +66,12 @@ function boxPaths(camera, bounds, pose, kind) {
 }
 
 /** Observed keypoints as rings; where the prediction puts them as dots, tied to the rings. */
-function keypoints(
-  { camera, points_2d: seen = [], points_3d: model = [], semantic_ids: ids = [] },
-  pose,
-) {
+function keypoints(exhibit, pose) {
+  const { camera, points_2d: seen = [], points_3d: model = [], semantic_ids: ids = [] } = exhibit;
   const group = svg("g", { class: "keypoints" });
   const size = camera.width / 160;
   const predicted = pose
-    ? transform(matrixOf(pose), model).map((point) => pixel(camera, point))
+    ? transform(matrixOf(pose), warped(exhibit, pose, model)).map((point) => pixel(camera, point))
     : [];
   seen.forEach(([u, v], i) => {
     const there = predicted[i];

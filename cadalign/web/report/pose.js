@@ -1,16 +1,29 @@
 // Poses as the estimates give them: depth * (u, v, 1) = K (R diag(scale) x + t).
 
+import { warpOf } from "./warp.js";
+
 const ONES = [1, 1, 1];
 const NEAR = 1e-6;
 
-/** x -> R diag(scale * before) x + t as 12 numbers, row by row. */
-export function matrixOf({ rotation, translation, scale }, before = ONES) {
+/** x -> R diag(scale) x + t as 12 numbers, row by row. */
+export function matrixOf({ rotation, translation, scale }) {
   const rows = [];
   for (let i = 0; i < 3; i++) {
-    for (let j = 0; j < 3; j++) rows.push(rotation[3 * i + j] * scale[j] * before[j]);
+    for (let j = 0; j < 3; j++) rows.push(rotation[3 * i + j] * scale[j]);
     rows.push(translation[i]);
   }
   return rows;
+}
+
+/** The given model's points, from the data set's: stretched, and warped where the pose says so. */
+export function shapeOf(exhibit, pose, points) {
+  const { stretch = ONES } = exhibit;
+  return warped(exhibit, pose, points.map((point) => point.map((value, k) => value * stretch[k])));
+}
+
+/** Points of the given model, warped where the pose says so. */
+export function warped({ bounds }, { warp }, points) {
+  return warp && bounds ? warpOf(warp, bounds)(points) : points;
 }
 
 /** Points in the camera's axes. */

@@ -17,7 +17,7 @@ import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import { themeColor } from "../common/colors.js";
 import { Stage } from "../common/stage.js";
-import { BOX_EDGES, anchorOf, cornersOf, matrixOf } from "./pose.js";
+import { BOX_EDGES, anchorOf, cornersOf, matrixOf, shapeOf } from "./pose.js";
 import { wireOf } from "./mesh.js";
 
 const FRUSTUM = 0.35; // the camera's size, as a part of its distance
@@ -67,14 +67,15 @@ export class Scene3D {
   addModel(exhibit, pose, kind, mesh, layers) {
     const color = themeColor(kind);
     if (mesh) {
-      const matrix = this.world.clone().multiply(matrix4(matrixOf(pose, exhibit.stretch)));
-      const solid = new Mesh(geometryOf(mesh), surface(color, kind));
+      const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
+      const { points, edges } = wireOf(mesh);
+      const shaped = shapeOf(exhibit, pose, points);
+      const solid = new Mesh(geometryOf(shaped, mesh.faces), surface(color, kind));
       // The true one is drawn over the predicted one, so that both are seen where they agree.
       solid.renderOrder = kind === "gt" ? 2 : 1;
       this.solids.add(placed(solid, matrix));
       if (layers.has("w")) {
-        const { points, edges } = wireOf(mesh);
-        this.solids.add(placed(segments(points, edges, color, 1), matrix));
+        this.solids.add(placed(segments(shaped, edges, color, 1), matrix));
       }
     }
     const matrix = this.world.clone().multiply(matrix4(matrixOf(pose)));
@@ -85,7 +86,7 @@ export class Scene3D {
       const geometry = new BufferGeometry();
       geometry.setAttribute(
         "position",
-        new BufferAttribute(Float32Array.from(exhibit.points_3d.flat()), 3),
+        new BufferAttribute(Float32Array.from((pose.warp?.to ?? exhibit.points_3d).flat()), 3),
       );
       const material = new PointsMaterial({
         color,
@@ -181,9 +182,9 @@ function surface(color, kind) {
   });
 }
 
-function geometryOf({ vertices, faces }) {
+function geometryOf(points, faces) {
   const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(vertices, 3));
+  geometry.setAttribute("position", new BufferAttribute(Float32Array.from(points.flat()), 3));
   geometry.setIndex(new BufferAttribute(faces, 1));
   return geometry;
 }

@@ -272,7 +272,13 @@ export class Viewer {
     const several = this.report.runs.length > 1;
     const run = several && this.report.runs[instance.run].name;
     const failed = method && this.report.failed(instance, method.key);
-    const caption = [run, method?.label, failed && "failed: no prediction to draw"]
+    const isWarped = mesh && this.pose(exhibit, method)?.warp;
+    const caption = [
+      run,
+      method?.label,
+      failed && "failed: no prediction to draw",
+      isWarped && "the model is warped to the estimated shape",
+    ]
       .filter(Boolean)
       .join(" \u00b7 ");
     if (!exhibit) {

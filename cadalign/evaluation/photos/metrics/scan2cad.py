@@ -80,7 +80,8 @@ class PlacedModel:
     symmetry : Symmetry
         Of a true model: motions that take it to itself.
     center : (3,) float
-        Of a true model: the point of the model whose positions are compared [model units].
+        Of a true model: the point of the model whose positions are compared [model units]. The
+        benchmark's script takes minus the centre of the model's box.
     """
 
     category: str

@@ -1,0 +1,263 @@
+"""The annotator with the object's own shape: a category's, or that of a similar model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.annotating import Case, place, place_all
+
+from cadalign import AlignResult, CadalignError, ShapeModel
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet, ModelKeypoints
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence
+from cadalign.shapes.examples import Example
+
+LACKING = 2  # keypoints of the model that the learned shape does not know
+
+
+def learn(points: np.ndarray, ids: list[Any]) -> ShapeModel:
+    """A category of stretched and distorted copies."""
+    rng = np.random.default_rng(0)
+    models = []
+    for row in range(60):
+        own = points * rng.normal(1, 0.08, 3) + rng.normal(0, 0.005, points.shape)
+        models.append(Example(f"chair {row}", ids, own, np.stack([own.min(0), own.max(0)])))
+    return ShapeModel.learn(models, category="chair", up_axis="y")
+
+
+@pytest.fixture(scope="module")
+def shape_file(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shape of chairs; two of the sample chair's keypoints were not learned, one is new."""
+    keypoints = KeypointNet(sample_root)["chair", "sample_chair_000"].keypoints
+    points = np.concatenate([keypoints.xyz[LACKING:], [[0.0, 0.1, 0.0]]])
+    ids = [*keypoints.semantic_ids[LACKING:].tolist(), 77]
+    path = tmp_path_factory.mktemp("shapes") / "chair.shape"
+    learn(points, ids).save(path)
+    return path
+
+
+def numbers(value: Any) -> list[float]:
+    """All numbers of nested lists and objects."""
+    if isinstance(value, dict):
+        return numbers(list(value.values()))
+    if isinstance(value, list | tuple):
+        return [number for item in value for number in numbers(item)]
+    return [] if isinstance(value, str) else [value]
+
+
+def live_shape(session: Session) -> LiveShape:
+    live, _ = session.live(session.photos[0])
+    assert isinstance(live, LiveShape)
+    return live
+
+
+def options_of(kind: str, shape_file: Path) -> dict[str, Any]:
+    return {"shape": shape_file} if kind == "learned" else {"shape_sigma": 0.02}
+
+
+@pytest.mark.parametrize("kind", ["learned", "similar"])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("count", [None, 6])
+def test_fit_of_the_observation_gives_the_pages_numbers(
+    case: Case,
+    capsys: pytest.CaptureFixture[str],
+    shape_file: Path,
+    kind: str,
+    count: int | None,
+    *,
+    weighted: bool,
+) -> None:
+    instance = case.instance
+    keep = slice(None if count is None else count + LACKING)
+    ids = instance.semantic_ids[keep]
+    sigma = np.random.default_rng(0).uniform(0.5, 2, len(ids)) if weighted else None
+    of_model = {
+        each.semantic_id: each.xyz for each in ModelKeypoints.load(case.keypoints).keypoints
+    }
+    points = np.array([of_model[number] for number in ids.tolist()])
+    given = Observation(points, instance.points_2d[keep], instance.camera, sigma, ids)
+    given.save(case.observation)
+    session = case.open(**options_of(kind, shape_file))
+    session.act(0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
+    page = live_shape(session).shown
+    assert page is not None
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command = AlignResult.from_dict(json.loads(capsys.readouterr().out))
+    saved = AlignResult.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
+    for fitted in (command, saved):
+        np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
+        ours, theirs = numbers(page.alignment.to_dict()), numbers(fitted.alignment.to_dict())
+        np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(fitted.bounds, page.bounds, atol=1e-9)
+        np.testing.assert_allclose(fitted.stretch, page.stretch, rtol=1e-9)
+        assert fitted.warnings == page.warnings
+        rows = [page.ids.index(label) for label in fitted.ids]
+        np.testing.assert_allclose(fitted.points_3d, page.points_3d[rows], atol=1e-9)
+        np.testing.assert_allclose(
+            fitted.points_cam_covariance, page.points_cam_covariance[rows], rtol=1e-9, atol=1e-15
+        )
+    shown = page_state(session, 0)["alignment"]
+    assert numbers(shown["alignment"]) == numbers(page.alignment.to_dict())
+    assert shown["rms"] == page.rms
+
+
+def test_page_shows_box_lines_keypoints_and_regions(case: Case, shape_file: Path) -> None:
+    session = case.open(shape=shape_file)
+    state = place_all(session, case)
+    drawn = state["alignment"]
+    shape = ShapeModel.open(shape_file)
+    assert state["shape"] == {"category": "chair", "missing": [77]}
+    assert len(drawn["keypoints"]) == len(shape.ids)
+    used = {number for number, _ in case.clicks} & set(shape.ids)
+    assert [keypoint["state"] for keypoint in drawn["keypoints"]].count("marked") == len(used)
+    assert len(drawn["regions"]) + len(drawn["faint_regions"]) > 1
+    assert drawn["faint_regions"]  # of the keypoint that the model lacks
+    assert len(drawn["lines"]) > 100
+    assert len(drawn["box"]) > 100
+    labels = [fact["label"] for fact in drawn["facts"]]
+    assert labels[:5] == [*(f"Length along {axis}" for axis in "xyz"), "Rotation", "Distance"]
+
+
+def test_three_pairs_give_an_estimate_that_says_what_is_open(case: Case, shape_file: Path) -> None:
+    session = case.open(shape=shape_file)
+    known = [click for click in case.clicks if click[0] in ShapeModel.open(shape_file).ids]
+    for keypoint, uv in known[:2]:
+        place(session, keypoint, uv)
+    assert page_state(session, 0)["alignment"]["message"].startswith("1 more pair to the first")
+    place(session, *known[2])
+    few = page_state(session, 0)
+    assert any("the pairs leave it open" in fact["note"] for fact in few["alignment"]["facts"])
+    assert few["suggestion"]["keypoint"] not in [keypoint for keypoint, _ in known[:3]]
+    for keypoint, uv in known[3:]:
+        place(session, keypoint, uv)
+    regions = [np.ptp(np.reshape(r, (-1, 2)), axis=0).max() for r in few["alignment"]["regions"]]
+    many = page_state(session, 0)["alignment"]
+    shrunk = [np.ptp(np.reshape(r, (-1, 2)), axis=0).max() for r in many["regions"]]
+    assert max(shrunk) < 0.5 * max(regions)
+
+
+def test_warp_carries_points_that_the_shape_lacks(case: Case, shape_file: Path) -> None:
+    """They don't count, are shown with where the warp puts them, and are not lost."""
+    session = case.open(shape=shape_file)
+    state = place_all(session, case)
+    lacking = [pair for pair in state["pairs"] if not pair["counts"]]
+    known = set(ShapeModel.open(shape_file).ids)
+    assert {pair["keypoint"] for pair in lacking} == {n for n, _ in case.clicks} - known
+    assert lacking
+    for pair in lacking:
+        assert np.linalg.norm(pair["residual"]) < 15
+    assert f"{len(lacking)} pair" in " ".join(state["alignment"]["notes"])
+    observation = Observation.load(case.observation)
+    assert observation.shape is not None
+    assert observation.shape.samefile(shape_file)
+    assert set(observation.semantic_ids.tolist()) <= known  # type: ignore[union-attr]
+    again = page_state(case.open(shape=shape_file), 0)["pairs"]
+    both = ({(p["keypoint"], tuple(p["uv"])) for p in pairs} for pairs in (state["pairs"], again))
+    assert next(both) == next(both)
+
+
+def test_points_of_the_model_can_be_identified(
+    case: Case, shape_file: Path, sample_root: Path
+) -> None:
+    """A new point does not get an id of the shape by chance, but on demand, and is saved."""
+    session = case.open(shape=shape_file)
+    session.act(0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
+    (pair,) = page_state(session, 0)["pairs"]
+    assert not pair["counts"]
+    assert pair["keypoint"] > 77
+    with pytest.raises(CadalignError, match="no keypoint of the shape"):
+        session.act(0, {"do": "identify", "pair": pair["pair"], "label": 99})
+    with pytest.raises(CadalignError, match="has its keypoint 5 already"):
+        session.act(0, {"do": "identify", "pair": pair["pair"], "label": 5})
+    session.act(0, {"do": "identify", "pair": pair["pair"], "label": 77})
+    state = page_state(session, 0)
+    assert state["pairs"][0]["counts"]
+    assert state["pairs"][0]["keypoint"] == 77
+    assert state["shape"]["missing"] == []
+    written = ModelKeypoints.load(session.keypoints_path)
+    assert 77 in written.semantic_ids
+    session.act(0, {"do": "undo"})
+    assert not page_state(session, 0)["pairs"][0]["counts"]
+
+
+def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
+    keypoints = ModelKeypoints.load(case.keypoints)
+    named = replace(
+        keypoints,
+        keypoints=tuple(replace(each, semantic_id=None) for each in keypoints.keypoints),
+    )
+    named.save(case.keypoints)
+    path = tmp_path / "named.shape"
+    learn(named.xyz, list(named.names)).save(path)
+    session = case.open(shape=path)
+    by_name = {point.name: number for number, point in session.registry}
+    for semantic_id, uv in case.clicks:
+        place(session, by_name[f"keypoint {semantic_id}"], uv)
+    page = live_shape(session)
+    assert page.counts.all()
+    assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
+    fitted = AlignResult.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
+    assert page.shown is not None
+    np.testing.assert_allclose(fitted.covariance, page.shown.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_assumed_focal_length_is_shown_and_not_saved(case: Case, shape_file: Path) -> None:
+    session = case.open(shape=shape_file, camera=None)
+    state = place_all(session, case)
+    assert "The focal length is assumed" in state["alignment"]["notes"][0]
+    assert not (case.folder / "photo_fit/fit.json").exists()
+    assert not Observation.load(case.observation).camera.focal_known
+    session.act(0, {"do": "focal", "known": True})
+    assert (case.folder / "photo_fit/fit.json").exists()
+    assert Observation.load(case.observation).camera.focal_known
+
+
+def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:
+    session = case.open(shape=shape_file)
+    place_all(session, case)
+    pairs = page_state(session, 0)["pairs"]
+    assert not [pair for pair in pairs if pair["off"] is not None]
+    wrong = next(pair for pair in pairs[3:] if pair["counts"])
+    u, v = wrong["uv"]
+    session.act(0, {"do": "move", "pair": wrong["pair"], "uv": [u - 60, v + 40]})
+    off = {pair["pair"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]}
+    assert list(off) == [wrong["pair"]]
+    assert off[wrong["pair"]] == pytest.approx(72, abs=20)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (lambda file: {"shape": file, "shape_sigma": 0.1}, "give one of the two options"),
+        (lambda file: {"shape_sigma": -1.0}, "--shape-sigma: -1 is not a standard deviation"),
+        (lambda file: {"shape": file.with_name("no.shape")}, "no.shape"),
+    ],
+)
+def test_bad_options_are_refused(
+    case: Case, shape_file: Path, options: Callable[[Path], dict[str, Any]], words: str
+) -> None:
+    with pytest.raises(CadalignError) as refused:
+        case.open(**options(shape_file))
+    assert words in str(refused.value)
+
+
+def test_evidence_that_would_be_lost_is_refused(case: Case) -> None:
+    instance = case.instance
+    Observation(
+        instance.points_3d,
+        instance.points_2d,
+        instance.camera,
+        evidence=ImageEvidence(up=np.array([0.0, -1.0, 0.0])),
+    ).save(case.observation)
+    with pytest.raises(CadalignError, match="evidence beyond keypoints"):
+        case.open()

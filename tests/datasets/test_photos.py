@@ -1,0 +1,129 @@
+"""What all data sets of photos have in common, and their recognition."""
+
+from __future__ import annotations
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+from support.files import write_json
+from support.photo_data import write_bop, write_photo, write_scan2cad, write_text
+
+import cadalign
+import cadalign.datasets
+from cadalign.cli import main
+from cadalign.datasets import Bop, CadModel, PhotoKeypoints, PhotoObject
+from cadalign.datasets.photos.photo import DepthImage, ModelFiles
+from cadalign.datasets.photos.recognise import PHOTO_FORMATS
+from cadalign.errors import DataError
+
+
+def test_photos_are_asked_for_by_number_and_name(tmp_path):
+    write_bop(tmp_path)
+    dataset = cadalign.datasets.open(tmp_path)
+    assert [photo.name for photo in dataset] == list(dataset.names)
+    assert dataset[1].name == dataset[-1].name == dataset[dataset.names[1]].name
+    with pytest.raises(DataError, match="no photo 'x'"):
+        dataset["x"]
+    with pytest.raises(IndexError):
+        dataset[2]
+    assert repr(dataset) == f"Bop({str(tmp_path)!r}): 2 photos"
+
+
+def test_data_sets_can_be_sent_to_other_processes(tmp_path):
+    write_bop(tmp_path)
+    dataset = Bop(tmp_path)
+    first = dataset[0]
+    copy = pickle.loads(pickle.dumps(dataset))
+    assert copy[0].objects[0].truth.cam_from_model == first.objects[0].truth.cam_from_model
+
+
+def test_problems_are_counted_once_and_few_are_logged(tmp_path, caplog):
+    write_bop(tmp_path, photos=50, images=False)
+    path = tmp_path / "test" / "000001" / "scene_gt.json"
+    path.write_text(json.dumps(dict.fromkeys(json.loads(path.read_text()), 3)))
+    dataset = Bop(tmp_path)
+    for _ in range(2):
+        assert list(dataset) == []
+    assert len(dataset.problems) == 50
+    assert len(caplog.records) == 21
+    assert "counted only" in caplog.records[-1].message
+
+
+def test_what_is_missing_is_told(tmp_path):
+    found = PhotoObject("3", "chair")
+    with pytest.raises(DataError, match="object 3: this object has no mask"):
+        found.read_mask()
+    with pytest.raises(DataError, match="model x: there is no mesh"):
+        CadModel("x", ModelFiles(None)).load_mesh()
+    with pytest.raises(DataError, match=r"gone\.obj"):
+        CadModel("x", ModelFiles(tmp_path / "gone.obj")).load_mesh()
+    with pytest.raises(DataError, match="2 keypoints, 1 names"):
+        PhotoKeypoints(np.zeros((2, 2)), ("a",), np.ones(2, dtype=bool))
+    color = write_photo(tmp_path / "color.png")
+    with pytest.raises(DataError, match="not a depth image"):
+        DepthImage(color, 1.0).read()
+
+
+def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
+    with pytest.raises(DataError, match="no such folder"):
+        cadalign.datasets.open(tmp_path / "gone")
+    with pytest.raises(DataError, match="no such folder"):
+        cadalign.datasets.open("a\0b")
+    with pytest.raises(DataError) as caught:
+        cadalign.datasets.open(tmp_path)
+    for each in PHOTO_FORMATS:
+        assert each.signature in str(caught.value)
+
+
+def test_annotations_of_other_kinds_are_not_taken_for_objectron(tmp_path):
+    write_json(tmp_path / "annotations" / "chair.json", [{"class_id": "03001627"}])
+    with pytest.raises(DataError, match="no data set of photos is recognised"):
+        cadalign.datasets.open(tmp_path)
+
+
+@pytest.mark.parametrize("bad", ["[" * 9999 + "]" * 9999, '"\\ud800"', "1e999", "9" * 5000, "nul"])
+@pytest.mark.parametrize("name", ["pix3d.json", "cars.json", "full_annotations.json"])
+def test_hostile_entries_are_told(tmp_path, name, bad):
+    write_text(tmp_path / name, f"[{bad}]")
+    with pytest.raises(DataError, match=name) as caught:
+        cadalign.datasets.open(tmp_path)[0]
+    assert len(str(caught.value)) < 2000
+
+
+@pytest.mark.parametrize("bad", ["[" * 9999 + "]" * 9999, '"\\ud800"', "1e999", "9" * 5000, "nul"])
+@pytest.mark.parametrize("name", ["scene_gt.json", "poses.json"])
+def test_hostile_tables_are_told(tmp_path, name, bad):
+    write_text(tmp_path / name, f'{{"1": {bad}}}')
+    with pytest.raises(DataError, match=str(tmp_path)) as caught:
+        cadalign.datasets.open(tmp_path)[0]
+    assert len(str(caught.value)) < 2000
+
+
+def test_the_doctor_lists_a_data_set(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    write_scan2cad(tmp_path, scenes=2, frames=2)
+    (tmp_path / "scans/scene0001_00/pose/1.txt").write_text("x")
+    assert main(["doctor", "--data", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "Scan2CAD" in text
+    assert "3 of 4 photos can be read, 3 with image" in text
+    assert "3 objects: 3 with pose, 3 with keypoints, 3 with CAD model, 0 with mask" in text
+    assert "Left out:" in text
+    assert main(["doctor", "--json", "--data", str(tmp_path)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["categories"] == {"chair": 3}
+    assert len(found["problems"]) == 1
+
+
+def test_the_doctor_fails_where_nothing_can_be_read(tmp_path, capsys):
+    assert main(["doctor", "--data", str(tmp_path)]) == 1
+    assert "no data set of photos is recognised" in capsys.readouterr().err
+    write_text(tmp_path / "label_2" / "0.txt", "")
+    write_text(tmp_path / "calib" / "0.txt", "")
+    assert main(["doctor", "--data", str(tmp_path)]) == 1
+
+
+def test_open_is_a_public_name():
+    assert cadalign.datasets.open is cadalign.datasets.open_photos

@@ -1,0 +1,133 @@
+"""Reduced modes: the same estimates, costs and covariances as with all modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.evidence import (
+    Directions,
+    Evidence,
+    Heights,
+    Lengths,
+    Planes,
+    Rig,
+    ScalePriors,
+    Shape,
+    Sightings,
+    State,
+    points_of,
+)
+from cadalign.solvers.joint.reduction import reduce_modes, used_points
+from cadalign.solvers.joint.search import search_joint
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
+NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)
+
+
+@pytest.fixture(params=[RANK, MODES])
+def rank(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+@pytest.fixture
+def evidence(rank: int) -> Evidence:
+    """Six of nine points in one view; the modes move them in ``rank`` or all 18 directions."""
+    rng = np.random.default_rng(rank)
+    mixed = rng.normal(size=(MODES, rank)) @ rng.normal(size=(rank, POINTS * 3))
+    shape = Shape(
+        rng.normal(size=(POINTS, 3)),
+        0.02 * mixed.reshape(MODES, POINTS, 3) / np.sqrt(rank),
+        np.zeros(POINTS),
+    )
+    truth = State(
+        np.concatenate([Rotation.random(random_state=rank).as_matrix().ravel(), [0.1, 0.2, 6.0]])[
+            None
+        ],
+        np.zeros(3),
+        rng.normal(size=MODES),
+        np.zeros((POINTS, 3)),
+    )
+    seen = points_of(shape, truth)[:SEEN] @ truth.poses[0, :9].reshape(3, 3).T
+    seen += truth.poses[0, 9:]
+    rays = seen[:, :2] / seen[:, 2:] + rng.normal(0, 1e-3, (SEEN, 2))
+    sightings = Sightings(
+        np.arange(SEEN),
+        np.zeros(SEEN, dtype=np.int64),
+        rays,
+        np.tile([1000.0, 0.0, 1000.0], (SEEN, 1)),
+        np.zeros((SEEN, 2)),
+        np.zeros(SEEN, dtype=np.int64),
+        np.ones(SEEN),
+    )
+    return Evidence(
+        shape,
+        sightings,
+        Rig(np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None], np.zeros(1, dtype=np.int64)),
+        Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
+        Lengths(np.empty((0, 2), dtype=np.int64), NONE, NO_VALUE, NO_VALUE),
+        Heights(NONE, NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
+        Planes(NONE, NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE, NONE, NO_VALUE),
+        ScalePriors(np.zeros(3), np.zeros((3, 3))),
+    )
+
+
+def best_of(evidence: Evidence, rank: int) -> tuple[State, float]:
+    rotation = Rotation.random(random_state=rank) * Rotation.from_rotvec([0.1, 0.0, 0.1])
+    start = np.concatenate([rotation.as_matrix().ravel(), [0.0, 0.0, 5.5]])[None, None]
+    minima, count, _ = search_joint(evidence, start, np.zeros((1, 3)))
+    assert count == 1
+    state = State(
+        minima.poses[0], minima.log_scales[0], minima.coefficients[0], minima.displacements[0]
+    )
+    return state, float(minima.scores[0])
+
+
+def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: int) -> None:
+    reduced, basis = reduce_modes(evidence)
+    assert basis.shape == (MODES, min(rank, 3 * SEEN))
+    assert np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
+    seen = evidence.shape.modes[:, :SEEN].reshape(MODES, -1)
+    assert np.allclose(basis @ basis.T @ seen, seen, atol=1e-8)
+    assert np.allclose(np.tensordot(basis.T, evidence.shape.modes, 1), reduced.shape.modes)
+
+
+def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
+    state, score = best_of(evidence, rank)
+    system = empty_system(evidence)
+    cost = evaluate_joint(evidence, state, system)
+    slope = np.linalg.solve(system.hessian, system.gradient)
+    assert system.gradient @ slope < 1e-9 * max(cost, 1.0)
+    assert score == pytest.approx(cost + np.linalg.slogdet(system.hessian)[1], rel=1e-9)
+
+
+def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> None:
+    state, _ = best_of(evidence, rank)
+    system = empty_system(evidence)
+    evaluate_joint(evidence, state, system)
+    inverse = np.linalg.inv(system.hessian)
+    inverse[6:9] = inverse[:, 6:9] = 0.0
+    unknowns, points, seen = joint_covariance(evidence, state)
+    assert np.allclose(unknowns, inverse, atol=1e-9 * np.abs(inverse).max())
+    by_modes = np.moveaxis(evidence.shape.modes, 0, 2)
+    expected = by_modes @ inverse[9:, 9:] @ by_modes.swapaxes(1, 2)
+    assert np.allclose(points, expected, atol=1e-9 * np.abs(expected).max())
+    turn = state.poses[0, :9].reshape(3, 3)
+    x, y, z = (points_of(evidence.shape, state) @ turn.T).T
+    zero = np.zeros(POINTS)
+    across = np.moveaxis(np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]), 2, 0)
+    rows = np.zeros((POINTS, 3, len(inverse)))
+    rows[:, :, :3], rows[:, :, 3:6], rows[:, :, 9:] = across, np.eye(3), turn @ by_modes
+    expected = rows @ inverse @ rows.swapaxes(1, 2)
+    assert np.allclose(seen, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_points_of_every_kind_of_evidence_count(evidence: Evidence) -> None:
+    lengths = Lengths(np.array([[6, 0]]), np.array([0]), np.ones(1), np.ones(1))
+    heights = Heights(np.array([7]), np.array([0]), np.eye(3)[1:2], np.ones(1), np.ones(1))
+    assert used_points(evidence).sum() == SEEN
+    more = evidence._replace(lengths=lengths, heights=heights)
+    assert used_points(more).tolist() == [True] * 8 + [False]

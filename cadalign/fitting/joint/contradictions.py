@@ -69,16 +69,10 @@ def contradictions(
         evidence = _without_hidden(evidence, state)
         state = copy_state(state)
         cost, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
-    whole = _determined(evidence, state)
-    trials = []
-    for piece in pieces:
-        rest, start = without(evidence, state, piece)
-        refitted = copy_state(start)
-        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
-        trials.append(_trial(piece, whole, rest, refitted, cost, lower))
     level = _FALSE_ALARMS / len(pieces)
-    if not any(trial is not None and _is_unlikely(trial, level) for trial in trials):
+    if not _is_suspicious(evidence, state, cost, pieces, level):
         return ()
+    whole = _determined(evidence, state)
     found = [_searched(evidence, state, cost, whole, piece, search) for piece in pieces]
     suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
     if not suspects:
@@ -94,6 +88,25 @@ def contradictions(
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
     return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _is_suspicious(
+    evidence: Evidence, state: State, cost: float, pieces: Sequence[Piece], level: float
+) -> bool:
+    """True if leaving out a piece, by a short refinement, saves more than is likely."""
+    from scipy.special import chdtri  # takes longer to import than all that is compiled
+
+    least = chdtri(1, level)
+    for piece in pieces:
+        rest, start = without(evidence, state, piece)
+        refitted = copy_state(start)
+        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
+        if not cost - lower >= least:  # of one equation; of more, more is likely
+            continue
+        trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
+        if trial is not None and _is_unlikely(trial, level):
+            return True
+    return False
 
 
 def _without_hidden(evidence: Evidence, state: State) -> Evidence:

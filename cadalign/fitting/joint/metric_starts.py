@@ -20,6 +20,7 @@ _GRID = 400
 _SCREENED = 64
 _MOST = 16
 _ROUNDS = 3  # of weighting by the depths of the last
+_ROUNDS_GIVEN_ROTATION = 2
 _LEAST_EQUATIONS = 12
 _CONDITION = 1e-7  # least singular value over the largest, of columns of unit length
 _LEAST_SCALE = 1e-6
@@ -145,7 +146,7 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
     extra_left, extra_right = _other_rows(evidence, rotation, basis)
     weights, cost = rows.weights, np.inf
     found = np.zeros(left.shape[1])
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_GIVEN_ROTATION):
         weighted = np.concatenate([left * weights[:, None], extra_left])
         target = np.concatenate([right * weights, extra_right])
         sizes = np.linalg.norm(weighted, axis=0)

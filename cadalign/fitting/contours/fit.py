@@ -126,7 +126,13 @@ def fit_masks(
     used, left_out, warnings = list(contours), [], []
     best: list[_Candidate] = []
     while used:
-        best = _settled(likely[:_MOST_STARTS], keypoints, used, surfaces)
+        best = _settled(
+            likely[:_MOST_STARTS],
+            keypoints,
+            used,
+            surfaces,
+            follows_displacements=isinstance(model, Model),
+        )
         wrong = _contradicting(best, used)
         if wrong is None:
             break
@@ -158,17 +164,27 @@ def _settled(
     keypoints: int,
     contours: list[ViewContour],
     surfaces: list[Surface],
+    *,
+    follows_displacements: bool,
 ) -> list[_Candidate]:
-    """Every start with every surface; the scores are made comparable by the best one's noise."""
+    """Every start with the surface that fits best.
+
+    The scores of several starts are made comparable by the noise of the best one.
+    """
     found = []
     for start in starts:
         own = score_of(start.evidence, start.state, empty_system(start.evidence))
         extra = start.score - own if np.isfinite(start.score - own) else 0.0
-        evidence, state = with_displacement_modes(start.evidence, start.state)
+        evidence, state = start.evidence, start.state
+        if follows_displacements:
+            evidence, state = with_displacement_modes(evidence, state)
+        tried = []
         for surface in surfaces:
             settled = settle(evidence, keypoints, state, contours, surface)
             if settled is not None:
-                found.append(_Candidate(start, evidence, state, extra, surface, settled))
+                tried.append(_Candidate(start, evidence, state, extra, surface, settled))
+        if tried:
+            found.append(min(tried, key=lambda each: _misfit(each.settled)))
     if len(found) > 1:
         reference = min(found, key=lambda each: _misfit(each.settled))
         noises = [fit.noise for fit in reference.settled.fits]

@@ -32,11 +32,12 @@ _REACH = 6.0  # in deviations of the residuals
 _COARSE_ROUNDS = 20
 _FINE_ROUNDS = 4
 _ITERATIONS = 12
-_SETTLED = 0.02  # [px], mean change of the offsets from round to round
+_SETTLED = 0.02  # [px], median change of the offsets from round to round, or in deviations
 _LEAST_SIGMA = 0.1  # [px]
 _LOSS_SCALE = 2.4  # in deviations: Cauchy's loss then keeps 95 % of the information
 _FIRST_OFFSET = 1.0  # [px], deviation of the offset that all of a contour has in common
 _LEAST_OFFSET = 0.1
+_LEAST_INFORMATION = 1e-12  # about an unknown, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +124,8 @@ def settle(
             _residuals(view, each, offset * noise.offset)
             for view, each, offset, noise in zip(views, rims, offsets, current, strict=True)
         ]
-        if moved < _SETTLED or number >= _COARSE_ROUNDS - _FINE_ROUNDS:
+        widest = max(noise.sigma for noise in current)
+        if moved < _SETTLED * max(1.0, widest) or number >= _COARSE_ROUNDS - _FINE_ROUNDS:
             fine += 1
         if noises is None:
             before = current
@@ -174,7 +176,7 @@ def _cauchy(residual: float, noise: Noise) -> float:
 
 
 def _change(last: list[Rims], rims: list[Rims]) -> float:
-    """Mean change of the rims' offsets [px] since the last round; infinite in the first."""
+    """Median change of the rims' offsets [px] since the last round; infinite in the first."""
     if not last:
         return np.inf
     changes = [np.zeros(0)]
@@ -208,7 +210,12 @@ def _relearned(
     """Deviations of the offsets by their own likelihood, and the offsets in these deviations."""
     system = empty_system(evidence)
     evaluate_joint(evidence, state, system)
-    variances = np.linalg.pinv(system.hessian).diagonal()[-len(noises) :]
+    size = len(system.gradient)
+    own = np.arange(size - len(noises), size)
+    sizes = np.sqrt(np.maximum(system.hessian.diagonal(), 1e-300))
+    scaled = system.hessian / np.outer(sizes, sizes) + _LEAST_INFORMATION * np.eye(size)
+    columns = np.linalg.solve(scaled, np.eye(size)[:, own])
+    variances = columns[own].diagonal() / sizes[own] ** 2
     learned, coefficients = [], []
     for noise, coefficient, variance in zip(noises, offsets, variances, strict=True):
         without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of noise.offset

@@ -338,9 +338,8 @@ def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
         [0, 0, 0.02],
         [0, 0, -0.02],
     ]
-    wider = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, -1], [0, 0, 1], [0, 0, -1]], float)
     mean = np.array(places, float)
-    model = ShapeModel.from_basis(mean, [wider], [0.06], residual_sigma=0.001)
+    model = ShapeModel.from_basis(mean, [mean * [0, 0, 1]], [1.2], residual_sigma=0.001)
     truth = truth_of((1.0, 1.0, 1.0))
     result = align(model, seen(mean, truth, np.eye(4)))
     assert rotation_error(est=result.alignment, gt=truth) < 5

@@ -37,6 +37,11 @@ class Contour(NamedTuple):
     normals: FloatArray
     curve: IntArray
 
+    @property
+    def size(self) -> float:
+        """Geometric mean of the extents [px]."""
+        return float(np.sqrt(np.prod(np.ptp(self.points, axis=0))))
+
     def taken(self, chosen: BoolArray | IntArray) -> Contour:
         """The samples that a mask or numbers choose."""
         return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])

@@ -20,7 +20,7 @@ from cadalign.fitting.contours.loop import (
 from cadalign.fitting.contours.mask import mask_contour
 from cadalign.fitting.contours.residuals import MaskResiduals
 from cadalign.fitting.contours.stack import with_displacement_modes
-from cadalign.fitting.contours.surface import RigidSurface, Surface
+from cadalign.fitting.contours.surface import Surface
 from cadalign.fitting.joint.assemble import Minimum
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
@@ -33,12 +33,15 @@ from cadalign.solvers.joint.search import score_of
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
 _MOST_STARTS = 4
+_MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
+_LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
 _UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried with them
 _LEAST_SUPPORT = 0.5  # share of the contour that must agree
 _LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
 _RELATIVE_TOLERANCE = 0.02
 _WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+_LARGEST = 24.0  # [px]
 _INLIER = 3.5  # in deviations
 
 
@@ -96,8 +99,7 @@ def fit_masks(
     model, prior, views
         Those of `cadalign.align`; without a mask the minima stay as they are.
     minima : sequence of Minimum
-        Estimates without masks, the likeliest first; their scores are infinite where nothing but
-        the masks determines the unknowns.
+        Estimates without masks, the likeliest first; starts where these leave something open.
 
     Raises
     ------
@@ -122,22 +124,25 @@ def fit_masks(
     first = minima[0]
     points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
     surfaces = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
-    likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
+    is_open = not _is_determined(first)
+    likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
+    most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
     best: list[_Candidate] = []
     while used:
         best = _settled(
-            likely[:_MOST_STARTS],
+            likely[:most],
             keypoints,
             used,
             surfaces,
             follows_displacements=isinstance(model, Model),
+            is_wide=is_open,
         )
         wrong = _contradicting(best, used)
         if wrong is None:
             break
         contour, reason = wrong
-        if len(used) == 1 and not np.isfinite(first.score):
+        if len(used) == 1 and is_open:
             if not best:
                 raise _no_rim(contour)
             warnings.append(f"views[{contour.image}].mask: {reason}")
@@ -159,6 +164,17 @@ def fit_masks(
     return MaskFit([_minimum(each) for each in best], tuple(residuals), tuple(warnings))
 
 
+def _is_determined(minimum: Minimum) -> bool:
+    """True if the evidence without masks determines all unknowns."""
+    system = empty_system(minimum.evidence)
+    evaluate_joint(minimum.evidence, minimum.state, system)
+    sizes = np.sqrt(system.hessian.diagonal())
+    if not np.isfinite(sizes).all() or not (sizes > 0).all():
+        return False
+    values = np.linalg.eigvalsh(system.hessian / np.outer(sizes, sizes))
+    return bool(values[0] > _LEAST_INFORMATION)
+
+
 def _settled(
     starts: Sequence[Minimum],
     keypoints: int,
@@ -166,6 +182,7 @@ def _settled(
     surfaces: list[Surface],
     *,
     follows_displacements: bool,
+    is_wide: bool,
 ) -> list[_Candidate]:
     """Every start with the surface that fits best.
 
@@ -180,7 +197,7 @@ def _settled(
             evidence, state = with_displacement_modes(evidence, state)
         tried = []
         for surface in surfaces:
-            settled = settle(evidence, keypoints, state, contours, surface)
+            settled = settle(evidence, keypoints, state, contours, surface, is_wide=is_wide)
             if settled is not None:
                 tried.append(_Candidate(start, evidence, state, extra, surface, settled))
         if tried:
@@ -201,9 +218,9 @@ def _settled(
 
 
 def _misfit(settled: Settled) -> float:
-    """Mean robust residual [px] of all samples, those without a rim at the reach's end."""
-    every = np.concatenate([np.nan_to_num(np.abs(fit.residuals), nan=24.0) for fit in settled.fits])
-    return float(np.minimum(every, 24.0).mean())
+    """Mean residual [px] of all samples, each at most `_LARGEST`, as of those without a rim."""
+    every = [np.nan_to_num(np.abs(fit.residuals), nan=_LARGEST) for fit in settled.fits]
+    return float(np.minimum(np.concatenate(every), _LARGEST).mean())
 
 
 def _contradicting(
@@ -213,12 +230,10 @@ def _contradicting(
     if not candidates:
         return contours[0], "no part of the model's outline comes near its contour"
     best = candidates[0]
-    is_exact = isinstance(best.surface, RigidSurface)
-    relative = _RELATIVE_TOLERANCE if is_exact else _WARPED_TOLERANCE
+    relative = _RELATIVE_TOLERANCE if best.surface.is_exact else _WARPED_TOLERANCE
     supports = []
     for contour, fit in zip(contours, best.settled.fits, strict=True):
-        size = np.sqrt(np.prod(np.ptp(contour.contour.points, axis=0)))
-        tolerance = max(_LEAST_TOLERANCE, relative * float(size))
+        tolerance = max(_LEAST_TOLERANCE, relative * contour.contour.size)
         supports.append(
             float((np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < tolerance).mean())
         )

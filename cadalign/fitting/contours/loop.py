@@ -26,7 +26,9 @@ from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.search import score_of
 from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
-_FIRST_REACH = 24.0  # [px]
+_FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
+_RELATIVE_REACH = 0.04
+_WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in deviations of the residuals
 _COARSE_ROUNDS = 20
@@ -37,6 +39,7 @@ _LEAST_SIGMA = 0.1  # [px]
 _LOSS_SCALE = 2.4  # in deviations: Cauchy's loss then keeps 95 % of the information
 _FIRST_OFFSET = 1.0  # [px], deviation of the offset that all of a contour has in common
 _LEAST_OFFSET = 0.1
+_FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
 _LEAST_INFORMATION = 1e-12  # about an unknown, relative
 
 
@@ -102,14 +105,20 @@ def settle(
     views: list[ViewContour],
     surface: Surface,
     noises: list[Noise] | None = None,
+    *,
+    is_wide: bool = False,
 ) -> Settled | None:
     """Rounds from one start until they change little; None where no rim comes near a contour.
 
-    With ``noises`` these are kept, so that the scores of several estimates compare.
+    With ``noises`` these are kept, so that the scores of several estimates compare. ``is_wide``
+    says that the start may be far off.
     """
     offsets = np.zeros(len(views))
-    reach = _FIRST_REACH if noises is None else _reach_of(max(noise.sigma for noise in noises))
-    current = noises or [Noise(view.sigma or reach / 3, 1.0, _FIRST_OFFSET) for view in views]
+    first_reach = max(_first_reach(view, is_wide=is_wide) for view in views)
+    reach = first_reach
+    if noises is not None:
+        reach = min(reach, _reach_of(max(noise.sigma for noise in noises)))
+    current = noises or [_first_noise(view, reach, is_exact=surface.is_exact) for view in views]
     fine = 0
     last: list[Rims] = []
     for number in range(_COARSE_ROUNDS):
@@ -131,9 +140,12 @@ def settle(
             before = current
             current = [
                 noise_of(view, each, residual, noise, correlated=fine > 0)
+                if surface.is_exact
+                else _noise_of_similar(view, each, residual, reach)
                 for view, each, residual, noise in zip(views, rims, residuals, current, strict=True)
             ]
-            reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
+            if surface.is_exact:
+                reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
         rows = [
             rim_rows(view, each, noise, posed, poses[view.image])
             for view, each, noise in zip(views, rims, current, strict=True)
@@ -148,7 +160,7 @@ def settle(
         if not cost < np.inf:
             return None
         state, offsets = without_rims(stacked, keypoints, rows)
-        if noises is None:
+        if noises is None and surface.is_exact:
             current, offsets = _relearned(full, stacked, current, offsets)
         last = rims
         if fine > _FINE_ROUNDS or (fine > 1 and noises is not None):
@@ -166,7 +178,13 @@ def settle(
 
 
 def _reach_of(sigma: float) -> float:
-    return float(np.clip(_REACH * sigma, _LEAST_REACH, _FIRST_REACH))
+    return max(_REACH * sigma, _LEAST_REACH)
+
+
+def _first_reach(view: ViewContour, *, is_wide: bool) -> float:
+    """Largest distance [px] between rim and contour at the start."""
+    share = _WIDE_REACH if is_wide else _RELATIVE_REACH
+    return max(_FIRST_REACH, share * view.contour.size)
 
 
 def _cauchy(residual: float, noise: Noise) -> float:
@@ -202,6 +220,23 @@ def noise_of(
         kept = rims.found & (np.abs(np.nan_to_num(residuals)) < 3 * sigma)
         length = correlation_length(view.contour, np.nan_to_num(residuals), kept)
     return Noise(sigma if view.sigma is None else view.sigma, length, noise.offset)
+
+
+def _first_noise(view: ViewContour, reach: float, *, is_exact: bool) -> Noise:
+    if is_exact:
+        return Noise(view.sigma or reach / 3, 1.0, _FIRST_OFFSET)
+    return Noise(reach / 3, _FIRST_CORRELATION, _LEAST_OFFSET)
+
+
+def _noise_of_similar(view: ViewContour, rims: Rims, residuals: FloatArray, reach: float) -> Noise:
+    """Deviation and correlation where the surface is only similar to the object's.
+
+    Samples without a rim count as the farthest: there the surface lacks a part or has one more.
+    """
+    everywhere = np.nan_to_num(residuals, nan=reach)
+    sigma = max(robust_deviation(everywhere), view.sigma or _LEAST_SIGMA)
+    length = correlation_length(view.contour, np.nan_to_num(residuals), rims.found)
+    return Noise(sigma, length, _LEAST_OFFSET)
 
 
 def _relearned(

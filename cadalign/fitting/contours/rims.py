@@ -14,6 +14,7 @@ from cadalign.geometry.projection import model_rays
 from cadalign.geometry.raycaster import RayCaster
 
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
+_MOST_STEPS = 24  # to either side
 _PRECISION = 0.01  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 
@@ -40,7 +41,7 @@ def find_rims(
     the rim runs at a steep angle to the contour, the two don't match.
     """
     count = len(contour.points)
-    intervals = 2 * int(np.ceil(reach / _LONGEST_STEP))
+    intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
     sight = _Sight(caster, camera, pose)
     covered = sight.covered(contour, steps[:, None] + np.zeros(count))

@@ -32,7 +32,11 @@ class PosedSurface(Protocol):
 
 
 class Surface(Protocol):
-    """A mesh that follows the shape."""
+    """A mesh that follows the shape; ``is_exact`` where it is that of the object."""
+
+    @property
+    def is_exact(self) -> bool:
+        """True if rim and contour differ by the errors of the contour alone."""
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
         """The mesh at a state."""
@@ -40,6 +44,8 @@ class Surface(Protocol):
 
 class RigidSurface:
     """The surface of an exact or stretched model; it is the same at all states."""
+
+    is_exact = True
 
     def __init__(self, mesh: Mesh) -> None:
         self.caster = caster_of(mesh)
@@ -58,6 +64,8 @@ class WarpedSurface:
 
     ``source`` (n, 3) are the mesh's keypoints, ``rows`` (n,) their numbers in the shape.
     """
+
+    is_exact = False
 
     def __init__(self, mesh: Mesh, source: FloatArray, rows: IntArray) -> None:
         self._mesh, self._rows = mesh, rows

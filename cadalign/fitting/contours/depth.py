@@ -153,7 +153,7 @@ def _bare(state: State, keypoints: int) -> State:
 
 
 def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples) -> _Rows:
-    """Where the rays of samples meet the surface, and the planes that say how deep they should."""
+    """Points where the rays of samples meet the surface, and planes at their measured depths."""
     origin, model_from_ray = model_rays(pose)
     directions = samples.rays @ model_from_ray.T
     face, depth = surface.caster.first_hits(origin, directions)

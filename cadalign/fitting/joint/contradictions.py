@@ -170,7 +170,7 @@ def _searched(
 def _trial(
     piece: Piece, whole: _Determined, rest: Evidence, state: State, cost: float, lower: float
 ) -> _Trial | None:
-    """What is saved without a piece; None if the rest does not determine the estimate."""
+    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
     left = _determined(rest, state)
     equations = whole.redundancy - left.redundancy
     if equations <= 0 or not lower < np.inf:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.fitting.joint.contradictions import count_equations
 from cadalign.fitting.joint.half_turns import half_turned
 from cadalign.fitting.joint.metric_starts import metric_starts
 from cadalign.solvers.joint.evidence import Evidence
@@ -35,6 +36,8 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
     if init is not None:
+        if _is_underdetermined(evidence):  # what the keypoints alone suggest is arbitrary
+            per_pose[0].clear()
         per_pose[0].insert(0, (init.pose, init.log_scales))
     elif is_metric and poses == 1:
         rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
@@ -66,6 +69,12 @@ class Start(NamedTuple):
 
     pose: FloatArray
     log_scales: FloatArray
+
+
+def _is_underdetermined(evidence: Evidence) -> bool:
+    """True if there are fewer equations than poses and scales have unknowns."""
+    unknowns = 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
+    return count_equations(evidence) - len(evidence.shape.modes) < unknowns
 
 
 def _with_rig(

@@ -1,4 +1,4 @@
-"""What every piece of evidence contributes to an alignment, as text and as JSON."""
+"""Contributions of the pieces of evidence to an alignment, as text and as JSON."""
 
 from __future__ import annotations
 

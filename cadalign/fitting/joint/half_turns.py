@@ -1,7 +1,7 @@
 """Starts half a turn away, where a flat object's shape leaves open which side is seen.
 
-The mean does not show such an ambiguity: a blade whose width varies more than it measures looks much
-the same from behind, with its edge and its back exchanged.
+The mean does not show such an ambiguity: a blade whose width varies more than it measures looks
+much the same from behind, with its edge and its back exchanged.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
 def half_turned(evidence: Evidence, view: int, poses: Sequence[FloatArray]) -> list[FloatArray]:
-    """Turn poses (12,) of the mean by half a turn, about each axis for which its shape allows it."""
+    """Turn poses (12,) of the mean by half a turn, about each axis that its shape allows."""
     sightings = evidence.sightings
     names = np.unique(sightings.point[(sightings.image == view) & (sightings.whitening[:, 2] > 0)])
     if len(names) < _LEAST_POINTS or evidence.scales.free.any():
@@ -32,7 +32,7 @@ def _half_turns(shape: Shape, names: IntArray) -> list[FloatArray]:
     points = shape.mean[names]
     centre = points.mean(axis=0)
     offsets = points - centre
-    modes = shape.modes[:, names].reshape(len(shape.modes), -1)
+    modes = shape.modes[:, names].reshape(len(shape.modes), offsets.size)
     unseen = _FLATNESS**2 * (offsets**2).sum(axis=1).max()
     own = np.repeat(shape.spread[names] ** 2, 3) + unseen
     largest = float((modes**2).sum(axis=1).max(initial=0.0) + own.max())

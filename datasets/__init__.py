@@ -22,7 +22,6 @@ from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, Phot
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.recognise import open_photos
-from cadalign.datasets.photos.recognise import open_photos as open
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
 from cadalign.datasets.sfm.blind_pnp import BlindPnP
@@ -30,6 +29,9 @@ from cadalign.datasets.sfm.bundler import Bundler
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
 from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
+
+# Not in __all__: a star import must not hide the built-in function.
+open = open_photos
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",
@@ -70,7 +72,6 @@ __all__ = [
     "flat_axes",
     "join_keypoints",
     "load_mesh",
-    "open",
     "open_correspondences",
     "open_photos",
     "read_image_keypoints",

@@ -68,7 +68,7 @@ class Case:
 
     @property
     def model(self) -> Model:
-        """What is aligned."""
+        """The model that is aligned."""
         return Model(points_3d=self.annotated.keypoints.xyz, mesh=self.scene.mesh)
 
     def view(self, mask: np.ndarray | None) -> View:
@@ -254,7 +254,7 @@ def ideal(bound: np.ndarray, case: Case, rng: np.random.Generator) -> np.ndarray
 
 
 def neighbours(cases: list[Case], arguments: Arguments) -> dict[str, float]:
-    """How often the mask of a neighbouring object is named, and what it does to the estimate."""
+    """Rate at which the mask of a neighbouring object is named, and its effect on the estimate."""
     named, ratios = [], []
     for number in range(arguments.neighbours):
         rng = np.random.default_rng([arguments.seed, 2, number])

@@ -87,7 +87,9 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(self, registry: KeypointRegistry, diagonal: float) -> tuple[Document, Camera | None]:
+    def read(
+        self, registry: KeypointRegistry, diagonal: float, shape: ObjectShape | None = None
+    ) -> tuple[Document, Camera | None]:
         """Read an earlier session's annotation.
 
         New model points are added to the registry; ``diagonal`` is that of the model's box. The
@@ -97,7 +99,7 @@ class AnnotationFiles:
         if self.observation.exists():
             observation = self._load()
             camera = observation.camera
-            self._warn_of_options(observation)
+            self._warn_of_options(observation, shape)
             document = _document_of(observation, registry, diagonal)
         if self.unfinished.exists():
             document = _with_halves(document, self.unfinished, registry)
@@ -158,10 +160,16 @@ class AnnotationFiles:
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
 
-    def _warn_of_options(self, observation: Observation) -> None:
+    def _warn_of_options(self, observation: Observation, shape: ObjectShape | None) -> None:
         """Warn of stored options of the fit that the page does not use."""
-        options = observation.fit_options.items()
-        others = [name for name, value in options if name != "sigma" or isinstance(value, float)]
+        ours = {} if shape is None else {"shape_sigma": shape.sigma}
+        others = [
+            name
+            for name, value in observation.fit_options.items()
+            if (name != "sigma" or isinstance(value, float)) and value != ours.get(name)
+        ]
+        if observation.shape is not None and (shape is None or shape.path is None):
+            others.append(f"shape {observation.shape}")
         if others:
             logger.warning(
                 "%s: the annotator fits without the stored %s, and replaces the stored options "

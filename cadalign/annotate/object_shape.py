@@ -68,7 +68,7 @@ class ObjectShape:
 
     @property
     def average(self) -> str:
-        """What the object is compared with, for a sentence."""
+        """The noun that the object is compared with in a sentence."""
         return "the model" if self.learned is None else f"the average {self.learned.category}"
 
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:

@@ -95,7 +95,7 @@ def open_session(
     shape = ObjectShape.open(options)
     registry = _open_registry(files.keypoints, source, model, cad, shape)
     photo_states = [
-        _open_photo_state(photo, file, model, camera, registry, cad.diagonal)
+        _open_photo_state(photo, file, model, camera, registry, cad.diagonal, shape)
         for photo, file in zip(files.photos, files.observations, strict=True)
     ]
     return Session(cad, registry, photo_states, files.keypoints, before_saving, shape)
@@ -124,9 +124,10 @@ def _open_photo_state(
     camera: Camera | None,
     registry: KeypointRegistry,
     diagonal: float,
+    shape: ObjectShape | None,
 ) -> PhotoState:
     files = AnnotationFiles(file, photo.path, model)
-    document, own = files.read(registry, diagonal)
+    document, own = files.read(registry, diagonal, shape)
     if own is not None and not own.focal_known:
         # The file leaves it to be estimated; the given camera's is kept for the user to choose.
         intrinsics = intrinsics_of(photo, camera or own)

@@ -19,7 +19,7 @@ from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.photos import Intrinsics, Photo
-from cadalign.annotate.shape_alignment import LiveShape, align_shape
+from cadalign.annotate.shape_alignment import LiveShape, align_shape, warm_up_joint
 from cadalign.annotate.suggestion import Suggestion, suggest, suggest_of_shape
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.errors import CadalignError, InputError, quote
@@ -75,6 +75,8 @@ class Session:
                 align(
                     problem.points_3d, problem.points_2d, None, intrinsics, FocalChoice(known=known)
                 )
+            if self.shape is not None:
+                warm_up_joint(problem.points_3d, problem.points_2d, problem.camera)
             # Takes seconds on a model of millions of faces, which the first click would wait for.
             _ = self.model.scene.caster, self.model.samples
         finally:  # an error here occurs again, and is reported, when the user aligns

@@ -18,6 +18,7 @@ from cadalign.fitting.joint.align import align
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.observed import views_of
 from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.view import View
 from cadalign.fitting.options import RansacOptions
 from cadalign.geometry.camera import Camera
 from cadalign.io.observation import Observation
@@ -62,6 +63,13 @@ class LiveShape:
     def fit_options(self) -> Mapping[str, Any]:
         """Options with which `cadalign fit` finds the same: its defaults."""
         return {}
+
+
+def warm_up_joint(points_3d: FloatArray, points_2d: FloatArray, camera: Camera) -> None:
+    """Compile or load what `align_shape` calls, by aligning points (n, 3) with (n, 2) [px]."""
+    view = View(camera, points_2d)
+    for ransac in (None, RansacOptions()):
+        align(Model(points_3d=points_3d, shape_sigma=0.01), view, ransac=ransac)
 
 
 def align_shape(
@@ -150,7 +158,7 @@ def _warp(
 
 
 def _contradicting(
-    model: Model | ShapeModel, view: Any, observation: Observation
+    model: Model | ShapeModel, view: View, observation: Observation
 ) -> dict[int, float]:
     """Distances [px] of pairs that a robust search leaves out, by their rows."""
     if len(observation.points_2d) < _LEAST_JUDGED:

@@ -1,4 +1,4 @@
-"""What every piece of evidence contributes to an alignment, as text and as JSON."""
+"""Contributions of the pieces of evidence to an alignment, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from cadalign.fitting.joint.result import AlignResult
+    from cadalign.fitting.joint.summary import Contribution
     from cadalign.fitting.uncertainty import Uncertainty
 
 _HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
@@ -23,7 +24,8 @@ def tabulate_contributions(result: AlignResult) -> str:
     if len(pieces) < 2:
         return ""
     rows = [_HEADS, ("with all evidence", *_cells(result.std))]
-    rows += [(f"without {piece.name}", *_cells(piece.without)) for piece in pieces]
+    several = len(result.poses) > 1
+    rows += [(f"without {_label(piece, several)}", *_cells(piece.without)) for piece in pieces]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
     lines = [
         "  ".join(
@@ -51,6 +53,13 @@ def list_contributions(result: AlignResult) -> dict[str, Any]:
             for piece in pieces
         ]
     }
+
+
+def _label(piece: Contribution, several: bool) -> str:
+    """The kind of a piece and, of several views, the one in the file's ``views``."""
+    return (
+        f"{piece.kind} of views[{piece.view}]" if several and piece.view is not None else piece.kind
+    )
 
 
 def _cells(std: Uncertainty) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ _DIGITS = 6
 _DASHES = ("-", "--", ":", "-.")
 # Of lines and markers [points].
 _THINNEST, _SMALLEST, _STEP = 1.5, 4.5, 0.35
+_MOST_STEPS = 7
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def _draw_lines(axes: Axes, plot: Plot, dash: str) -> list[tuple[Any, Any, Any, 
         middle = np.array(trace.y, dtype=float)
         if not np.isfinite(middle).any():
             continue
-        below = len(plot.traces) - 1 - place
+        below = min(len(plot.traces) - 1 - place, _MOST_STEPS)
         axes.plot(
             trace.x,
             middle,

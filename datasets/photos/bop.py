@@ -24,7 +24,16 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
-from cadalign.io.documents import Finite, ForeignDocument, NotNegative, Point3, Positive, convert
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    NotNegative,
+    Point3,
+    Positive,
+    convert,
+    in_file,
+    read_json,
+)
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
@@ -67,12 +76,13 @@ class _SceneCamera(ForeignDocument):
 
 @dataclass(frozen=True)
 class _Scene:
-    """The tables of a scene's folder; the values of each are parsed when they are asked for."""
+    """A scene's tables, whose values are parsed when they are asked for, and its common camera."""
 
     folder: Path
     truth: dict[str, Raw]
     cameras: dict[str, Raw]
     info: dict[str, Raw]
+    common: _SceneCamera | None
 
 
 class Bop(PhotoDataset):
@@ -174,7 +184,8 @@ def find_scenes(folder: Path) -> Iterator[Path]:
 def _read_scene(folder: Path) -> _Scene:
     tables = {name: folder / name for name in (_CAMERAS, _INFO)}
     found = {name: read_table(path) if path.is_file() else {} for name, path in tables.items()}
-    return _Scene(folder, read_table(folder / TRUTH), found[_CAMERAS], found[_INFO])
+    common = _common_camera(folder)
+    return _Scene(folder, read_table(folder / TRUTH), found[_CAMERAS], found[_INFO], common)
 
 
 def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
@@ -190,7 +201,7 @@ def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
 
 def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None, float]:
     """The photo's camera, None where its size is not known; and the depth's scale."""
-    common, path = _common_camera(scene.folder)
+    common = scene.common
     size = photo_size(image) if image is not None else None
     if size is None and common is not None and common.width and common.height:
         size = int(common.width), int(common.height)
@@ -210,26 +221,21 @@ def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None,
     try:
         return Camera(*size, *values), scale
     except InputError as error:
-        where = path if key not in scene.cameras else scene.folder / _CAMERAS
-        raise DataError(error.what, where=f"{where}, {key}") from None
+        where = f"{scene.folder}, camera of photo {key}"
+        raise DataError(error.what, where=where) from None
 
 
-def _common_camera(folder: Path) -> tuple[_SceneCamera | None, Path | None]:
+def _common_camera(folder: Path) -> _SceneCamera | None:
     """The camera of all photos of a scene: its own, or that of a folder above it."""
     for place in (folder, *folder.parents[:2]):
         path = place / _CAMERA
         if path.is_file():
-            table = read_table(path)
-            whole: dict[str, Any] = {
-                name: parse(value, Any, path=path, where=name) for name, value in table.items()
-            }
-            if "fx" not in whole:
-                continue
-            from cadalign.io.documents import in_file
-
-            with in_file(path):
-                return convert(whole, _SceneCamera), path
-    return None, None
+            data = read_json(path)
+            if isinstance(data, dict) and "fx" in data:
+                with in_file(path):
+                    found: _SceneCamera = convert(data, _SceneCamera)
+                return found
+    return None
 
 
 def _object(number: int, pose: _Pose, models: BopModels | None) -> PhotoObject:

@@ -85,7 +85,7 @@ class NamedPoints:
 
 
 class ModelSource(Protocol):
-    """Where a CAD model's mesh and keypoints are read from, each when it is asked for."""
+    """Source of a CAD model's mesh and keypoints, each read when it is asked for."""
 
     def load_mesh(self) -> Mesh | None:
         """Read the mesh; None where there is none."""
@@ -166,7 +166,7 @@ class CadModel:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is known of an object's pose; anything may be missing.
+    """The known parts of an object's pose; anything may be missing.
 
     Parameters
     ----------

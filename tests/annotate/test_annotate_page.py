@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,13 @@ from playwright.sync_api import Browser, Page, expect
 from support.annotating import Case, place_all, place_twenty, served
 from support.timing import Yardstick, reference_seconds
 
+from cadalign import ShapeModel
 from cadalign.annotate.guard import Access
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
+from cadalign.datasets import ModelKeypoints
+from cadalign.shapes.examples import Example
 
 READY = (
     "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
@@ -448,3 +452,42 @@ def test_every_control_has_a_name_and_nothing_sticks_out(
         assert page.locator("h1").count() == 1
         assert driver.errors == []
     context.close()
+
+
+def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: Case) -> None:
+    """Rings and regions of unmarked keypoints, and the choice which keypoint a point is."""
+    points = ModelKeypoints.load(case.keypoints)
+    rng = np.random.default_rng(0)
+    ids = [int(number or 0) for number in points.semantic_ids[1:]]
+    examples = [
+        Example(f"chair {row}", ids, points.xyz[1:] * rng.normal(1, 0.1, 3)) for row in range(40)
+    ]
+    file = case.folder / "chair.shape"
+    ShapeModel.learn(examples, category="chair").save(file)
+    few = replace(points, keypoints=points.keypoints[:-1])  # the model lacks one of the shape
+    few.save(case.keypoints)
+    session = case.open(shape=file)
+    context = browser.new_context(viewport={"width": 1000, "height": 760})
+    with served(session) as access:
+        driver = Driver(context.new_page(), session)
+        driver.open(access)
+        page = driver.page
+        expect(page.get_by_text("Three pairs give the first alignment")).to_be_visible()
+        known = [click for click in case.clicks if click[0] in ids[:-1]][:4]
+        for keypoint, uv in known:
+            session.act(0, {"do": "place_uv", "uv": uv})
+            session.act(0, {"do": "place_keypoint", "keypoint": keypoint})
+        driver.open(access)
+        state = driver.wait_for_state(lambda state: state["alignment"]["status"] == "done")
+        assert state["alignment"]["regions"]
+        expect(page.locator(".facts dt").first).to_have_text("Length along x")
+        page.wait_for_timeout(200)
+        assert page.evaluate(COUNT_COLOR, [255, 150, 225]) > 10
+        session.act(0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
+        driver.open(access)
+        choice = page.get_by_label("Keypoint of chair that pair 5 is")
+        choice.select_option(f"keypoint {ids[-1]}")
+        driver.wait_for_state(lambda state: state["pairs"][4]["counts"])
+        expect(choice).to_have_count(0)
+        context.close()
+        assert driver.errors == []

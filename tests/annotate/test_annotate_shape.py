@@ -251,6 +251,20 @@ def test_bad_options_are_refused(
     assert words in str(refused.value)
 
 
+def test_a_stored_shape_is_named_where_it_is_not_used(
+    case: Case, shape_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for options in ({"shape": shape_file}, {"shape_sigma": 0.02}):
+        place_all(case.open(**options), case)
+        case.open(**options)
+        assert caplog.text == ""
+        case.open()
+        assert "fits without the stored shape" in caplog.text
+        caplog.clear()
+        for file in case.folder.glob("photo*.json"):
+            file.unlink()
+
+
 def test_evidence_that_would_be_lost_is_refused(case: Case) -> None:
     instance = case.instance
     Observation(

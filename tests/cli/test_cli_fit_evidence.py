@@ -15,8 +15,10 @@ from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
 
 from cadalign import AlignResult, Model, Size, View, align
 from cadalign.cli import main
+from cadalign.datasets import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.overlay import EST_COLOR
 
 POINTS = keypoints()
@@ -59,8 +61,8 @@ def test_gravity_and_size_are_used_as_by_align(
     assert [line.strip().split("  ")[0] for line in lines] == [
         "standard deviations",
         "with all evidence",
-        "without views[0].points_2d",
-        "without views[0].up",
+        "without keypoints",
+        "without gravity",
         "without size",
     ]
     assert lines[0].split()[2:] == ["rotation", "position", "x", "y", "z"]
@@ -104,7 +106,7 @@ def test_views_of_a_rig_share_the_model(tmp_path: Path, capsys: pytest.CaptureFi
         assert near.sum() > 20
     assert (pictures[0] != pictures[1]).any()
     captured = capsys.readouterr()
-    assert "without views[2].points_2d" in captured.out
+    assert "without keypoints of views[2]" in captured.out
     assert f"Pictures: {tmp_path / 'a_fit' / 'overlay.png'}, " in captured.err
 
 
@@ -142,6 +144,29 @@ def test_depths_of_keypoints_are_used(tmp_path: Path) -> None:
     found = result_in(tmp_path).alignment
     expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d, depth=depths))
     assert found == expected.alignment
+
+
+def test_mask_sharpens_the_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+    quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    lines += [f"f {a} {b} {c} {d}" for a, b, c, d in quads]
+    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    truth = truth_of((1.0, 0.7, 1.5))
+    mask = cast_geometry(Scene(load_mesh(tmp_path / "box.obj")), CAMERA, truth).mask
+    cv2.imwrite(str(tmp_path / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+    noise = np.random.default_rng(0).normal(0, 1, (7, 2))
+    pixels = CAMERA.project(truth.apply(corners[:7])) + noise
+    evidence = ImageEvidence(mask=tmp_path / "mask.png")
+    image = ObservedImage(corners[:7], pixels, CAMERA, evidence=evidence)
+    path = write(tmp_path, image, model=tmp_path / "box.obj")
+    assert main(["fit", str(path)]) == 0
+    found = result_in(tmp_path)
+    np.testing.assert_allclose(found.alignment.scale, truth.scale, rtol=0.01)
+    assert "without mask" in capsys.readouterr().out
+    data = json.loads((tmp_path / "a_fit" / "fit.json").read_text())
+    without = {each["kind"]: each["std_without"] for each in data["contributions"]}
+    assert without["mask"]["rotation_deg"] > 2 * data["std"]["rotation_deg"]
 
 
 # --- refusals ----------------------------------------------------------------------------------

@@ -6,13 +6,14 @@ import base64
 import io
 import itertools
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Locator, expect
 from support.pages import Opened, card_names, open_first
-from support.reports import METHODS, WARNING, Recipe, listed, payload_of
+from support.reports import METHODS, WARNING, Recipe, listed, payload_of, write_page
 
 from cadalign import Alignment
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -184,3 +185,32 @@ def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
     expect(dialog.locator(".stage")).to_contain_text("needs WebGL")
     page.keyboard.press("ArrowRight")
     expect(dialog.locator("table").first).to_be_visible()
+
+
+def test_a_warped_model_is_drawn_at_the_estimated_keypoints(
+    opened: Opened, plain: str, tmp_path: Path
+) -> None:
+    """In the overlay and in the 3D view; the box stays the estimate's."""
+    exhibits = payload_of(Recipe())["exhibits"]
+    for exhibit in exhibits.values():
+        places = np.array(exhibit["points_3d"])
+        for estimate in exhibit["estimates"]:
+            moved = places + 0.2 * np.ptp(places, axis=0)
+            estimate["warp"] = {"from": places.tolist(), "to": moved.tolist()}
+    warped = write_page(tmp_path / "report.html", Recipe(), exhibits=exhibits)
+    seen = []
+    for address in (plain, warped):
+        page = opened(f"{address}#order=listed&show={METHODS[1]}&layers=gpkw")
+        dialog = open_first(page)
+        shown = {
+            name: dialog.locator(f".overlay .{name}").get_attribute("d") or ""
+            for name in ("wire.est", "wire.gt", "box.est")
+        }
+        seen.append((shown, look(dialog.locator(".stage canvas"))))
+        words = dialog.get_by_text("the model is warped to the estimated shape")
+        expect(words).to_have_count(int(address == warped))
+    (before, solid_before), (after, solid_after) = seen
+    assert before["wire.gt"] == after["wire.gt"]
+    assert before["box.est"] == after["box.est"]
+    assert before["wire.est"] != after["wire.est"]
+    assert changed(solid_before, solid_after) > 0.01

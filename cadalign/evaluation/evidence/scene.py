@@ -24,7 +24,7 @@ _TURNS = (0, 1, -1, 2, -2)  # places of the cameras around the object
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What one camera shows.
+    """One camera's image.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
     """
     if isinstance(model, Model):
         if model.mesh is None:
-            fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
+            fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
             raise InputError("the model has no mesh, which a mask wants", where=where, fix=fix)
         if model.shape_sigma is None:
             return [RigidSurface(model.mesh)]

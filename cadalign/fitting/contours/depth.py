@@ -18,6 +18,7 @@ from cadalign.fitting.contours.loop import poses_of
 from cadalign.fitting.contours.surface import PosedSurface, Surface
 from cadalign.fitting.joint.assemble import Minimum
 from cadalign.fitting.joint.model import Model
+from cadalign.fitting.joint.pieces import kept_rows
 from cadalign.fitting.joint.prior import ShapePrior
 from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
@@ -136,9 +137,8 @@ def _settled(
 
 def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:
     """The evidence without depths at keypoints, which may be hidden, where the surface has them."""
-    planes = evidence.planes
-    kept = ~np.isin(planes.image, [each.image for each in samples])
-    return evidence._replace(planes=Planes(*(column[kept] for column in planes)))
+    kept = ~np.isin(evidence.planes.image, [each.image for each in samples])
+    return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
 def _without_extras(shape: Shape, keypoints: int) -> Shape:
@@ -153,7 +153,7 @@ def _bare(state: State, keypoints: int) -> State:
 
 
 def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples) -> _Rows:
-    """Where the rays of samples meet the surface, and the planes that say how deep they should."""
+    """Points where the rays of samples meet the surface, and planes at their measured depths."""
     origin, model_from_ray = model_rays(pose)
     directions = samples.rays @ model_from_ray.T
     face, depth = surface.caster.first_hits(origin, directions)

@@ -1,4 +1,4 @@
-"""How well a contour is known: deviation and correlation of the residuals along it."""
+"""Accuracy of a contour: deviation and correlation of the residuals along it."""
 
 from __future__ import annotations
 

@@ -82,16 +82,25 @@ def _depths(
     evidence: Evidence, state: State, points: FloatArray, view: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Expected and measured depths of a view (n,), with the inverse deviations."""
-    sightings, planes = evidence.sightings, evidence.planes
-    rows, others = depths_in(evidence, view), planes.image == view
+    sightings, rows = evidence.sightings, depths_in(evidence, view)
     seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
-    on_planes = seen_in_cameras(evidence, state, points[planes.point[others]], planes.image[others])
-    distances = (on_planes * planes.normal[others]).sum(axis=1)
+    expected, measured, weights, images = plane_distances(evidence, state)
+    others = images == view
     return (
-        np.concatenate([seen[:, 2], distances]),
-        np.concatenate([sightings.depths[rows, 0], planes.offset[others]]),
-        np.concatenate([sightings.depths[rows, 1], planes.weight[others]]),
+        np.concatenate([seen[:, 2], expected[others]]),
+        np.concatenate([sightings.depths[rows, 0], measured[others]]),
+        np.concatenate([sightings.depths[rows, 1], weights[others]]),
     )
+
+
+def plane_distances(
+    evidence: Evidence, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Expected and measured distances along planes' normals, inverse deviations, and views."""
+    planes = evidence.planes
+    points = points_of(evidence.shape, state)[planes.point]
+    seen = seen_in_cameras(evidence, state, points, planes.image)
+    return (seen * planes.normal).sum(axis=1), planes.offset, planes.weight, planes.image
 
 
 def _of_up(evidence: Evidence, state: State, view: int) -> list[EvidenceSummary]:

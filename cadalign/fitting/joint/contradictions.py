@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.fitting.joint.agreement import depth_factor
-from cadalign.fitting.joint.pieces import Piece, pieces_of, without
+from cadalign.fitting.joint.agreement import depth_factor, plane_distances
+from cadalign.fitting.joint.pieces import Piece, kept_rows, pieces_of, without
 from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.fitting.joint.summary import name_of
 from cadalign.solvers.joint.evidence import Evidence, State, copy_state
@@ -25,6 +25,7 @@ from cadalign.solvers.joint.system import empty_system, evaluate_joint
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
 _LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown of
+_HIDDEN = 6.0  # [sigma], of a depth from most others of its image
 _WRONG_UNIT = 100.0  # factor between measured and expected depths
 _PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
 _AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
@@ -64,16 +65,14 @@ def contradictions(
         return ()
     evidence, basis = reduce_modes(evidence)
     state = state._replace(coefficients=state.coefficients @ basis)
-    whole = _determined(evidence, state)
-    trials = []
-    for piece in pieces:
-        rest, start = without(evidence, state, piece)
-        refitted = copy_state(start)
-        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
-        trials.append(_trial(piece, whole, rest, refitted, cost, lower))
+    if len(evidence.planes.point):
+        evidence = _without_hidden(evidence, state)
+        state = copy_state(state)
+        cost, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
     level = _FALSE_ALARMS / len(pieces)
-    if not any(trial is not None and _is_unlikely(trial, level) for trial in trials):
+    if not _is_suspicious(evidence, state, cost, pieces, level):
         return ()
+    whole = _determined(evidence, state)
     found = [_searched(evidence, state, cost, whole, piece, search) for piece in pieces]
     suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
     if not suspects:
@@ -89,6 +88,36 @@ def contradictions(
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
     return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _is_suspicious(
+    evidence: Evidence, state: State, cost: float, pieces: Sequence[Piece], level: float
+) -> bool:
+    """True if leaving out a piece, by a short refinement, saves more than is likely."""
+    from scipy.special import chdtri  # takes longer to import than all that is compiled
+
+    least = chdtri(1, level)
+    for piece in pieces:
+        rest, start = without(evidence, state, piece)
+        refitted = copy_state(start)
+        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
+        if not cost - lower >= least:  # of one equation; of more, more is likely
+            continue
+        trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
+        if trial is not None and _is_unlikely(trial, level):
+            return True
+    return False
+
+
+def _without_hidden(evidence: Evidence, state: State) -> Evidence:
+    """The evidence without depths that differ from most of their image: of something else."""
+    expected, measured, weights, images = plane_distances(evidence, state)
+    kept = np.ones(len(images), dtype=bool)
+    for view in np.unique(images):
+        rows = images == view
+        factor = np.median(measured[rows] / expected[rows])
+        kept[rows] = np.abs(measured / factor - expected)[rows] * weights[rows] < _HIDDEN
+    return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
 def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
@@ -141,7 +170,7 @@ def _searched(
 def _trial(
     piece: Piece, whole: _Determined, rest: Evidence, state: State, cost: float, lower: float
 ) -> _Trial | None:
-    """What is saved without a piece; None if the rest does not determine the estimate."""
+    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
     left = _determined(rest, state)
     equations = whole.redundancy - left.redundancy
     if equations <= 0 or not lower < np.inf:

@@ -1,4 +1,4 @@
-"""What each piece of evidence contributes to an estimate: its deviations without the piece."""
+"""Contribution of each piece of evidence to an estimate: the deviations without the piece."""
 
 from __future__ import annotations
 

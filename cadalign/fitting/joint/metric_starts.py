@@ -17,8 +17,10 @@ from cadalign.fitting.joint.scales import has_scale_prior
 from cadalign.solvers.joint.evidence import Evidence
 
 _GRID = 400
+_SCREENED = 64
 _MOST = 16
 _ROUNDS = 3  # of weighting by the depths of the last
+_ROUNDS_GIVEN_ROTATION = 2
 _LEAST_EQUATIONS = 12
 _CONDITION = 1e-7  # least singular value over the largest, of columns of unit length
 _LEAST_SCALE = 1e-6
@@ -47,7 +49,7 @@ def metric_starts(evidence: Evidence, rotations: FloatArray) -> tuple[FloatArray
     if linear is not None:
         proposed.insert(0, linear[None])
     if not len(rotations):
-        proposed.append(_rotation_grid())
+        proposed.append(_screened(evidence, rows, _rotation_grid()))
     candidates = np.concatenate(proposed)
     systems = [_given_rotation(evidence, rows, rotation) for rotation in candidates]
     found = [each for each in systems if each is not None]
@@ -144,7 +146,7 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
     extra_left, extra_right = _other_rows(evidence, rotation, basis)
     weights, cost = rows.weights, np.inf
     found = np.zeros(left.shape[1])
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_GIVEN_ROTATION):
         weighted = np.concatenate([left * weights[:, None], extra_left])
         target = np.concatenate([right * weights, extra_right])
         sizes = np.linalg.norm(weighted, axis=0)
@@ -163,6 +165,24 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
     if not (scales > _LEAST_SCALE).all() or not (depths > 0).all() or not np.isfinite(cost):
         return None
     return _Placed(rotation, found[:3], np.log(scales), cost + _cost_of_up(evidence, rotation))
+
+
+def _screened(evidence: Evidence, rows: _Rows, rotations: FloatArray) -> FloatArray:
+    """The rotations (S, 3, 3) with the least algebraic error, unweighted by depth."""
+    basis = _scale_basis(evidence)
+    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
+    in_rig = np.einsum("ni,nij->nj", rows.normals, turns)
+    by_scale = (in_rig @ rotations) * rows.points
+    same = np.broadcast_to(in_rig, by_scale.shape)
+    left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
+    right = (rows.right - (rows.normals * shifts).sum(axis=1)) * rows.weights
+    normal = left.swapaxes(1, 2) @ left
+    ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    normal = normal + ridge * np.eye(left.shape[2])
+    found = np.linalg.solve(normal, (left.swapaxes(1, 2) @ right)[:, :, None])
+    errors = (((left @ found)[:, :, 0] - right) ** 2).sum(axis=1)
+    costs = errors + [_cost_of_up(evidence, rotation) for rotation in rotations]
+    return np.asarray(rotations[np.argsort(costs)[:_SCREENED]])
 
 
 def _scale_basis(evidence: Evidence) -> FloatArray:

@@ -66,7 +66,7 @@ def model_of(
 def views_of(
     observation: Observation, model: Model | ShapeModel, *, sigma: Sigma | None = None
 ) -> tuple[View, ...]:
-    """What the images of an observation tell about a model.
+    """Evidence of an observation's images about a model.
 
     A learned shape's keypoints are found by semantic id or by name, as the shape has them.
 

@@ -65,24 +65,25 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
     view = piece.view
     if view is None:
         none = np.zeros(len(evidence.lengths.value), dtype=bool)
-        return evidence._replace(lengths=_kept(evidence.lengths, none)), state
+        return evidence._replace(lengths=kept_rows(evidence.lengths, none)), state
     if piece.kind == "rig":
         return _unlinked(evidence, state, view)
     if piece.kind == "keypoints":
         return evidence._replace(sightings=_unseen(evidence, view)), state
     if piece.kind == "mask":
         kept = ~contours_in(evidence, view)
-        return evidence._replace(sightings=_kept(evidence.sightings, kept)), state
+        return evidence._replace(sightings=kept_rows(evidence.sightings, kept)), state
     if piece.kind == "depth":
         return _without_depth(evidence, view), state
     if piece.kind == "gravity":
-        rest = _kept(evidence.directions, evidence.directions.image != view)
+        rest = kept_rows(evidence.directions, evidence.directions.image != view)
         return evidence._replace(directions=rest), state
-    rest_of_heights = _kept(evidence.heights, evidence.heights.image != view)
+    rest_of_heights = kept_rows(evidence.heights, evidence.heights.image != view)
     return evidence._replace(heights=rest_of_heights), state
 
 
-def _kept(rows: Rows, kept: BoolArray) -> Rows:
+def kept_rows(rows: Rows, kept: BoolArray) -> Rows:
+    """Some rows of a table of columns."""
     columns: list[Any] = [np.ascontiguousarray(column[kept]) for column in rows]
     return type(rows)(*columns)
 
@@ -92,16 +93,16 @@ def _unseen(evidence: Evidence, view: int) -> Sightings:
     hidden = keypoints_in(evidence, view)
     kept = ~hidden | depths_in(evidence, view)
     whitening = np.where(hidden[:, None], 0.0, evidence.sightings.whitening)
-    return _kept(evidence.sightings._replace(whitening=whitening), kept)
+    return kept_rows(evidence.sightings._replace(whitening=whitening), kept)
 
 
 def _without_depth(evidence: Evidence, view: int) -> Evidence:
     there = depths_in(evidence, view)
     depths = np.where(there[:, None], 0.0, evidence.sightings.depths)
-    planes: Planes = _kept(evidence.planes, evidence.planes.image != view)
+    planes: Planes = kept_rows(evidence.planes, evidence.planes.image != view)
     sightings = evidence.sightings._replace(depths=depths)
     kept = ~there | sightings.whitening.any(axis=1)
-    return evidence._replace(sightings=_kept(sightings, kept), planes=planes)
+    return evidence._replace(sightings=kept_rows(sightings, kept), planes=planes)
 
 
 def _unlinked(evidence: Evidence, state: State, view: int) -> tuple[Evidence, State]:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.fitting.joint.contradictions import count_equations
+from cadalign.fitting.joint.half_turns import half_turned
 from cadalign.fitting.joint.metric_starts import metric_starts
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
@@ -19,18 +21,23 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
 
     Where every view has a pose of its own, the likeliest ones are taken together, and then one of
     them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
-    the size of its image, widens the keypoints' own. A start that is given comes first.
+    the size of its image, widens the keypoints' own. A start that is given comes first, poses half
+    a turn away come last.
     """
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
     per_pose: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(poses)]
     for view in range(len(rig.pose)):
         camera = rig.cam_from_rig[view]
-        found = zip(*view_starts(evidence, view), strict=True)
-        moved = [(in_rig(pose, camera), scales) for pose, scales in found]
+        found, logs = view_starts(evidence, view)
+        turned = half_turned(evidence, view, list(found))
+        moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
+        moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
     if init is not None:
+        if _is_underdetermined(evidence):  # what the keypoints alone suggest is arbitrary
+            per_pose[0].clear()
         per_pose[0].insert(0, (init.pose, init.log_scales))
     elif is_metric and poses == 1:
         rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
@@ -44,7 +51,7 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
     first = [0] * poses
     others = [
         [*first[:p], rank, *first[p + 1 :]]
-        for rank in range(1, MOST_PER_VIEW)
+        for rank in range(1, max(len(found) for found in per_pose))
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
@@ -62,6 +69,12 @@ class Start(NamedTuple):
 
     pose: FloatArray
     log_scales: FloatArray
+
+
+def _is_underdetermined(evidence: Evidence) -> bool:
+    """True if there are fewer equations than poses and scales have unknowns."""
+    unknowns = 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
+    return count_equations(evidence) - len(evidence.shape.modes) < unknowns
 
 
 def _with_rig(

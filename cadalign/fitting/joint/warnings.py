@@ -15,6 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import search_joint
 
+_WRONG_UNIT = 100.0  # size over the model's, where nothing but depths tells it
 _LEAST_PROBABILITY = 0.005  # of residuals as large as these by chance
 
 
@@ -41,12 +42,26 @@ def warnings_of(
     spread = float(np.linalg.norm(deviations[3:6]))
     if spread > WEAK_DISTANCE * distance > 0:
         warnings.append(f"the distance is known only to +-{100 * spread / distance:.0f} %")
+    if _is_sized_by_depth_alone(evidence):
+        size = float(np.exp(state.log_scales.mean()))
+        if not 1 / _WRONG_UNIT < size < _WRONG_UNIT:
+            warnings.append(
+                f"the object is {size:.2g} times as large as the model: are the depths in "
+                "another unit (millimetres for metres)?"
+            )
     contradicting = contradictions(evidence, state, cost, _searched)
     warnings.extend(contradicting)
     misfit = None if contradicting else _misfit(evidence, cost)
     if misfit is not None:
         warnings.append(misfit)
     return tuple(warnings)
+
+
+def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
+    has_depth = len(evidence.planes.point) or (evidence.sightings.depths[:, 1] > 0).any()
+    others = len(evidence.lengths.value) + len(evidence.heights.value)
+    is_rig = (np.bincount(evidence.rig.pose) > 1).any()
+    return bool(has_depth and not others and not is_rig)
 
 
 def _searched(evidence: Evidence) -> tuple[State, float] | None:
@@ -71,7 +86,7 @@ def _misfit(evidence: Evidence, cost: float) -> str | None:
 
     redundancy = count_equations(evidence) - len(evidence.shape.modes)
     redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-    if redundancy <= 0 or evidence.sightings.loss.any():
+    if redundancy <= 0 or evidence.sightings.loss.any() or evidence.planes.loss.any():
         return None
     if chdtrc(redundancy, cost) >= _LEAST_PROBABILITY:
         return None

@@ -327,3 +327,22 @@ def test_bad_input_is_named(call: Any, message: str) -> None:
         call()
     assert isinstance(caught.value, CadalignError)
     assert str(caught.value).startswith(message)
+
+
+def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
+    places = [
+        [0, 0.6, 0],
+        [0, -0.3, 0],
+        [0, 0.1, 0.05],
+        [0, 0.1, -0.05],
+        [0, 0, 0.02],
+        [0, 0, -0.02],
+    ]
+    mean = np.array(places, float)
+    model = ShapeModel.from_basis(mean, [mean * [0, 0, 1]], [1.2], residual_sigma=0.001)
+    truth = truth_of((1.0, 1.0, 1.0))
+    result = align(model, seen(mean, truth, np.eye(4)))
+    assert rotation_error(est=result.alignment, gt=truth) < 5
+    behind = Alignment(LOOK @ np.diag([-1.0, 1.0, -1.0]), truth.translation, np.ones(3))
+    others = [each.alignment for each in result.alternatives]
+    assert min(rotation_error(est=each, gt=behind) for each in others) < 5

@@ -7,7 +7,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.scenes import around, in_camera, keypoints, rig, seen, truth_of, turned
+from support.scenes import (
+    CAMERA,
+    around,
+    depth_image,
+    in_camera,
+    keypoints,
+    rig,
+    seen,
+    truth_of,
+    turned,
+)
 
 from cadalign import Model, Size, View, align
 
@@ -99,3 +109,27 @@ def test_two_sources_of_the_size_accuse_each_other() -> None:
     warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
     assert any("views[0].depth" in text and "size" in text for text in warnings)
     assert any("millimetres" in text for text in warnings)
+
+
+def test_depths_alone_in_another_unit_are_told() -> None:
+    points, truth, rng = keypoints(9), truth_of(), np.random.default_rng(0)
+    depth = 1000 * in_camera(points, truth, np.eye(4))[:, 2]
+    view = seen(points, truth, np.eye(4), rng, depth=depth)
+    warnings = align(Model(points_3d=points), view).warnings
+    assert any("millimetres" in text for text in warnings)
+
+
+def test_hidden_keypoints_in_a_depth_image_are_not_a_contradiction() -> None:
+    points, truth = keypoints(12), truth_of()
+    width = np.ptp(points[:, 0]) * truth.scale[0]
+    accused = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        image = depth_image(points, truth)
+        image *= 1 + 0.005 * rng.normal(size=image.shape)
+        for x, y in CAMERA.project(truth.apply(points))[:4].round().astype(int):
+            image[y - 9 : y + 10, x - 9 : x + 10] = 4.0
+        view = seen(points, truth, np.eye(4), rng, depth=image, depth_sigma=0.005)
+        warnings = align(Model(points_3d=points), view, size=Size(width=width)).warnings
+        accused += any("contradict" in text or "residuals" in text for text in warnings)
+    assert accused <= 1

@@ -44,8 +44,7 @@ _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
 _MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
-_CLUSTERINGS = 3  # in each space
-_PROBE_ROUNDS = 5
+_CLUSTERINGS = 5
 _STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
@@ -118,15 +117,14 @@ class _Models:
         common = learn_gaussian(vectors, strength=recipe.strength, floor=floor, rounds=_ROUNDS)
         if recipe.components == 1:
             return common
-
-        def learn(labels: IntArray, rounds: int) -> Gaussians:
-            return learn_mixture(
-                vectors, labels, common, strength=_MIXTURE_STRENGTH, floor=floor, rounds=rounds
-            )
-
-        clusterings = _clusterings(vectors, common, recipe.components)
-        scores = [self.log_likelihoods(learn(each, _PROBE_ROUNDS)).sum() for each in clusterings]
-        return learn(clusterings[int(np.argmax(scores))], _ROUNDS)
+        return learn_mixture(
+            vectors,
+            _clusters(vectors, common, recipe.components),
+            common,
+            strength=_MIXTURE_STRENGTH,
+            floor=floor,
+            rounds=_ROUNDS,
+        )
 
     def log_likelihoods(self, mixture: Gaussians) -> FloatArray:
         """Log-likelihood of each model at the resolution of images, (N,) float.
@@ -257,26 +255,19 @@ def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[Keyp
     return Vectors(rows.reshape(len(rows), -1), np.full(len(rows), weight))
 
 
-def _clusterings(vectors: Vectors, common: Gaussians, count: int) -> list[IntArray]:
-    """Cluster the completed vectors by their main coefficients, in several ways.
-
-    Distances are those in space or, since kinds of objects may differ in what varies little, those
-    of coefficients of unit variance.
-    """
-    values, directions = np.linalg.eigh(common.covariances[0])
-    directions = directions[:, -_CLUSTER_MODES:]
-    coefficients = (vectors.completed(common) - common.means[0]) @ directions
-    spaces = [coefficients, coefficients / np.sqrt(values[-_CLUSTER_MODES:])]
-    found = []
-    for space in spaces:
-        for seed in range(_CLUSTERINGS):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
-                _, labels = kmeans2(space, count, minit="++", seed=seed)
-            labels = labels.astype(np.int64)
-            labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
-            found.append(labels)
-    return found
+def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
+    """Cluster the completed vectors by their main coefficients."""
+    _, directions = np.linalg.eigh(common.covariances[0])
+    coefficients = (vectors.completed(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
+    tries = []
+    for seed in range(_CLUSTERINGS):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
+            centres, labels = kmeans2(coefficients, count, minit="++", seed=seed)
+        tries.append((float(((coefficients - centres[labels]) ** 2).sum()), seed, labels))
+    labels = min(tries)[2].astype(np.int64)
+    labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
+    return np.asarray(labels)
 
 
 def _components(mixture: Gaussians, modes: int | None) -> tuple[ShapeComponent, ...]:

@@ -56,7 +56,7 @@ def viewpoint_error_deg(*, est: npt.ArrayLike, gt: npt.ArrayLike) -> float:
 
     Examples
     --------
-    >>> round(viewpoint_error_deg(est=np.diag([1, -1, -1]), gt=np.eye(3)), 9)
+    >>> round(viewpoint_error_deg(est=np.diag([-1, -1, 1]), gt=np.eye(3)), 9)
     180.0
     """
     poses = [Alignment(np.asarray(each), np.zeros(3), np.ones(3)) for each in (est, gt)]

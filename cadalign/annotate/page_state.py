@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import Outcome
-from cadalign.annotate.advice import Marked, rank
+from cadalign.annotate.advice import Marked, present, rank
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
 from cadalign.annotate.files import filled
@@ -82,7 +82,7 @@ def advice_state(session: Session, number: int) -> dict[str, Any]:
         points_3d = session.registry.xyz(
             pair.keypoint for pair in pairs if pair.keypoint is not None
         )
-    answer: dict[str, Any] = {"revision": revision, "note": "", "pieces": []}
+    answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
     if not isinstance(live, LiveAlignment) or live.cautious is None or live.provisional:
         return answer
     if not document.focal.known:
@@ -102,7 +102,8 @@ def advice_state(session: Session, number: int) -> dict[str, Any]:
         }
         for each in ranked
     ]
-    return answer | {"pieces": pieces}
+    now = present(live.cautious)
+    return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 def _moved(state: PhotoState) -> str:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from support.annotating import Case, place_all, served
 
-from cadalign import Model, View
+from cadalign import Camera, Model, View
+from cadalign.annotate.advice import Marked, rank
+from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.result_text import evidence_text, left_text
@@ -40,13 +43,16 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     assert suggestion is not None
     assert live.shown is not None
     alignment, camera = live.shown.alignment, case.instance.camera
+    # The pairs' deviations as the page shows them, calibrated for few pairs.
+    ratio = live.shown.posterior_covariance.diagonal() / live.shown.covariance.diagonal()
+    sigma = live.sigma * np.sqrt(ratio.mean())
     wanted = rank_evidence(
         Model(
             points_3d=np.vstack([session.registry.xyz(keypoints), suggestion.point.xyz]),
             ids=[*keypoints, "next"],
             mesh=session.model.scene.mesh,
         ),
-        View(camera, uv, ids=keypoints, sigma=live.sigma),
+        View(camera, uv, ids=keypoints, sigma=sigma),
         alignment,
         candidates=["next"],
         mask=cast_geometry(session.model.scene, camera, alignment).mask,
@@ -55,8 +61,40 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     assert sorted(kind for kind, _ in found) == ["keypoint", "lengths", "mask", "view"]
     assert [kind for kind, _ in found] == [each.kind for each in wanted]
     assert [worst for _, worst in found] == pytest.approx([each.worst for each in wanted])
+    # What is left is less than what there is.
+    shown = live.shown.std
+    assert answer["now"] == f"rotation to ± {shown.rotation_deg:.2g}°"
+    assert wanted[-1].worst <= 1.01 * np.radians(shown.rotation_deg)
     names = {each["kind"]: each["what"] for each in answer["pieces"]}
     assert names["keypoint"] == suggestion.point.name
+
+
+def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
+    """Clicks are as precise in shares of the photo; so is the mask, of a photo of 1280 px."""
+    session = case.open()
+    place_all(session, case, count=6)
+    live, suggestion = session.live(session.photos[0])
+    assert isinstance(live, LiveAlignment)
+    assert live.cautious is not None
+    points_3d = session.registry.xyz(keypoint for keypoint, _ in case.clicks[:6])
+    found = []
+    for times in (2, 6):
+        camera = case.instance.camera
+        large = Camera(
+            camera.width * times,
+            camera.height * times,
+            camera.fx * times,
+            camera.fy * times,
+            camera.cx * times + (times - 1) / 2,
+            camera.cy * times + (times - 1) / 2,
+        )
+        points_2d = large.project(live.cautious.alignment.apply(points_3d))
+        marked = Marked(points_3d, points_2d, np.full(6, float(times)))
+        result = replace(live.cautious, camera=large)
+        found.append(rank(session.model, marked, result, suggestion))
+    assert [each.kind for each in found[0]] == [each.kind for each in found[1]]
+    worst = [[each.worst for each in one] for one in found]
+    assert worst[0] == pytest.approx(worst[1], rel=1e-6)
 
 
 def test_revision_grows_with_every_change(case: Case) -> None:

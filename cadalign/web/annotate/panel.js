@@ -113,13 +113,13 @@ export class Panel {
   showRanking(ranked, current) {
     this.ranking.classList.toggle("stale", !current);
     if (!current) return;
-    const { pieces, note } = ranked;
+    const { pieces, note, now } = ranked;
     const rows = pieces.map(({ kind, what, left }) =>
-      h("li", { class: kind }, h("span", {}, what), ": ", h("strong", {}, left)),
+      h("li", { class: `piece-${kind}` }, h("span", {}, what), ": ", h("strong", {}, left)),
     );
     this.ranking.replaceChildren(
       rows.length ? h("h3", {}, "What would help most") : "",
-      rows.length ? h("p", { class: "soft" }, "By the largest standard deviation that each leaves:") : "",
+      rows.length ? h("p", { class: "soft" }, `The largest standard deviation, now ${now}, with each:`) : "",
       rows.length ? h("ol", {}, rows) : "",
       note ? h("p", { class: "soft" }, note) : "",
     );

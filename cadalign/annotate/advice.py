@@ -41,7 +41,7 @@ def rank(
     The pairs count as much as the deviations of the result say, which are calibrated for few of
     them. Masks are predicted for a photo of at most 1280 px.
     """
-    mesh, bounds = model.scene.mesh, model.scene.bounds
+    scene = model.light_scene
     alignment = result.alignment
     times = max(1.0, max(result.camera.width, result.camera.height) / _MASKED_AT)
     camera = _reduced(result.camera, times)
@@ -51,12 +51,12 @@ def rank(
     exact = Model(
         points_3d=np.vstack([marked.points_3d, *suggested]),
         ids=(*ids, *candidates),
-        bounds=bounds,
-        mesh=mesh,
+        bounds=model.scene.bounds,
+        mesh=scene.mesh,
     )
     sigma = _widening(result) * marked.sigma / times
     view = View(camera, _reduced_pixels(marked.points_2d, times), ids=ids, sigma=sigma)
-    mask = cast_geometry(model.scene, camera, alignment).mask
+    mask = cast_geometry(scene, camera, alignment).mask
     try:
         ranked = rank_evidence(exact, view, alignment, candidates=candidates, mask=mask)
     except CadalignError:

@@ -82,6 +82,8 @@ class Session:
                 warm_up_advice(problem)
             # Takes seconds on a model of millions of faces, which the first click would wait for.
             _ = self.model.scene.caster, self.model.samples
+            if self.shape is None:
+                _ = self.model.light_scene.caster
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:

@@ -80,4 +80,6 @@ def test_regions_hold_unseen_keypoints_of_unseen_chairs() -> None:
         found = np.einsum("na,nab,nb->n", error, np.linalg.inv(covariances), error)
         squares.extend(np.delete(found, seen))
     held = np.mean(np.array(squares) < -2 * np.log(1 - 0.95))  # chi-square, 2 degrees of freedom
-    assert 0.90 <= held <= 0.98
+    # Chairs have heavier tails than Gaussians. One factor widens all deviations until rotations and
+    # seen keypoints are held as often as stated; regions of unseen ones are then on the wide side.
+    assert 0.90 <= held <= 0.99

@@ -124,6 +124,7 @@ class History:
 
     def __init__(self, document: Document) -> None:
         self.document = document
+        self.revision = 0  # grows with every change, those by undo and redo included
         self._before: list[Document] = []
         self._after: list[Document] = []
         self._step: object = None
@@ -149,6 +150,7 @@ class History:
             del self._before[:-_LONGEST]
         self._after.clear()
         self.document = document
+        self.revision += 1
         self._step = step
 
     def undo(self) -> bool:
@@ -165,4 +167,5 @@ class History:
             return False
         target.append(self.document)
         self.document = source.pop()
+        self.revision += 1
         return True

@@ -91,6 +91,15 @@ class CadModel:
         """The positions of `samples`, (k, 3) float."""
         return np.array([point.xyz for point in self.samples])
 
+    @cached_property
+    def light_scene(self) -> Scene:
+        """The mesh with at most as many faces as are displayed, for what need not be exact."""
+        mesh = self.scene.mesh
+        if len(mesh.faces) <= MOST_FACES:
+            return self.scene
+        small = simplify(mesh, max_faces=MOST_FACES)
+        return Scene(Mesh(small.vertices, small.faces))
+
     def _on_triangle(self, triangle: int, xyz: FloatArray) -> ModelKeypoint:
         """Make a keypoint of a point on a triangle, with the file's face number and barycentrics.
 

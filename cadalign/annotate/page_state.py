@@ -9,12 +9,23 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import Outcome
+from cadalign.annotate.advice import Marked, present, rank
+from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
-from cadalign.annotate.result_text import facts_of, next_best_text, notes_of
+from cadalign.annotate.files import filled
+from cadalign.annotate.result_text import (
+    evidence_text,
+    facts_of,
+    left_text,
+    next_best_text,
+    notes_of,
+)
 from cadalign.annotate.session import Live, PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.annotate.shape_text import facts_of_shape, notes_of_shape
 from cadalign.annotate.suggestion import Suggestion
+
+_FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
 
 
 def page_state(session: Session, number: int, outcome: Outcome | None = None) -> dict[str, Any]:
@@ -25,6 +36,7 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
         live, suggestion = session.live(state)
         focal = state.document.focal
         return {
+            "revision": state.history.revision,
             "image": {
                 "number": number,
                 "count": len(session.photos),
@@ -54,6 +66,44 @@ def page_state(session: Session, number: int, outcome: Outcome | None = None) ->
             "alignment": _alignment(session, state, live),
             "suggestion": _suggestion(session, suggestion),
         }
+
+
+def advice_state(session: Session, number: int) -> dict[str, Any]:
+    """Rank what could be added to a photo's pairs, of the annotation of that ``revision``.
+
+    Nothing is ranked without an alignment by the pairs alone, for an object's own shape, and where
+    the focal length is estimated.
+    """
+    with session.lock:
+        state = session.photo_state(number)
+        live, suggestion = session.live(state)
+        document, revision = state.document, state.history.revision
+        pairs = document.complete_pairs
+        points_3d = session.registry.xyz(
+            pair.keypoint for pair in pairs if pair.keypoint is not None
+        )
+    answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
+    if not isinstance(live, LiveAlignment) or live.cautious is None or live.provisional:
+        return answer
+    if not document.focal.known:
+        return answer | {"note": _FOCAL}
+    given = filled(pair.sigma for pair in pairs)
+    sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
+    points_2d = np.array([pair.uv for pair in pairs], dtype=float)
+    # Without the lock, for which the next click would wait.
+    ranked = rank(session.model, Marked(points_3d, points_2d, sigma), live.cautious, suggestion)
+    name = "" if suggestion is None else _name_of(suggestion)
+    pieces = [
+        {
+            "kind": each.kind,
+            "what": evidence_text(each, name),
+            "left": left_text(each),
+            "worst": each.worst,
+        }
+        for each in ranked
+    ]
+    now = present(live.cautious)
+    return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 def _moved(state: PhotoState) -> str:
@@ -155,5 +205,9 @@ def _suggestion(session: Session, suggestion: Suggestion | None) -> dict[str, An
         "keypoint": point.semantic_id,
         "xyz": session.model.to_display(point.xyz).tolist(),
         "uv": suggestion.uv,
-        "text": next_best_text(suggestion.next_best, point.name or "The marked corner"),
+        "text": next_best_text(suggestion.next_best, _name_of(suggestion)),
     }
+
+
+def _name_of(suggestion: Suggestion) -> str:
+    return suggestion.point.name or "The marked corner"

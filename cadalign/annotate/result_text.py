@@ -9,6 +9,7 @@ import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.suggestion import NextBest, Unmarked
+from cadalign.fitting.joint.advice import LENGTH_SIGMA, TURN_DEG, Advice
 from cadalign.fitting.result import FitResult
 
 UNKNOWNS = (
@@ -71,6 +72,29 @@ def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
     before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
     unknown = UNKNOWNS[next_best.unknown]
     return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
+
+
+def evidence_text(advice: Advice, keypoint: str) -> str:
+    """One piece of evidence; of keypoints the one of that name."""
+    if advice.kind == "keypoint":
+        return keypoint
+    if advice.kind == "view":
+        return f"A second photo of these points, from {TURN_DEG:.0f}° aside"
+    if advice.kind == "mask":
+        return "A mask of the object"
+    return f"{str(advice.detail).capitalize()}, measured to {100 * LENGTH_SIGMA:.0f} %"
+
+
+def left_text(advice: Advice) -> str:
+    """The largest standard deviation that is left with a piece of evidence."""
+    if advice.worst > UNCERTAIN:
+        return "something stays undetermined"
+    if advice.worst == math.radians(advice.rotation_deg):
+        return f"rotation to ± {short(advice.rotation_deg)}°"
+    percent = f"± {short(100 * advice.worst)} %"
+    if advice.worst == advice.position:
+        return f"position to {percent}"
+    return f"stretch along {'xyz'[advice.stretch.index(advice.worst)]} to {percent}"
 
 
 def _stretch(result: FitResult, axis: str) -> Fact:

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp
 
 from cadalign.annotate.guard import Access, Guard
 from cadalign.annotate.model import display_bytes
-from cadalign.annotate.page_state import page_state
+from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError
 from cadalign.web import asset
@@ -35,6 +35,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
             Route("/model", routes.model),
             Route("/photo/{number:int}", routes.photo),
             Route("/state/{number:int}", routes.state),
+            Route("/advice/{number:int}", routes.advice),
             Route("/act/{number:int}", routes.act, methods=["POST"]),
         ],
         exception_handlers={CadalignError: _refused},
@@ -96,6 +97,10 @@ class _Routes:
 
     async def state(self, request: Request) -> Response:
         return await self._answer(request.path_params["number"], None)
+
+    async def advice(self, request: Request) -> Response:
+        number = request.path_params["number"]
+        return JSONResponse(await run_in_threadpool(advice_state, self._session, number))
 
     async def act(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":

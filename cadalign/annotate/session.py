@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import ACTIONS, RENAMING, Outcome
+from cadalign.annotate.advice import warm_up_advice
 from cadalign.annotate.alignment import LiveAlignment, align
 from cadalign.annotate.document import Document, FocalChoice, History
 from cadalign.annotate.files import AnnotationFiles, filled, known_pairs, write_keypoints
@@ -77,8 +78,12 @@ class Session:
                 )
             if self.shape is not None:
                 warm_up_joint(problem.points_3d, problem.points_2d, problem.camera)
+            else:
+                warm_up_advice(problem)
             # Takes seconds on a model of millions of faces, which the first click would wait for.
             _ = self.model.scene.caster, self.model.samples
+            if self.shape is None:
+                _ = self.model.light_scene.caster
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:

@@ -31,7 +31,7 @@ FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
 
 def comparable(state: dict[str, Any]) -> dict[str, Any]:
     """A state without what a new session cannot know: undo, times, the pairs' own numbers."""
-    left_out = {"saved", "selected", "message", "can_undo", "can_redo"}
+    left_out = {"saved", "selected", "message", "can_undo", "can_redo", "revision"}
     kept = {key: value for key, value in state.items() if key not in left_out}
     kept["focal"] = {k: v for k, v in state["focal"].items() if k != "typed"}
     kept["pairs"] = [{k: v for k, v in pair.items() if k != "pair"} for pair in state["pairs"]]

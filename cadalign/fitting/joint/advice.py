@@ -22,9 +22,9 @@ from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import State
 
-_TURN_DEG = 25.0  # of another view about the object
+TURN_DEG = 25.0  # of another view about the object
 _MASK_SIGMA = 1.5  # of a contour as segmentation gives it [px]
-_LENGTH_SIGMA = 0.01
+LENGTH_SIGMA = 0.01
 _LENGTHS = ("width", "height", "length")
 
 
@@ -130,7 +130,7 @@ def _lengths(model: Model, view: View, alignment: Alignment) -> Iterator[Advice]
             model,
             [view],
             alignment,
-            Size(width=lengths[0], sigma=_LENGTH_SIGMA, **{name: lengths[axis]}),
+            Size(width=lengths[0], sigma=LENGTH_SIGMA, **{name: lengths[axis]}),
         )
         for axis, name in enumerate(_LENGTHS)
         if axis and lengths[0] > 0 and lengths[axis] > 0
@@ -156,7 +156,7 @@ def _turned(model: Model, view: View, alignment: Alignment) -> View:
 
 def _moved(model: Model, alignment: Alignment) -> Alignment:
     centre = alignment.apply(np.asarray(model.bounds).mean(axis=0)[None])[0]
-    turn = rotation_from_vector(np.array([0.0, np.radians(_TURN_DEG), 0.0]))
+    turn = rotation_from_vector(np.array([0.0, np.radians(TURN_DEG), 0.0]))
     shift = centre + turn @ (alignment.translation - centre)
     return Alignment(turn @ alignment.rotation, shift, alignment.scale)
 

@@ -31,6 +31,16 @@ export class Api {
     return this.enqueue((image) => ({ url: `state/${image}`, options: {} }));
   }
 
+  /** What could be added to a photo's pairs, ranked; null if it cannot be told. Nothing waits for it. */
+  async advice(image) {
+    try {
+      const response = await fetch(`advice/${image}`);
+      return response.ok ? await response.json() : null;
+    } catch {
+      return null; // the next action tells that the server is gone
+    }
+  }
+
   /** Go on to another photo. */
   open(image) {
     this.image = image;

@@ -1,6 +1,7 @@
 // The annotator: photo on the left, model on the right, results below.
 import "../common/theme.css";
 import "./annotate.css";
+import { debounced } from "../common/dom.js";
 import { Api } from "./api.js";
 import { listen } from "./keys.js";
 import { Layout } from "./layout.js";
@@ -10,6 +11,7 @@ import { PhotoView } from "./photo_view.js";
 
 const POLL = 400; // while the solvers are being prepared [ms]
 const PAUSE = 800; // nudges that follow each other faster are undone together [ms]
+const REST = 300; // without a change, until what to add next is ranked [ms]
 
 class App {
   constructor() {
@@ -21,6 +23,7 @@ class App {
       onTrouble: (text) => this.layout.tell(text),
     });
     const act = (action, select) => this.act(action, select);
+    this.askSoon = debounced(() => this.ask(), REST);
     this.panel = new Panel({ act, select: (pair) => this.select(pair), suggested: () => this.suggested() });
     this.layout = new Layout(
       {
@@ -86,6 +89,7 @@ class App {
     if (!state.pairs.some((pair) => pair.pair === this.selected)) this.selected = null;
     this.layout.show(state);
     this.draw();
+    if (state.alignment.status === "done") this.askSoon();
     if (state.alignment.status === "preparing") setTimeout(() => this.api.refresh(), POLL);
   }
 
@@ -93,6 +97,24 @@ class App {
     this.photo.show(this.state, this.selected);
     this.model.show(this.state, this.selected);
     this.panel.show(this.state, this.selected);
+    this.panel.showRanking(this.ranked, this.isCurrent(this.ranked));
+  }
+
+  /** Ask what to add next, unless that is known; an answer that comes too late is dropped. */
+  async ask() {
+    if (this.isCurrent(this.ranked)) return;
+    const { number } = this.state.image;
+    const answer = await this.api.advice(number);
+    const ranked = answer && { ...answer, number };
+    if (!this.isCurrent(ranked)) return;
+    this.ranked = ranked;
+    this.panel.showRanking(ranked, true);
+  }
+
+  /** Whether a ranking is that of the annotation that is shown. */
+  isCurrent(ranked) {
+    const { image, revision } = this.state;
+    return ranked?.number === image.number && ranked.revision === revision;
   }
 
   /** Do an action; the time until its result is drawn is kept in `redrawn` [ms]. */

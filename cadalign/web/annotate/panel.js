@@ -8,6 +8,7 @@ export class Panel {
     this.alignment = h("div", { class: "alignment" });
     this.focal = this.makeFocal();
     this.advice = h("div", { class: "advice" });
+    this.ranking = h("div", { class: "ranking" });
     this.keypoints = h("ul", { class: "keypoints" });
     this.keypointsTitle = h("summary");
     this.details = h("details", {}, this.keypointsTitle, this.keypoints);
@@ -16,7 +17,7 @@ export class Panel {
       "section",
       { class: "panel", "aria-label": "Results" },
       card("Alignment", this.alignment, this.focal),
-      card("Next keypoint", this.advice, this.details),
+      card("Next keypoint", this.advice, this.ranking, this.details),
       card("Pairs", this.makeTable()),
     );
     this.root.lastChild.classList.add("wide");
@@ -105,6 +106,22 @@ export class Panel {
         "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
       ),
       button("Use this model point", this.handlers.suggested, { title: "N" }),
+    );
+  }
+
+  /** Show what could be added, the most useful first; one that is out of date keeps its place. */
+  showRanking(ranked, current) {
+    this.ranking.classList.toggle("stale", !current);
+    if (!current) return;
+    const { pieces, note, now } = ranked;
+    const rows = pieces.map(({ kind, what, left }) =>
+      h("li", { class: `piece-${kind}` }, h("span", {}, what), ": ", h("strong", {}, left)),
+    );
+    this.ranking.replaceChildren(
+      rows.length ? h("h3", {}, "What would help most") : "",
+      rows.length ? h("p", { class: "soft" }, `The largest standard deviation, now ${now}, with each:`) : "",
+      rows.length ? h("ol", {}, rows) : "",
+      note ? h("p", { class: "soft" }, note) : "",
     );
   }
 

@@ -15,6 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.fitting.contours.choice import surfaces_of
 from cadalign.fitting.contours.loop import poses_of
+from cadalign.fitting.contours.stack import displacements_with_points, with_points
 from cadalign.fitting.contours.surface import PosedSurface, Surface
 from cadalign.fitting.joint.assemble import Minimum
 from cadalign.fitting.joint.model import Model
@@ -113,6 +114,8 @@ def _settled(
     """Rounds from one minimum until the cost changes little."""
     state, last = start.state, np.inf
     result, bare = start, _without_keypoints(start.evidence, samples)
+    own = score_of(start.evidence, start.state, empty_system(start.evidence))
+    extra = start.score - own if np.isfinite(start.score - own) else 0.0
     for _ in range(_ROUNDS):
         posed = surface.at(
             _without_extras(start.evidence.shape, keypoints), _bare(state, keypoints)
@@ -125,8 +128,6 @@ def _settled(
         if not cost < np.inf:
             return start
         score = score_of(full, room, empty_system(full))
-        own = score_of(start.evidence, start.state, empty_system(start.evidence))
-        extra = start.score - own if np.isfinite(start.score - own) else 0.0
         result = start._replace(evidence=full, state=room, cost=cost, score=score + extra)
         state = _without_room(room, keypoints, len(start.evidence.shape.mean))
         if abs(last - cost) < _SETTLED:
@@ -179,27 +180,16 @@ def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples) -> _Rows:
 
 def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evidence:
     """The evidence with points of the surface, which stand behind the keypoints."""
-    shape, planes = evidence.shape, evidence.planes
     total = sum(len(each.mean) for each in rows)
-    modes = np.zeros((len(shape.modes), len(shape.mean) + total, 3))
-    modes[:, :keypoints] = shape.modes[:, :keypoints]
-    modes[:, keypoints + total :] = shape.modes[:, keypoints:]
-    start = keypoints
+    modes = np.zeros((len(evidence.shape.modes), total, 3))
+    start = 0
     for each in rows:
         modes[: len(each.modes), start : start + len(each.mean)] = each.modes
         start += len(each.mean)
-
-    def moved(point: np.ndarray) -> np.ndarray:
-        return np.where(point >= keypoints, point + total, point)
-
-    means = [shape.mean[:keypoints], *(each.mean for each in rows), shape.mean[keypoints:]]
-    spreads = [shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]
+    extended = with_points(evidence, keypoints, np.concatenate([each.mean for each in rows]), modes)
+    planes = extended.planes
     images = [np.full(len(each.mean), each.image) for each in rows]
-    return evidence._replace(
-        shape=Shape(np.concatenate(means), modes, np.concatenate(spreads)),
-        sightings=evidence.sightings._replace(point=moved(evidence.sightings.point)),
-        lengths=evidence.lengths._replace(points=moved(evidence.lengths.points)),
-        heights=evidence.heights._replace(point=moved(evidence.heights.point)),
+    return extended._replace(
         planes=Planes(
             np.concatenate([planes.point, keypoints + np.arange(total)]),
             np.concatenate([planes.image, *images]),
@@ -213,12 +203,11 @@ def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evi
 
 
 def _with_room(state: State, keypoints: int, total: int) -> State:
-    still = state.displacements
     return State(
         state.poses.copy(),
         state.log_scales.copy(),
         state.coefficients.copy(),
-        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
+        displacements_with_points(state.displacements, keypoints, total),
     )
 
 

@@ -28,32 +28,58 @@ class RimRows(NamedTuple):
     loss_scale: FloatArray
 
 
+def with_points(
+    evidence: Evidence, keypoints: int, mean: FloatArray, modes: FloatArray
+) -> Evidence:
+    """The evidence with more points (N, 3), between the keypoints and the box's corners.
+
+    Of their ``modes`` (K, N, 3) the first are the shape's; further ones move them alone.
+    """
+    shape, total = evidence.shape, len(mean)
+    all_modes = np.zeros((len(modes), len(shape.mean) + total, 3))
+    own = all_modes[: len(shape.modes)]
+    own[:, :keypoints] = shape.modes[:, :keypoints]
+    own[:, keypoints + total :] = shape.modes[:, keypoints:]
+    all_modes[:, keypoints : keypoints + total] = modes
+    sightings, lengths = evidence.sightings, evidence.lengths
+    heights, planes = evidence.heights, evidence.planes
+    return evidence._replace(
+        shape=Shape(
+            np.concatenate([shape.mean[:keypoints], mean, shape.mean[keypoints:]]),
+            all_modes,
+            np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]),
+        ),
+        sightings=sightings._replace(point=_moved(sightings.point, keypoints, total)),
+        lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
+        heights=heights._replace(point=_moved(heights.point, keypoints, total)),
+        planes=planes._replace(point=_moved(planes.point, keypoints, total)),
+    )
+
+
+def displacements_with_points(displacements: FloatArray, keypoints: int, total: int) -> FloatArray:
+    """Displacements (m, 3) with those of more points, which are zero, behind the keypoints'."""
+    return np.concatenate(
+        [displacements[:keypoints], np.zeros((total, 3)), displacements[keypoints:]]
+    )
+
+
 def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Evidence:
     """The evidence with rims; their points stand between the keypoints and the box's corners.
 
     Each view's rims have one more mode, the last ones of the shape in the order of the views.
     """
-    shape = evidence.shape
-    own, views = len(shape.modes), len(rims)
-    counts = [len(each.mean) for each in rims]
-    total = sum(counts)
-    modes = np.zeros((own + views, len(shape.mean) + total, 3))
-    modes[:own, :keypoints] = shape.modes[:, :keypoints]
-    modes[:own, keypoints + total :] = shape.modes[:, keypoints:]
-    start = keypoints
+    own, views = len(evidence.shape.modes), len(rims)
+    total = sum(len(each.mean) for each in rims)
+    modes = np.zeros((own + views, total, 3))
+    start = 0
     for number, each in enumerate(rims):
-        end = start + counts[number]
+        end = start + len(each.mean)
         modes[: len(each.modes), start:end] = each.modes  # none for a rigid surface
         modes[own + number, start:end] = each.offset_mode
         start = end
-    extended = Shape(
-        np.concatenate(
-            [shape.mean[:keypoints], *(each.mean for each in rims), shape.mean[keypoints:]]
-        ),
-        modes,
-        np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]),
-    )
-    old, lengths = evidence.sightings, evidence.lengths
+    mean = np.concatenate([np.empty((0, 3)), *(each.mean for each in rims)])
+    extended = with_points(evidence, keypoints, mean, modes)
+    old = extended.sightings
     sightings = Sightings(
         np.concatenate([old.point, keypoints + np.arange(total)]),
         np.concatenate([old.image, *(np.full(len(each.mean), each.image) for each in rims)]),
@@ -63,13 +89,7 @@ def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Eviden
         np.concatenate([old.loss, *(each.loss for each in rims)]),
         np.concatenate([old.loss_scale, *(each.loss_scale for each in rims)]),
     )
-    return evidence._replace(
-        shape=extended,
-        sightings=sightings,
-        lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
-        heights=evidence.heights._replace(point=_moved(evidence.heights.point, keypoints, total)),
-        planes=evidence.planes._replace(point=_moved(evidence.planes.point, keypoints, total)),
-    )
+    return extended._replace(sightings=sightings)
 
 
 def _moved(rows: IntArray, keypoints: int, total: int) -> IntArray:
@@ -104,12 +124,11 @@ def with_room(state: State, keypoints: int, rims: list[RimRows], offsets: FloatA
     ``offsets`` (V,) are the coefficients of the rims' own modes.
     """
     total = sum(len(each.mean) for each in rims)
-    still = state.displacements
     return State(
         state.poses.copy(),
         state.log_scales.copy(),
         np.concatenate([state.coefficients, offsets]),
-        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
+        displacements_with_points(state.displacements, keypoints, total),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -168,6 +168,27 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
             names = {group.key: value, "method": method}
             summaries.append(Summary(group_name(group, value), names, {**counts, **values}))
     return summaries
+
+
+def by_category_and_method(
+    run: Run, summarize: Callable[[str, str, Cells], Summary]
+) -> list[Summary]:
+    """A summary of each category's cells for every method, and of all where there are several."""
+    cells = run.cells
+    categories = sorted(set(cells["category"].tolist()))
+    parts = [(name, where(cells, cells["category"] == name)) for name in categories]
+    if len(parts) > 1:
+        parts.append((ALL, cells))
+    return [
+        summarize(category, method, found) for category, found in parts for method in run.methods
+    ]
+
+
+def text_rows(summaries: Sequence[Summary], shown: Sequence[Metric]) -> list[tuple[str, ...]]:
+    """Rows of a table for the console: group, method, and the shown cells as text."""
+    return [
+        (s.group, s.method, *(column.text(s[column.key]) for column in shown)) for s in summaries
+    ]
 
 
 def group_name(group: Metric, value: Any) -> str:

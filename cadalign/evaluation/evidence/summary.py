@@ -16,7 +16,15 @@ import numpy as np
 from cadalign.evaluation import metrics
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
-from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of, where
+from cadalign.evaluation.summary import (
+    ConsoleTable,
+    Summary,
+    by_category_and_method,
+    mean_of,
+    median_of,
+    text_rows,
+    where,
+)
 
 ROTATION_BOUND = replace(
     metrics.ROTATION,
@@ -37,14 +45,7 @@ HEADLINE = (
 
 def summarize(run: Run) -> list[Summary]:
     """A summary for every category and method, and for all categories together."""
-    cells = run.cells
-    categories = sorted(set(cells["category"].tolist()))
-    parts = [(name, where(cells, cells["category"] == name)) for name in categories]
-    if len(parts) > 1:
-        parts.append((ALL, cells))
-    return [
-        _summarize(category, method, found) for category, found in parts for method in run.methods
-    ]
+    return by_category_and_method(run, _summarize)
 
 
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
@@ -59,10 +60,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         title="Medians per category and evidence",
         labels=("category", "evidence"),
         heads=tuple(column.symbol for column in shown),
-        rows=[
-            (s.group, s.method, *(column.text(s[column.key]) for column in shown))
-            for s in summaries
-        ],
+        rows=text_rows(summaries, shown),
         note="t in diagonals of the object; R/bound: median ratio to the instance's own bound",
         narrow=True,
         wraps=True,

@@ -18,7 +18,15 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.methods import LIMIT
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
-from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of, where
+from cadalign.evaluation.summary import (
+    ALL,
+    ConsoleTable,
+    Summary,
+    mean_of,
+    median_of,
+    text_rows,
+    where,
+)
 
 MEDIANS = (
     *(metric.key for metric in metrics.INSTANCE_METRICS if metric is not metrics.RMS),
@@ -78,10 +86,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         title="Medians per category and method; success over all instances",
         labels=("category", "method"),
         heads=tuple(column.symbol for column in shown),
-        rows=[
-            (s.group, s.method, *(column.text(s[column.key]) for column in shown))
-            for s in summaries
-        ],
+        rows=text_rows(summaries, shown),
         note="t in model diagonals; * rotations that map a model onto itself are no errors"
         if rest is not metrics.UP_TO_SCALE
         else "t in model diagonals; ~ up to scale: one image does not tell the size",

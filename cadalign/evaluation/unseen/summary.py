@@ -20,12 +20,13 @@ from cadalign.evaluation import metrics
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (
-    ALL,
     ConsoleTable,
     Summary,
+    by_category_and_method,
     known,
     mean_of,
     median_of,
+    text_rows,
     where,
 )
 
@@ -50,14 +51,7 @@ HEADLINE = (
 
 def summarize(run: Run) -> list[Summary]:
     """A summary for every category and method, and for all categories together."""
-    cells = run.cells
-    categories = sorted(set(cells["category"].tolist()))
-    parts = [(name, where(cells, cells["category"] == name)) for name in categories]
-    if len(parts) > 1:
-        parts.append((ALL, cells))
-    return [
-        _summarize(category, method, found) for category, found in parts for method in run.methods
-    ]
+    return by_category_and_method(run, _summarize)
 
 
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
@@ -72,10 +66,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         title="Medians per category and method, and truths within stated regions",
         labels=("category", "method"),
         heads=tuple(column.symbol for column in shown),
-        rows=[
-            (s.group, s.method, *(column.text(s[column.key]) for column in shown))
-            for s in summaries
-        ],
+        rows=text_rows(summaries, shown),
         note="lengths in model diagonals; ~ scaled about the camera centre",
         narrow=True,
         wraps=True,

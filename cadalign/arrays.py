@@ -45,22 +45,10 @@ def as_floats(
     InputError
         If it is not numeric, has another shape, or holds NaN or infinite values.
     """
-    try:
-        found = np.asarray(value)
-        if found.dtype.kind in "cmM":  # complex numbers and times
-            raise TypeError(f"they are {found.dtype}")
-        if np.ma.is_masked(value):
-            raise TypeError("some are masked")
-        array = np.ascontiguousarray(value, dtype=np.float64)
-        if found.dtype.kind in "SU" or (
-            found.dtype.kind == "O" and any(isinstance(each, str | bytes) for each in found.flat)
-        ):
-            raise TypeError("they are texts")
-    except (TypeError, ValueError, OverflowError) as error:
-        what = f"not an array of numbers ({str(error)[:200]})"
-        raise InputError(what, where=name) from None
-    if np.ndim(value) == 0:
-        array = array.reshape(())
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
+        array: FloatArray = value
+    else:
+        array = _converted(value, name)
     if array.ndim != len(shape) or any(
         wanted is not None and wanted != actual
         for wanted, actual in zip(shape, array.shape, strict=True)
@@ -70,6 +58,29 @@ def as_floats(
     if finite and not np.isfinite(array).all():
         raise InputError(describe_non_finite(array), where=name, fix="remove or repair these")
     return array
+
+
+def _converted(value: Any, name: str) -> FloatArray:
+    try:
+        found = np.asarray(value)
+        if found.dtype.kind in "cmM":  # complex numbers and times
+            raise TypeError(f"they are {found.dtype}")
+        if is_masked(value):
+            raise TypeError("some are masked")
+        array = np.ascontiguousarray(value, dtype=np.float64)
+        if found.dtype.kind in "SU" or (
+            found.dtype.kind == "O" and any(isinstance(each, str | bytes) for each in found.flat)
+        ):
+            raise TypeError("they are texts")
+    except (TypeError, ValueError, OverflowError) as error:
+        what = f"not an array of numbers ({str(error)[:200]})"
+        raise InputError(what, where=name) from None
+    return array.reshape(()) if np.ndim(value) == 0 else array
+
+
+def is_masked(value: object) -> bool:
+    """True if some elements of an array are masked; asks without importing ``numpy.ma``."""
+    return isinstance(value, np.ndarray) and bool(np.any(getattr(value, "mask", False)))
 
 
 def is_number(value: Any) -> bool:

@@ -92,6 +92,10 @@ class RenderError(CadalignError):
     """Something cannot be drawn: an empty mesh, an image size out of bounds, no view found."""
 
 
+class TooFewVisibleError(DegenerateError, RenderError):
+    """No view of an object shows as many keypoints as are asked for."""
+
+
 def quote(value: Any) -> str:
     """Quote a value for a message, in at most 200 characters.
 

@@ -1,0 +1,10 @@
+"""Compile kernels, keep their code on disk, and say so while it takes its time."""
+
+from numba.core import event
+
+from cadalign.compile.decorators import fast_sums, inlined, kernel
+from cadalign.compile.progress import CompileProgress
+
+__all__ = ["fast_sums", "inlined", "kernel"]
+
+event.register("numba:compile", CompileProgress())

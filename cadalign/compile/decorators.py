@@ -1,0 +1,78 @@
+"""Decorators of kernels; nothing else in cadalign calls Numba's compiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, TypeVar, cast
+
+from numba.core import config, types
+from numba.core.registry import CPUDispatcher
+
+from cadalign.compile.files import KernelCache
+from cadalign.compile.libraries import FastPartCompiler, KernelCompiler, PartCompiler
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """Compile on first use, keep the result on disk, release the interpreter lock while running.
+
+    Floating-point operations keep their order and rounding: contraction into fused multiply-adds,
+    for one, differs between code just compiled and code read back from disk, and results must be
+    the same bit for bit.
+    """
+    return _compiled(function, set())
+
+
+def fast_sums(function: F) -> F:
+    """Like `kernel`, but sums may be reordered, so that they run on vector units."""
+    return _compiled(function, {"reassoc"})
+
+
+def inlined(function: F) -> F:
+    """Like `kernel`, for a small function that is always compiled into its callers."""
+    return _compiled(function, set(), forceinline=True)
+
+
+def _compiled(function: F, fastmath: set[str], *, forceinline: bool = False) -> F:
+    if getattr(config, "DISABLE_JIT", False):  # Numba's types do not know it
+        return function
+    options = {
+        "nopython": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": fastmath or False,
+        "boundscheck": False,
+        "forceinline": forceinline,
+    }
+    return cast(F, KernelDispatcher(function, options))
+
+
+class KernelDispatcher(CPUDispatcher):
+    """A function compiled for Python and, apart from that, for the kernels that call it."""
+
+    def __init__(self, function: Any, options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options, pipeline_class=KernelCompiler)
+        self._cache: Any = KernelCache(function, "kernel")
+
+    @cached_property
+    def _part(self) -> Any:
+        """Code that kernels call; where all compiled code is on disk, nothing asks for it."""
+        compiler = FastPartCompiler if self.targetoptions["fastmath"] else PartCompiler
+        bare = {**self.targetoptions, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        part: Any = CPUDispatcher(self.py_func, targetoptions=bare, pipeline_class=compiler)
+        part._cache = KernelCache(self.py_func, "part")
+        return part
+
+    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
+        """Types of a call by a kernel.
+
+        The number 3 takes the code of any integer; Numba compiles one for each.
+        """
+        named = {name: types.unliteral(kind) for name, kind in keywords.items()}
+        return self._part.get_call_template(tuple(map(types.unliteral, arguments)), named)
+
+    def get_overload(self, signature: Any) -> Any:
+        """Code that a kernel calls."""
+        return self._part.get_overload(signature)

@@ -9,7 +9,7 @@ from cadalign.compile import kernel
 from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE
 from cadalign.solvers.evidence import BLOCK
 from cadalign.solvers.focal import focal_system
-from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
 from cadalign.solvers.objective import Objective, evaluate, with_points
 from cadalign.solvers.unknowns import uncenter
 
@@ -70,7 +70,7 @@ def _invert_information(objective: Objective, pose: FloatArray, covariance: Floa
         column[:] = 0.0
         column[k] = 1.0
         solve_cholesky(information, UNKNOWNS, column)
-        covariance[:, k] = column
+        copy_into(covariance[:, k], column)
     return -1
 
 

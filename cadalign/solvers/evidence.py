@@ -14,6 +14,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, inlined, kernel
 from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.projection import (
     Scalars,
     Triple,
@@ -198,10 +199,10 @@ def take_keypoints(keypoints: Keypoints, chosen: IntArray) -> Keypoints:
     rays = np.empty((count, 2))
     whitening = np.empty((count if each else 1, 3))
     for k in range(count):
-        points[k] = keypoints.points[chosen[k]]
-        rays[k] = keypoints.rays[chosen[k]]
+        copy_into(points[k], keypoints.points[chosen[k]])
+        copy_into(rays[k], keypoints.rays[chosen[k]])
     for k in range(whitening.shape[0]):
-        whitening[k] = keypoints.whitening[chosen[k] if each else 0]
+        copy_into(whitening[k], keypoints.whitening[chosen[k] if each else 0])
     return Keypoints(points, rays, whitening, keypoints.loss, keypoints.loss_scale)
 
 

@@ -21,7 +21,7 @@ from cadalign.solvers.evidence import (
     focal_prior_cost,
     keypoint_rows,
 )
-from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
 from cadalign.solvers.linear import affine_rows
 from cadalign.solvers.objective import Objective, evaluate, with_keypoints
 from cadalign.solvers.projection import project_point, scalars_of
@@ -154,7 +154,8 @@ def refine_focal(
             hessian[k, k] += floor
         if not cholesky(hessian, UNKNOWNS, 0.0):
             return cost, log_ratio, iterations
-        shift[:] = -hessian[UNKNOWNS]
+        for k in range(shift.shape[0]):
+            shift[k] = -hessian[UNKNOWNS, k]
         solve_cholesky(hessian, UNKNOWNS, shift)
         for k in range(UNKNOWNS):
             curvature += hessian[UNKNOWNS, k] * shift[k]
@@ -181,7 +182,7 @@ def refine_focal(
         if not improved:
             break
         decrease = cost - moved_cost
-        pose[:] = trial
+        copy_into(pose, trial)
         here = there
         log_ratio += step
         cost = moved_cost

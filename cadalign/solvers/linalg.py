@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 
 
 @kernel
@@ -43,6 +43,13 @@ def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
         for k in range(i + 1, size):
             total -= factor[k, i] * right[k]
         right[i] = total / factor[i, i]
+
+
+@inlined
+def copy_into(target: FloatArray, source: FloatArray) -> None:
+    """Copy a vector; ``target[:] = source`` makes Numba compile text for its error message."""
+    for k in range(target.shape[0]):
+        target[k] = source[k]
 
 
 @kernel
@@ -161,7 +168,8 @@ def polish_rotation(matrix: FloatArray, rotation: FloatArray) -> None:
     Newton-Schulz: R (3 I - R' R) / 2 squares the error; two steps take 1e-4 to rounding.
     """
     gram = np.empty((3, 3))
-    rotation[:] = matrix
+    for i in range(3):
+        copy_into(rotation[i], matrix[i])
     for _ in range(2):
         for i in range(3):
             for j in range(3):

@@ -17,6 +17,7 @@ from cadalign.solvers.constants import (
 )
 from cadalign.solvers.covariance import center_and_unit, covariance_of
 from cadalign.solvers.evidence import Keypoints, ScalePrior, take_keypoints
+from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.objective import Objective, evaluate_cost, with_keypoints, with_points
@@ -127,9 +128,11 @@ def _search(objective: Objective, poses: FloatArray, costs: FloatArray) -> tuple
     # A wrong sigma should not make every coarse minimum look unlikely.
     variance = max(1.0, costs[0] / (2.0 * _COARSE_POINTS - UNKNOWNS)) if found > 0 else 1.0
     while count < found and costs[count] - costs[0] < _UNLIKELY * variance:
-        candidates[count] = poses[count]
+        copy_into(candidates[count], poses[count])
         count += 1
-    candidates[count] = linear  # with strong noise, some of the points may have no minimum
+    copy_into(
+        candidates[count], linear
+    )  # with strong noise, some of the points may have no minimum
     minima = 0
     for k in range(count + 1):
         if k < count or (minima == 0 and is_solved):
@@ -159,7 +162,7 @@ def _search_from_all_starts(
         chosen = choose_subsets(points, subsets)
         count = minimal_starts(points, rays, subsets, chosen, starts)
     if is_solved:
-        starts[count] = linear
+        copy_into(starts[count], linear)
         count += 1
     # Other starts serve coplanar points, and where the unstretched model is a better guess.
     needs_grid = free[6] == 0.0 or free[7] == 0.0 or objective.scale_prior.weight > 0.0
@@ -243,17 +246,17 @@ def _descend(
     if found >= 0:
         if cost < costs[found]:
             costs[found] = cost
-            poses[found] = pose
+            copy_into(poses[found], pose)
         return minima, iterations
     if minima == MAX_MINIMA and cost >= costs[minima - 1]:
         return minima, iterations
     row = minima if minima < MAX_MINIMA else minima - 1
     while row > 0 and costs[row - 1] > cost:
         costs[row] = costs[row - 1]
-        poses[row] = poses[row - 1]
+        copy_into(poses[row], poses[row - 1])
         row -= 1
     costs[row] = cost
-    poses[row] = pose
+    copy_into(poses[row], pose)
     return min(minima + 1, MAX_MINIMA), iterations
 
 

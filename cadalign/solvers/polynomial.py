@@ -1,53 +1,104 @@
-"""Real roots of polynomials in an interval, for the compiled kernels."""
+"""Real roots of polynomials near zero, for the compiled kernels."""
 
 from __future__ import annotations
 
-import numpy as np
-
 from cadalign.arrays import FloatArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 
+_HALVINGS = 40
+_FRESH = 3  # halvings after which the coefficients about zero are computed anew
+_NARROW = 1e-3  # width over place of an interval in which roots are a pair or none
 _NEWTON_STEPS = 60
-_SEPARATING = 1e-5  # relative accuracy of critical points, which only separate roots
-_EXACT = 1e-12
+_EXACT = 1e-7  # last relative Newton step: the root itself is as good as the square
+
+ROOTS_ROWS = _HALVINGS + 3
+"""Rows that `real_roots` uses: coefficients, roots, and Bernstein coefficients of intervals."""
 
 
-@kernel
-def multiply_add(target: FloatArray, first: FloatArray, second: FloatArray, factor: float) -> None:
-    """Add ``factor * first * second`` to ``target``; coefficients from the constant upwards."""
-    for i in range(first.shape[0]):
-        if first[i] != 0.0:
-            scaled = factor * first[i]
-            for j in range(second.shape[0]):
-                target[i + j] += scaled * second[j]
+@inlined
+def real_roots(memory: FloatArray, first: int, degree: int, reach: float, touching: float) -> int:
+    """Find the real roots of a polynomial in (-reach, reach), and where it nearly touches zero.
+
+    Descartes' rule of signs on Bernstein coefficients: these do not change sign where there is no
+    root, and do once where there is one; intervals with more changes are halved (Lane, Riesenfeld,
+    "Bounds on a polynomial", 1981). Small roots are found as well as large ones. An extremum counts
+    as a root where its value is below the share ``touching`` of the sum of the terms' magnitudes: a
+    double root that rounding or noise has lifted off zero.
+
+    Row ``first`` of ``memory`` holds the coefficients from the constant upwards, with a degree of
+    at least 2; the next row receives the roots (at most 2 * degree, which it must have room for),
+    and the rest of `ROOTS_ROWS` rows is scratch space: to pass a single array spares the counting
+    of references, which takes as long as the search. Returns the number of roots.
+    """
+    found = 0
+    for end in (-reach, reach):
+        found = _roots_up_to(memory, first, degree, end, touching, found)
+    return found
 
 
-@kernel
-def _evaluate(coefficients: FloatArray, degree: int, x: float) -> tuple[float, float]:
+@inlined
+def _roots_up_to(
+    memory: FloatArray, first: int, degree: int, end: float, touching: float, found: int
+) -> int:
+    """Add the roots between zero and an end of either sign to those found; see `real_roots`."""
+    top = first + 2
+    _to_bernstein(memory, first, degree, end, top)
+    # Intervals are visited from zero outwards: here number ``index`` of the 2^depth of a depth, in
+    # row ``top``; the rows before it wait with the outer halves of those that it lies in.
+    depth = index = 0
+    width = end
+    while True:
+        near = index * width
+        far = near + width
+        if index == 0 and depth > 0 and depth % _FRESH == 0:
+            _to_bernstein(memory, first, degree, far, top)
+        changes = 0
+        for k in range(degree):
+            changes += (memory[top, k] > 0) != (memory[top, k + 1] > 0)
+        if changes > 1 and depth < _HALVINGS and abs(width) > _NARROW * abs(near):
+            _halve(memory, top, degree)
+            depth += 1
+            index *= 2
+            top += 1
+            width *= 0.5
+            continue
+        if changes > 0 and found < 2 * degree - 1:
+            low, high = min(near, far), max(near, far)
+            if changes % 2 == 1:
+                memory[first + 1, found] = _root_between(memory, first, degree, low, high)
+                found += 1
+            else:
+                found = _add_pair(memory, first, degree, low, high, touching, top, found)
+        while index % 2 == 1:  # after an outer half, its parent is done as well
+            depth -= 1
+            index //= 2
+            width *= 2.0
+        if depth == 0:
+            return found
+        index += 1
+        top -= 1
+
+
+@inlined
+def _evaluate(memory: FloatArray, row: int, degree: int, x: float) -> tuple[float, float]:
     """Value and derivative by Horner's rule."""
-    value = coefficients[degree]
+    value = memory[row, degree]
     slope = 0.0
     for k in range(degree - 1, -1, -1):
         slope = slope * x + value
-        value = value * x + coefficients[k]
+        value = value * x + memory[row, k]
     return value, slope
 
 
 @kernel
-def _root_between(
-    coefficients: FloatArray,
-    degree: int,
-    low: float,
-    high: float,
-    low_value: float,
-    high_value: float,
-    tolerance: float,
-) -> float:
+def _root_between(memory: FloatArray, row: int, degree: int, low: float, high: float) -> float:
     """The root between two points of opposite sign: Newton's method, kept inside by bisection."""
+    low_value, _ = _evaluate(memory, row, degree, low)
+    high_value, _ = _evaluate(memory, row, degree, high)
     share = low_value / (low_value - high_value)
     x = low + (high - low) * min(max(share, 0.1), 0.9)
     for _ in range(_NEWTON_STEPS):
-        value, slope = _evaluate(coefficients, degree, x)
+        value, slope = _evaluate(memory, row, degree, x)
         if (value > 0) == (low_value > 0):
             low = x
         else:
@@ -55,96 +106,63 @@ def _root_between(
         following = x - value / slope
         if not low <= following <= high:  # also where the slope is zero
             following = 0.5 * (low + high)
-        if abs(following - x) <= tolerance * abs(x) or high - low <= 1e-16:
+        if abs(following - x) <= _EXACT * abs(x) or high - low <= 1e-16:
             return following
         x = following
     return x
 
 
+@inlined
+def _to_bernstein(memory: FloatArray, first: int, degree: int, end: float, top: int) -> None:
+    """Write the Bernstein coefficients for the interval from zero to an end into row ``top``."""
+    memory[top, 0] = memory[first, 0]
+    scale = 1.0
+    for k in range(1, degree + 1):  # of x / end, over the binomial coefficients
+        scale *= end * k / (degree - k + 1)
+        memory[top, k] = scale * memory[first, k]
+    for i in range(degree):
+        for k in range(degree, i, -1):
+            memory[top, k] += memory[top, k - 1]
+
+
+@inlined
+def _halve(memory: FloatArray, top: int, degree: int) -> None:
+    """De Casteljau's algorithm: row ``top`` keeps the outer half, the next gets the inner one."""
+    for i in range(degree + 1):
+        memory[top + 1, i] = memory[top, 0]
+        for k in range(degree - i):
+            memory[top, k] = 0.5 * (memory[top, k] + memory[top, k + 1])
+
+
 @kernel
-def real_roots(
-    coefficients: FloatArray,
+def _add_pair(
+    memory: FloatArray,
+    first: int,
     degree: int,
-    start: float,
-    end: float,
+    low: float,
+    high: float,
     touching: float,
-    roots: FloatArray,
+    derivative: int,
+    found: int,
 ) -> int:
-    """Find the real roots of a polynomial in an interval, and where it nearly touches zero.
+    """Add two roots, or an extremum near zero, in a narrow interval; returns the new number.
 
-    The roots of a derivative separate those of the function above it: starting from the highest
-    derivative but one, every stretch between neighbouring critical points holds at most one root.
-    ``coefficients`` (degree + 1,) run from the constant upwards, with a degree of at least 2. An
-    extremum counts as a root where its value is below the share ``touching`` of the sum of the
-    terms' magnitudes: a double root that rounding or noise has lifted off zero. Returns the number
-    of ``roots`` (2 * degree,).
+    The derivative is written into the row with its number.
     """
-    derivative = np.empty(degree + 1)
-    critical = np.empty(degree + 2)
-    following = np.empty(degree + 2)
-    _derive(coefficients, degree, degree - 2, derivative)
-    count = _quadratic_roots(derivative, start, end, critical)
-    if degree == 2:
-        roots[:count] = critical[:count]
-        return count
-    found = 0
-    for order in range(degree - 3, -1, -1):  # of the derivative
-        size = degree - order
-        _derive(coefficients, degree, order, derivative)
-        tolerance = _EXACT if order == 0 else _SEPARATING
-        low = start
-        low_value, _ = _evaluate(derivative, size, start)
-        new = 0
-        for k in range(count + 1):
-            high = critical[k] if k < count else end
-            high_value, _ = _evaluate(derivative, size, high)
-            if (low_value > 0) != (high_value > 0):
-                following[new] = _root_between(
-                    derivative, size, low, high, low_value, high_value, tolerance
-                )
-                new += 1
-            elif order == 0 and k < count:
-                magnitude = 0.0
-                for i in range(degree, -1, -1):
-                    magnitude = magnitude * abs(high) + abs(derivative[i])
-                if abs(high_value) < touching * magnitude:
-                    roots[found] = high
-                    found += 1
-            low = high
-            low_value = high_value
-        critical, following = following, critical
-        count = new
-    for k in range(count):
-        roots[found] = critical[k]
-        found += 1
-    return found
-
-
-@kernel
-def _derive(coefficients: FloatArray, degree: int, order: int, derivative: FloatArray) -> None:
-    """Write a derivative of the given order, over the factorial of the order."""
-    factor = 1.0  # k + order over order
-    for k in range(degree - order + 1):
-        derivative[k] = coefficients[k + order] * factor
-        factor = factor * (k + 1 + order) / (k + 1)
-
-
-@kernel
-def _quadratic_roots(coefficients: FloatArray, start: float, end: float, roots: FloatArray) -> int:
-    """The real roots of a quadratic inside (start, end), in ascending order."""
-    a, b, c = coefficients[2], coefficients[1], coefficients[0]
-    discriminant = b * b - 4.0 * a * c
-    if not discriminant > 0:
-        return 0
-    q = -0.5 * (b + (np.sqrt(discriminant) if b >= 0 else -np.sqrt(discriminant)))
-    first, second = q / a, c / q
-    if first > second:
-        first, second = second, first
-    count = 0
-    if start < first < end:
-        roots[count] = first
-        count += 1
-    if start < second < end:
-        roots[count] = second
-        count += 1
-    return count
+    low_value, low_slope = _evaluate(memory, first, degree, low)
+    _, high_slope = _evaluate(memory, first, degree, high)
+    if (low_slope > 0) == (high_slope > 0):
+        return found
+    for k in range(degree):
+        memory[derivative, k] = (k + 1) * memory[first, k + 1]
+    x = _root_between(memory, derivative, degree - 1, low, high)
+    value, _ = _evaluate(memory, first, degree, x)
+    if (value > 0) != (low_value > 0):
+        memory[first + 1, found] = _root_between(memory, first, degree, low, x)
+        memory[first + 1, found + 1] = _root_between(memory, first, degree, x, high)
+        return found + 2
+    magnitude = 0.0
+    for k in range(degree, -1, -1):
+        magnitude = magnitude * abs(x) + abs(memory[first, k])
+    memory[first + 1, found] = x
+    return found + (abs(value) < touching * magnitude)

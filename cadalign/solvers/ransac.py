@@ -25,8 +25,13 @@ from cadalign.solvers.evidence import (
     take_keypoints,
 )
 from cadalign.solvers.focal import at_focal, refine_focal
+from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, solve_subset
+from cadalign.solvers.minimal import (
+    MAX_SOLUTIONS,
+    minimal_memory,
+    solve_subset,
+)
 from cadalign.solvers.objective import Objective, with_keypoints
 from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.refine import refine
@@ -35,7 +40,6 @@ from cadalign.solvers.sampling import (
     grow_pool,
     next_subset,
     seed_state,
-    shuffle,
     start_pool,
 )
 
@@ -77,14 +81,16 @@ def ransac_kernel(
     views: Views,
     log_focals: FloatArray,
     focal_prior: LogFocalPrior,
+    ranked: IntArray,
     settings: Settings,
     pose: FloatArray,
     inliers: BoolArray,
 ) -> tuple[float, float, int, int]:
     """Find the pose, and the focal length where it is unknown, with the lowest truncated score.
 
-    The objective has the points, by falling confidence where the search is guided; its rays and
-    weights are those of the views, which have one log focal length of any value where it is known.
+    The objective has the points in random order, in which scores look at them; its rays and weights
+    are those of the views, which have one log focal length of any value where it is known.
+    ``ranked`` (n,) holds the points' numbers, by falling confidence where the search is guided.
     Returns the score, a sum of squared errors, each at most the threshold's square [px^2], the log
     focal length, and the numbers of iterations and hypotheses.
     """
@@ -94,18 +100,18 @@ def ransac_kernel(
     limit = settings.threshold * settings.threshold
     state = np.empty(1, dtype=np.uint64)
     seed_state(settings.seed, state)
-    order = np.arange(n)
-    shuffle(state, order)
     chosen = np.arange(size)
+    sample = np.arange(size)
     growth = np.empty(3)
     start_pool(growth, size, n, 200_000.0)
     candidates = np.empty((MAX_SOLUTIONS, POSE_SIZE))
+    memory = minimal_memory()
     trial = np.empty(POSE_SIZE)
     random_support = _RANDOM_SUPPORT
     best = np.inf
     best_support = 0
     best_focal = log_focals[0]
-    best_view = _view(objective, views, 0)
+    view = best_view = _view(objective, views, 0)
     iterations = 0
     hypotheses = 0
     needed = float(settings.max_iterations)
@@ -122,14 +128,16 @@ def ransac_kernel(
                 grow_pool(growth, size, n, iterations // 2)
             draw_sample(state, growth, from_pool, n, chosen)
         iterations += 1
+        for k in range(size):
+            sample[k] = ranked[chosen[k]]
         for f in range(log_focals.shape[0]):
-            view = _view(objective, views, f)
-            found = _solve_sample(view.keypoints, settings.minimal, chosen, candidates)
+            if log_focals.shape[0] > 1:
+                view = _view(objective, views, f)
+            found = _solve_sample(view.keypoints, settings.minimal, sample, memory, candidates)
             hypotheses += found
             for k in range(found):
                 score, support, seen = _score_pose(
                     view.keypoints,
-                    order,
                     candidates[k],
                     limit,
                     best,
@@ -142,23 +150,21 @@ def ransac_kernel(
                     continue
                 best, best_support, best_view = score, support, view
                 best_focal = log_focals[f]
-                pose[:] = candidates[k]
+                copy_into(pose, candidates[k])
                 if settings.optimize:
-                    trial[:] = candidates[k]
+                    copy_into(trial, candidates[k])
                     there, moved = _optimize_locally(
-                        view, order, settings, relative_to(focal_prior, best_focal), trial
+                        view, settings, relative_to(focal_prior, best_focal), trial
                     )
-                    score, support, _ = _score_pose(
-                        there.keypoints, order, trial, limit, np.inf, 0.0, 1.0
-                    )
+                    score, support, _ = _score_pose(there.keypoints, trial, limit, np.inf, 0.0, 1.0)
                     if score < best:
                         best, best_support, best_view = score, support, there
                         best_focal += moved
-                        pose[:] = trial
+                        copy_into(pose, trial)
                 if best_support > 0:
                     needed = _needed_samples(best_support / n, settings)
     if best < np.inf and settings.optimize and not settings.estimate_focal:
-        best = _finish(best_view, settings.threshold, order, best, pose)
+        best = _finish(best_view, settings.threshold, best, pose)
     scalars = scalars_of(pose)
     for i in range(n):
         inliers[i] = squared_error(best_view.keypoints, scalars, i) < limit
@@ -187,11 +193,15 @@ def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
 
 @kernel
 def _solve_sample(
-    keypoints: Keypoints, minimal: int, chosen: IntArray, candidates: FloatArray
+    keypoints: Keypoints,
+    minimal: int,
+    chosen: IntArray,
+    memory: FloatArray,
+    candidates: FloatArray,
 ) -> int:
     """Solve a minimal set; returns the number of hypotheses."""
     if minimal == AP4P:
-        return solve_subset(keypoints.points, keypoints.rays, chosen, candidates)
+        return solve_subset(keypoints.points, keypoints.rays, chosen, memory, candidates)
     some = take_keypoints(keypoints, chosen)
     return 1 if aepnp_kernel(some.points, some.rays, candidates[0]) == OK else 0
 
@@ -199,7 +209,6 @@ def _solve_sample(
 @kernel
 def _score_pose(
     keypoints: Keypoints,
-    order: IntArray,
     pose: FloatArray,
     limit: float,
     best: float,
@@ -211,7 +220,7 @@ def _score_pose(
     Gives up, with an infinite score, once the score exceeds the best one, or once the points seen
     so far are much likelier under a wrong model than under one as good as the best.
     """
-    n = order.shape[0]
+    n = keypoints.points.shape[0]
     few = n <= _FEW_POINTS
     # Before anything good is found, a hypothesis must look better than chance.
     sought = min(max(inlier_ratio, _LEAST_SUPPORT, 1.5 * random_support), 0.99)
@@ -222,7 +231,7 @@ def _score_pose(
     support = 0
     ratio = 1.0
     for k in range(n):
-        square = squared_error(keypoints, scalars, order[k])
+        square = squared_error(keypoints, scalars, k)
         if square < limit:
             score += square
             support += 1
@@ -238,7 +247,6 @@ def _score_pose(
 @kernel
 def _optimize_locally(
     view: Objective,
-    order: IntArray,
     settings: Settings,
     focal_prior: LogFocalPrior,
     pose: FloatArray,
@@ -254,7 +262,7 @@ def _optimize_locally(
     log_ratio = 0.0
     for r in range(rounds):
         factor = wide + (1.0 - wide) * r / (rounds - 1)
-        some = _inliers_of(here, order, factor * settings.threshold, pose, _LOCAL_POINTS)
+        some = _inliers_of(here, factor * settings.threshold, pose, _LOCAL_POINTS)
         if some.keypoints.points.shape[0] < least_points:
             break
         if settings.estimate_focal:
@@ -274,40 +282,37 @@ def _optimize_locally(
 
 
 @kernel
-def _inliers_of(
-    objective: Objective, order: IntArray, threshold: float, pose: FloatArray, most: int
-) -> Objective:
+def _inliers_of(objective: Objective, threshold: float, pose: FloatArray, most: int) -> Objective:
     """The objective of the first ``most`` points that lie within a threshold."""
     limit = threshold * threshold
     scalars = scalars_of(pose)
-    chosen = np.empty(min(most, order.shape[0]), dtype=np.int64)
+    n = objective.keypoints.points.shape[0]
+    chosen = np.empty(min(most, n), dtype=np.int64)
     count = 0
-    for k in range(order.shape[0]):
+    for k in range(n):
         if count == chosen.shape[0]:
             break
-        if squared_error(objective.keypoints, scalars, order[k]) < limit:
-            chosen[count] = order[k]
+        if squared_error(objective.keypoints, scalars, k) < limit:
+            chosen[count] = k
             count += 1
     return with_keypoints(objective, take_keypoints(objective.keypoints, chosen[:count]))
 
 
 @kernel
-def _finish(
-    objective: Objective, threshold: float, order: IntArray, best: float, pose: FloatArray
-) -> float:
+def _finish(objective: Objective, threshold: float, best: float, pose: FloatArray) -> float:
     """Refine on all inliers until they don't change any more; returns the score."""
     trial = pose.copy()
     support = -1
     limit = threshold * threshold
     for _ in range(_FINAL_ROUNDS):
-        some = _inliers_of(objective, order, threshold, trial, order.shape[0])
+        some = _inliers_of(objective, threshold, trial, objective.keypoints.points.shape[0])
         if some.keypoints.points.shape[0] < 4:
             return best
         refine(some, _FINAL_ITERATIONS, trial)
-        score, inside, _ = _score_pose(objective.keypoints, order, trial, limit, np.inf, 0.0, 1.0)
+        score, inside, _ = _score_pose(objective.keypoints, trial, limit, np.inf, 0.0, 1.0)
         if score > best * (1.0 + 1e-9):
             return best
-        pose[:] = trial
+        copy_into(pose, trial)
         if inside == support and score >= best * (1.0 - 1e-9):
             return score
         best = min(best, score)

@@ -8,7 +8,7 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.evidence import BLOCK
-from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
 from cadalign.solvers.objective import Objective, evaluate
 from cadalign.solvers.unknowns import move_pose
 
@@ -52,7 +52,7 @@ def refine(objective: Objective, max_iterations: int, pose: FloatArray) -> tuple
         trial_cost = evaluate(objective, trial, rows, next_hessian, next_gradient)
         accepted = trial_cost <= cost or (done and trial_cost <= cost * (1 + 1e-9))
         if accepted and trial_cost < np.inf:
-            pose[:] = trial
+            copy_into(pose, trial)
             hessian, next_hessian = next_hessian, hessian
             gradient, next_gradient = next_gradient, gradient
             if cost < np.inf:

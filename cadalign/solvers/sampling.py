@@ -33,14 +33,6 @@ def draw_below(state: StateArray, bound: int) -> int:
 
 
 @kernel
-def shuffle(state: StateArray, numbers: IntArray) -> None:
-    """Bring numbers into a random order."""
-    for i in range(numbers.shape[0] - 1, 0, -1):
-        j = draw_below(state, i + 1)
-        numbers[i], numbers[j] = numbers[j], numbers[i]
-
-
-@kernel
 def draw_subset(state: StateArray, count: int, chosen: IntArray) -> None:
     """Draw distinct point numbers below ``count``, any of them alike."""
     k = 0

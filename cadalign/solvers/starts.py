@@ -7,7 +7,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
-from cadalign.solvers.minimal import MAX_SOLUTIONS, solve_subset
+from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
 from cadalign.solvers.projection import Triple
 from cadalign.solvers.sampling import next_subset
 from cadalign.solvers.unknowns import pack_pose
@@ -23,9 +23,11 @@ def minimal_starts(
 
     ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
     """
+    memory = minimal_memory()
     found = 0
     for s in range(count):
-        found += solve_subset(points, rays, subsets[s], poses[found : found + MAX_SOLUTIONS])
+        room = poses[found : found + MAX_SOLUTIONS]
+        found += solve_subset(points, rays, subsets[s], memory, room)
     return found
 
 
@@ -42,7 +44,8 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
     draw = np.arange(4)
     if total <= wanted:
         for row in range(total):
-            subsets[row] = draw
+            for k in range(4):
+                subsets[row, k] = draw[k]
             next_subset(draw, n)
         return int(total)
     volumes = np.full(wanted, -1.0)

@@ -9,7 +9,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.factor import factorize, invert_factor
+from cadalign.solvers.joint.factor import decide_on_undetermined, factorize, invert_factor
 from cadalign.solvers.joint.reduction import reduce_modes
 from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
 
@@ -36,6 +36,8 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     points, modes = evidence.shape.mean.shape[0], basis.shape[0]
     unknowns = system.gradient.shape[0]
     first = unknowns - basis.shape[1] - 3
+    if state.poses.shape[0] > 1:
+        decide_on_undetermined(system.hessian, state.poses.shape[0])
     if not factorize(system.hessian):
         size = first + 3 + modes
         return JointCovariance(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import fast_sums
+from cadalign.compile import fast_sums, kernel
+
+_LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 @fast_sums
@@ -28,6 +30,19 @@ def factorize(matrix: FloatArray) -> bool:
             return False
         matrix[i, i] = np.sqrt(square)
     return True
+
+
+@kernel
+def decide_on_undetermined(information: FloatArray, views: int) -> None:
+    """Make a singular matrix definite beside other views, and indefinite for a single one.
+
+    What the evidence leaves open gets a deviation, a million times its own scale, where several
+    views share a shape, and is refused for one alone. Otherwise the rounding of the entries would
+    tell whether the matrix has a Cholesky factor.
+    """
+    share = _LEAST_SHARE if views > 1 else -_LEAST_SHARE
+    for k in range(information.shape[0]):
+        information[k, k] *= 1.0 + share
 
 
 @fast_sums

@@ -9,7 +9,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.factor import factorize
+from cadalign.solvers.joint.factor import decide_on_undetermined, factorize
 from cadalign.solvers.joint.reduction import reduce_modes
 from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
@@ -142,8 +142,11 @@ def _insert(state: State, cost: float, score: float, minima: Minima, found: int)
 def score_of(evidence: Evidence, state: State, system: System) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     cost = evaluate_joint(evidence, state, system)
+    if not cost < np.inf:
+        return np.inf
     factor = system.hessian.copy()
-    if not cost < np.inf or not factorize(factor):
+    decide_on_undetermined(factor, state.poses.shape[0])
+    if not factorize(factor):
         return np.inf
     score = cost
     for k in range(factor.shape[0]):

@@ -1,0 +1,374 @@
+"""Where three homogeneous quadrics in four unknowns meet, for the minimal solver.
+
+Two unknowns are eliminated by the identities between the monomials y^2, yz and z^2, after Kukelova,
+Heller, Fitzgibbon, "Efficient intersection of three quadrics", 2016; the roots of the remaining
+polynomial of degree 8 are polished on the quadrics.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
+
+_DEGREE = 8
+_TOUCHING = 1e-7
+_POLISH_STEPS = 5
+_EXACT = 1e-7  # largest value of a quadric, over its summands, at an intersection
+_ALMOST_EXACT = 1e-11  # after which one step of Newton's method reaches rounding
+_FAR_BEHIND = -0.05  # depth, over half the sum of all, that polishing cannot make positive
+_SAME = 1e-6  # relative difference of depths below which two solutions are one
+
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+Quadruple = tuple[float, float, float, float]
+Quintuple = tuple[float, float, float, float, float]
+Sextuple = tuple[float, float, float, float, float, float]
+
+
+# Rows of the memory, which is a single array for the reason given in `real_roots`.
+QUADRICS = 0
+"""First of 3 rows of coefficients of e_i e_l for i <= l: 00, 01, 02, 03, 11, 12, 13, 22, 23, 33."""
+POINTS = 3
+"""First of the rows of the intersections."""
+_TABLE = POINTS + 2 * _DEGREE  # see `_solve_for_monomials`
+_SYSTEM = _TABLE + 3  # see `_eliminate`
+_POLYNOMIAL = _SYSTEM + 9
+INTERSECTION_ROWS = _POLYNOMIAL + ROOTS_ROWS
+"""Rows of 16 numbers that `intersect_quadrics` uses."""
+
+
+@inlined
+def intersect_quadrics(memory: FloatArray) -> int:
+    """Find the points e at which three quadrics meet and the depths H e / 2 are positive.
+
+    H is the Hadamard matrix (see `hadamard`): the common depth e_0 is 1, the others are differences
+    between -1 and 1. ``memory`` (`INTERSECTION_ROWS`, 16) holds the quadrics in the rows from
+    `QUADRICS`, and receives the points in those from `POINTS`. Returns their number.
+    """
+    # Eliminate the pair of differences for which the quadrics tell y^2, yz, z^2 best.
+    x, y, z, best = 1, 2, 3, -1.0
+    for i in range(1, 4):
+        j, k = i % 3 + 1, (i + 1) % 3 + 1
+        size = abs(_minor(memory, _entry(j, j), _entry(j, k), _entry(k, k)))
+        if size > best:
+            x, y, z, best = i, j, k, size
+    if not best > 0.0:
+        return 0
+    _solve_for_monomials(memory, x, y, z)
+    _eliminate(memory)
+    number = real_roots(memory, _POLYNOMIAL, _DEGREE, 1.0, _TOUCHING)
+    found = 0
+    for r in range(number):
+        row = POINTS + found
+        root = memory[_POLYNOMIAL + 1, r]
+        memory[row, 0], memory[row, x] = 1.0, root
+        memory[row, y], memory[row, z] = _back_substitute(memory, root)
+        if not _least_depth(memory, row) > _FAR_BEHIND or not _polish(memory, row):
+            continue
+        if _least_depth(memory, row) > 0.0:
+            is_new = True
+            for k in range(POINTS, row):
+                is_new = is_new and not _are_same(memory, row, k)
+            found += is_new
+    return found
+
+
+@inlined
+def hadamard(a: float, b: float, c: float, d: float) -> Quadruple:
+    """H v / 2 for a vector v = (a, b, c, d), an involution: the common part and differences."""
+    s, t, u, v = a + c, b + d, a - c, b - d
+    return 0.5 * (s + t), 0.5 * (s - t), 0.5 * (u + v), 0.5 * (u - v)
+
+
+@inlined
+def _least_depth(memory: FloatArray, row: int) -> float:
+    a, b, c, d = hadamard(memory[row, 0], memory[row, 1], memory[row, 2], memory[row, 3])
+    return min(min(a, b), min(c, d))
+
+
+@inlined
+def _are_same(memory: FloatArray, row: int, other: int) -> bool:
+    difference = 0.0
+    for i in range(1, 4):
+        difference = max(difference, abs(memory[row, i] - memory[other, i]))
+    return difference < _SAME
+
+
+@inlined
+def _entry(i: int, j: int) -> int:
+    """Position of the coefficient of e_i e_j in a row of quadrics."""
+    low, high = min(i, j), max(i, j)
+    return low * 4 - low * (low - 1) // 2 + high - low
+
+
+@inlined
+def _minor(memory: FloatArray, a: int, b: int, c: int) -> float:
+    """Determinant of three of the quadrics' columns."""
+    return dot(_column(memory, a), cross(_column(memory, b), _column(memory, c)))
+
+
+@inlined
+def _column(memory: FloatArray, k: int) -> Triple:
+    return memory[QUADRICS, k], memory[QUADRICS + 1, k], memory[QUADRICS + 2, k]
+
+
+@inlined
+def _solve_for_monomials(memory: FloatArray, x: int, y: int, z: int) -> None:
+    """Solve for y^2, yz and z^2 (rows from `_TABLE`): coefficients of 1, x, x^2, y, xy, z, xz."""
+    products = (0, x, _entry(x, x), y, _entry(x, y), z, _entry(x, z))
+    a = _column(memory, _entry(y, y))
+    b = _column(memory, _entry(y, z))
+    c = _column(memory, _entry(z, z))
+    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
+    scale = -1.0 / dot(a, bc)
+    for k in range(7):
+        column = _column(memory, products[k])
+        memory[_TABLE, k] = scale * dot(bc, column)
+        memory[_TABLE + 1, k] = scale * dot(ca, column)
+        memory[_TABLE + 2, k] = scale * dot(ab, column)
+
+
+@inlined
+def _eliminate(memory: FloatArray) -> None:
+    """Write three equations that are linear in y and z, and their determinant, of degree 8 in x.
+
+    With y^2 = a0 + a1 y + a2 z, yz = b0 + b1 y + b2 z, z^2 = c0 + c1 y + c2 z, polynomials in x,
+    these are the identities z (y^2) = y (yz), y (z^2) = z (yz) and (yz)^2 = (y^2)(z^2). Rows 3 r
+    to 3 r + 2 from `_SYSTEM` receive the coefficients of y, z and 1 in identity r. All that
+    is done in coefficients, not in values, since roots may be a hundred times smaller than 1.
+    """
+    a0, b0, c0 = _parabola(memory, 0), _parabola(memory, 1), _parabola(memory, 2)
+    a1, b1, c1 = _line(memory, 0, 3), _line(memory, 1, 3), _line(memory, 2, 3)
+    a2, b2, c2 = _line(memory, 0, 5), _line(memory, 1, 5), _line(memory, 2, 5)
+    d, e = _minus_2(a1, b2), _minus_2(c2, b1)
+    y1 = _minus_3(_minus_3(_times_22(a2, c1), _times_22(b1, b2)), b0)  # equal to z2
+    z1 = _plus_3(_plus_3(_times_22(d, b2), _times_22(a2, e)), a0)
+    w1 = _minus_4(_plus_4(_times_23(d, b0), _times_23(a2, c0)), _times_23(b1, a0))
+    y2 = _plus_3(_plus_3(_times_22(c1, d), _times_22(e, b1)), c0)
+    w2 = _minus_4(_plus_4(_times_23(c1, a0), _times_23(e, b0)), _times_23(b2, c0))
+    yy = _minus_3(_times_22(b1, b1), _times_22(a1, c1))
+    zz = _minus_3(_times_22(b2, b2), _times_22(a2, c2))
+    b12 = _times_22(b1, b2)
+    yz = _minus_3(_minus_3(_plus_3(b12, b12), _times_22(a1, c2)), _times_22(a2, c1))
+    f, g, h = _plus_3(b0, yz), _minus_3(zz, a0), _minus_3(yy, c0)
+    y3 = _plus_4(
+        _plus_4(_times_23(b1, _plus_3(b0, f)), _times_23(c1, g)),
+        _times_23(a1, h),
+    )
+    z3 = _plus_4(
+        _plus_4(_times_23(b2, _plus_3(b0, f)), _times_23(c2, g)),
+        _times_23(a2, h),
+    )
+    w3 = _plus_5(_plus_5(_times_33(b0, f), _times_33(c0, g)), _times_33(yy, a0))
+    _write(memory, 0, (y1[0], y1[1], y1[2], 0.0, 0.0))
+    _write(memory, 1, (z1[0], z1[1], z1[2], 0.0, 0.0))
+    _write(memory, 2, (w1[0], w1[1], w1[2], w1[3], 0.0))
+    _write(memory, 3, (y2[0], y2[1], y2[2], 0.0, 0.0))
+    _write(memory, 4, (y1[0], y1[1], y1[2], 0.0, 0.0))
+    _write(memory, 5, (w2[0], w2[1], w2[2], w2[3], 0.0))
+    _write(memory, 6, (y3[0], y3[1], y3[2], y3[3], 0.0))
+    _write(memory, 7, (z3[0], z3[1], z3[2], z3[3], 0.0))
+    _write(memory, 8, w3)
+    y = _minus_6(_times_34(z1, w2), _times_34(y1, w1))
+    z = _minus_6(_times_34(y2, w1), _times_34(y1, w2))
+    w = _minus_5(_times_33(y1, y1), _times_33(y2, z1))
+    for k in range(_DEGREE + 1):
+        memory[_POLYNOMIAL, k] = 0.0
+    for i in range(6):
+        for k in range(4):
+            memory[_POLYNOMIAL, i + k] += y[i] * y3[k] + z[i] * z3[k]
+    for i in range(5):
+        for k in range(5):
+            memory[_POLYNOMIAL, i + k] += w[i] * w3[k]
+
+
+@inlined
+def _line(memory: FloatArray, row: int, first: int) -> Pair:
+    return memory[_TABLE + row, first], memory[_TABLE + row, first + 1]
+
+
+@inlined
+def _parabola(memory: FloatArray, row: int) -> Triple:
+    return memory[_TABLE + row, 0], memory[_TABLE + row, 1], memory[_TABLE + row, 2]
+
+
+@inlined
+def _write(memory: FloatArray, row: int, values: Quintuple) -> None:
+    for k in range(5):
+        memory[_SYSTEM + row, k] = values[k]
+
+
+@inlined
+def cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def dot(a: Triple, b: Triple) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _back_substitute(memory: FloatArray, x: float) -> tuple[float, float]:
+    """The y and z that the linear system has at a root x: the best of three cross products."""
+    first = (_at(memory, 0, x), _at(memory, 1, x), _at(memory, 2, x))
+    second = (_at(memory, 3, x), _at(memory, 4, x), _at(memory, 5, x))
+    third = (_at(memory, 6, x), _at(memory, 7, x), _at(memory, 8, x))
+    a, b, c = dot(first, first), dot(second, second), dot(third, third)
+    y = z = 0.0
+    best = -1.0
+    for one, other, squares in (
+        (first, second, a * b),
+        (second, third, b * c),
+        (third, first, c * a),
+    ):
+        product = cross(one, other)
+        size = dot(product, product) / squares
+        if size > best and product[2] != 0.0:
+            y, z, best = product[0] / product[2], product[1] / product[2], size
+    return y, z
+
+
+@inlined
+def _at(memory: FloatArray, row: int, x: float) -> float:
+    m, r = memory, _SYSTEM + row
+    return float(m[r, 0] + x * (m[r, 1] + x * (m[r, 2] + x * (m[r, 3] + x * m[r, 4]))))
+
+
+@inlined
+def _half_gradient(memory: FloatArray, r: int, b: float, c: float, d: float) -> Quadruple:
+    """Half the gradient of a quadric at (1, b, c, d); its product with the point is the value."""
+    q = memory
+    return (
+        q[r, 0] + 0.5 * (q[r, 1] * b + q[r, 2] * c + q[r, 3] * d),
+        q[r, 4] * b + 0.5 * (q[r, 1] + q[r, 5] * c + q[r, 6] * d),
+        q[r, 7] * c + 0.5 * (q[r, 2] + q[r, 5] * b + q[r, 8] * d),
+        q[r, 9] * d + 0.5 * (q[r, 3] + q[r, 6] * b + q[r, 8] * c),
+    )
+
+
+@kernel
+def _polish(memory: FloatArray, row: int) -> bool:
+    """Improve an intersection, in a row, by Newton's method; False where it is not one."""
+    b, c, d = memory[row, 1], memory[row, 2], memory[row, 3]
+    error = np.inf
+    for iteration in range(_POLISH_STEPS + 1):
+        f = _half_gradient(memory, QUADRICS + 0, b, c, d)
+        g = _half_gradient(memory, QUADRICS + 1, b, c, d)
+        h = _half_gradient(memory, QUADRICS + 2, b, c, d)
+        values = (
+            f[0] + f[1] * b + f[2] * c + f[3] * d,
+            g[0] + g[1] * b + g[2] * c + g[3] * d,
+            h[0] + h[1] * b + h[2] * c + h[3] * d,
+        )
+        sizes = (
+            abs(f[0]) + abs(f[1] * b) + abs(f[2] * c) + abs(f[3] * d),
+            abs(g[0]) + abs(g[1] * b) + abs(g[2] * c) + abs(g[3] * d),
+            abs(h[0]) + abs(h[1] * b) + abs(h[2] * c) + abs(h[3] * d),
+        )
+        error = max(
+            max(abs(values[0]) / sizes[0], abs(values[1]) / sizes[1]), abs(values[2]) / sizes[2]
+        )
+        if iteration == _POLISH_STEPS or error < 1e-15 or not error < 1e3:
+            break
+        # Cramer's rule, with the rows' cross products as the columns of the adjugate.
+        fg, gh, hf = cross(f[1:], g[1:]), cross(g[1:], h[1:]), cross(h[1:], f[1:])
+        determinant = dot(f[1:], gh)
+        if determinant == 0.0:
+            break
+        scale = 0.5 / determinant
+        b -= scale * (values[0] * gh[0] + values[1] * hf[0] + values[2] * fg[0])
+        c -= scale * (values[0] * gh[1] + values[1] * hf[1] + values[2] * fg[1])
+        d -= scale * (values[0] * gh[2] + values[1] * hf[2] + values[2] * fg[2])
+        if error < _ALMOST_EXACT:
+            break
+    memory[row, 1], memory[row, 2], memory[row, 3] = b, c, d
+    return error < _EXACT
+
+
+# Sums and products of polynomials, named by their numbers of coefficients, constants first.
+
+
+@inlined
+def _plus_3(p: Triple, q: Triple) -> Triple:
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2]
+
+
+@inlined
+def _plus_4(p: Quadruple, q: Quadruple) -> Quadruple:
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3]
+
+
+@inlined
+def _plus_5(p: Quintuple, q: Quintuple) -> Quintuple:
+    return p[0] + q[0], p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4]
+
+
+@inlined
+def _minus_2(p: Pair, q: Pair) -> Pair:
+    return p[0] - q[0], p[1] - q[1]
+
+
+@inlined
+def _minus_3(p: Triple, q: Triple) -> Triple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2]
+
+
+@inlined
+def _minus_4(p: Quadruple, q: Quadruple) -> Quadruple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3]
+
+
+@inlined
+def _minus_5(p: Quintuple, q: Quintuple) -> Quintuple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4]
+
+
+@inlined
+def _minus_6(p: Sextuple, q: Sextuple) -> Sextuple:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2], p[3] - q[3], p[4] - q[4], p[5] - q[5]
+
+
+@inlined
+def _times_22(p: Pair, q: Pair) -> Triple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[1] * q[1],
+    )
+
+
+@inlined
+def _times_23(p: Pair, q: Triple) -> Quadruple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1],
+        p[1] * q[2],
+    )
+
+
+@inlined
+def _times_33(p: Triple, q: Triple) -> Quintuple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1] + p[2] * q[0],
+        p[1] * q[2] + p[2] * q[1],
+        p[2] * q[2],
+    )
+
+
+@inlined
+def _times_34(p: Triple, q: Quadruple) -> Sextuple:
+    return (
+        p[0] * q[0],
+        p[0] * q[1] + p[1] * q[0],
+        p[0] * q[2] + p[1] * q[1] + p[2] * q[0],
+        p[0] * q[3] + p[1] * q[2] + p[2] * q[1],
+        p[1] * q[3] + p[2] * q[2],
+        p[2] * q[3],
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ from cadalign.fitting.result import FitResult
 from cadalign.fitting.solutions import Solutions
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import POSE_SIZE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,50 @@ class BatchResult:
         solved[list(self.errors)] = False
         return solved
 
+    def __repr__(self) -> str:
+        return f"BatchResult({len(self)} problems, {len(self.errors)} without solution)"
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row for each problem, as a pandas DataFrame.
+
+        Columns: ``solved``, ``rms`` [px], ``keypoints``, ``inliers``, ``rotation_x`` to
+        ``rotation_z`` (rotation vector [degrees]), ``translation_x`` to ``_z``, ``scale_x`` to
+        ``_z``, ``focal_length`` [px], and ``error``, the reason where there is no solution.
+
+        Examples
+        --------
+        >>> from cadalign import Camera, fit_batch
+        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+        >>> seen = camera.project(corners + [0.1, 0.2, 5.0])
+        >>> frame = fit_batch([corners, corners], [seen, seen], camera).to_dataframe()
+        >>> frame[["solved", "keypoints"]].to_numpy().tolist()
+        [[True, 8], [True, 8]]
+        """
+        import pandas as pd
+        from scipy.spatial.transform import Rotation
+
+        solved = self.solved
+        vectors = np.full((len(self), 3), np.nan)
+        if solved.any():
+            turns = Rotation.from_matrix(self.rotation[solved])
+            vectors[solved] = turns.as_rotvec(degrees=True)
+        kept = np.concatenate([[0], np.cumsum(self.inliers)])
+        columns: dict[str, Any] = {
+            "solved": solved,
+            "rms": self.rms,
+            "keypoints": np.diff(self.offsets),
+            "inliers": np.diff(kept[self.offsets]),
+        }
+        named = {"rotation": vectors, "translation": self.translation, "scale": self.scale}
+        for name, values in named.items():
+            columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+        columns["focal_length"] = self.focal_length
+        columns["error"] = [
+            str(self.errors[b]) if b in self.errors else "" for b in range(len(self))
+        ]
+        return pd.DataFrame(columns)
+
     def alignment(self, problem: int) -> Alignment:
         """The alignment of one problem.
 
@@ -77,7 +124,9 @@ class BatchResult:
         """
         if problem in self.errors:
             raise self.errors[problem]
-        return Alignment(self.rotation[problem], self.translation[problem], self.scale[problem])
+        rotation, translation, scale = self.rotation, self.translation, self.scale
+        own = (array[problem].copy() for array in (rotation, translation, scale))
+        return Alignment(*own, is_valid=True)
 
     @classmethod
     def of_solutions(cls, problems: Problems, solutions: Solutions) -> BatchResult:

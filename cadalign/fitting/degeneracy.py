@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.fitting.options import FitOptions
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
 from cadalign.solvers.linear import aepnp_error, describe_plane, out_of_range_error
+
+_FLAT = 1e-6  # extent across a line over that along it
 
 
 def solver_error(
@@ -45,11 +49,19 @@ def solver_error(
             where="points_3d",
             fix="give more keypoints, or a scale_prior_sigma",
         )
+    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+    if undetermined < 3 and _are_on_a_line(points_3d):
+        fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
     return DegenerateError(
         f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
         where="points_3d",
-        fix="add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma",
+        fix=fix,
     )
+
+
+def _are_on_a_line(points: FloatArray) -> bool:
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[1] <= _FLAT * sizes[0])
 
 
 def no_redundancy_error(count: int) -> DegenerateError:

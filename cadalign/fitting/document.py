@@ -17,6 +17,7 @@ from cadalign.fitting.options import FitOptions
 from cadalign.fitting.result import Alternative, FitResult, FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
@@ -68,6 +69,7 @@ class _Result(ForeignDocument):
     alternatives: list[_Alternative]
     stats: FitStats
     options: _Options | None = None  # not in files of earlier versions
+    symmetry: Any = None  # in the form of `Symmetry.from_dict`
 
     def __post_init__(self) -> None:
         for name in ("residuals", "inliers"):
@@ -121,6 +123,7 @@ def _result(read: _Result) -> FitResult:
         ),
         stats=read.stats,
         options=None if read.options is None else _options(read.options, len(read.points_3d)),
+        symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
@@ -16,20 +15,20 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
 from cadalign.errors import CadalignError, InputError
+from cadalign.fitting.alternatives import alternatives_of, camera_of
 from cadalign.fitting.batch import BatchResult
+from cadalign.fitting.canonical import canonical_batch, canonical_fit
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.noise import check_sigmas
 from cadalign.fitting.options import FitOptions, RansacOptions, Sigma
 from cadalign.fitting.problems import Problems, each_of, pack_many, pack_one
-from cadalign.fitting.result import Alternative, FitResult, FitStats
-from cadalign.fitting.robust import find_consensus, residuals_of
-from cadalign.fitting.solutions import Solutions
+from cadalign.fitting.result import FitResult, FitStats
 from cadalign.fitting.solve import solve
+from cadalign.fitting.symmetric import checked_symmetry
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
 
-LEAST_LIKELIHOOD = 1e-3
-"""Relative likelihood above which another minimum is reported as an alternative."""
 _INLIER_ROUNDS = 5
 
 
@@ -50,6 +49,7 @@ def fit(
     focal_prior: FocalPrior | None = None,
     ransac: RansacOptions | None = None,
     confidences: npt.ArrayLike | None = None,
+    symmetry: Symmetry | None = None,
 ) -> FitResult:
     """Estimate rotation, translation and stretch of a model from its keypoints in one image.
 
@@ -96,6 +96,12 @@ def fit(
         outliers. ``result.inliers`` marks the inliers.
     confidences : (n,) float, optional
         Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
+    symmetry : Symmetry, optional
+        Motions that take the model to itself. Of the alignments that are equal under it, the result
+        is the one nearest to upright, y up, with the model's z axis towards the camera, and no
+        other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
+        that differs across an axis leaves half turns of its rotations; ``stretch="y"`` keeps round
+        what is round about y. See `cadalign.geometry.symmetry_group`.
 
     Returns
     -------
@@ -138,9 +144,13 @@ def fit(
         options = FitOptions(method, _copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
+    if symmetry is not None:
+        checked_symmetry(symmetry)
     if ransac is None:
-        return _fit_all(problems, options, start)
-    return _fit_robustly(problems, options, ransac, confidences, start)
+        result = _fit_all(problems, options, start)
+    else:
+        result = _fit_robustly(problems, options, ransac, confidences, start)
+    return result if symmetry is None else canonical_fit(result, symmetry).result
 
 
 @np.errstate(all="ignore")
@@ -160,6 +170,7 @@ def fit_batch(
     focal_prior: FocalPrior | None = None,
     ransac: RansacOptions | None = None,
     confidences: Sequence[npt.ArrayLike] | None = None,
+    symmetry: Symmetry | None = None,
     workers: int = 1,
 ) -> BatchResult:
     """Solve many independent problems in one call; each as `fit` does, bit for bit.
@@ -178,6 +189,8 @@ def fit_batch(
         As for `fit`; every problem has a focal length of its own.
     confidences : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
+    symmetry : Symmetry, optional
+        As for `fit`, of all models.
     workers : int
         Number of threads that share the problems; -1 for all cores.
 
@@ -223,6 +236,7 @@ def fit_batch(
     _check_ransac(ransac, confidences)
     if confidences is not None:
         confidences = each_of(confidences, "confidences", len(problems), "sets")
+    checked_symmetry(symmetry)
     bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
@@ -237,9 +251,13 @@ def fit_batch(
         return BatchResult.of_fits(some, fits, focal=options.focal)
 
     if len(parts) < 2:
-        return run((0, len(problems)))
-    with ThreadPoolExecutor(len(parts)) as pool:
-        return BatchResult.joined(list(pool.map(run, parts)))
+        batch = run((0, len(problems)))
+    else:
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(len(parts)) as pool:
+            batch = BatchResult.joined(list(pool.map(run, parts)))
+    return batch if symmetry is None else canonical_batch(batch, symmetry, options)
 
 
 def _copied(sigma: Any) -> Any:
@@ -294,6 +312,9 @@ def _fit_robustly(
     start: float,
 ) -> FitResult:
     """Fit the only problem to the keypoints that support its best alignment."""
+    # Only here: most programs never search for outliers, and its kernels take time to import.
+    from cadalign.fitting.robust import find_consensus, residuals_of
+
     if options.method != "optimal":
         raise InputError(
             f"the method {options.method!r} does not go with ransac",
@@ -365,47 +386,22 @@ def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult
         sigma = float(solutions.sigmas[0])
     elif options.method == "optimal" and isinstance(options.sigma, int | float):
         sigma = float(options.sigma)
+    inliers = np.empty(len(problems.points_3d), dtype=bool)
+    inliers.fill(True)
     return FitResult(
         alignment=alignment,
         points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
         residuals=solutions.residuals,
-        inliers=np.ones(len(problems.points_3d), dtype=bool),
+        inliers=inliers,
         method=options.method,
-        camera=_camera(problems, solutions, 0),
+        camera=camera_of(problems, solutions, 0),
         sigma=sigma,
         covariance=None if solutions.covariances is None else solutions.covariances[0],
         known_axis=options.known_axis,
         stretched_axes=options.stretched_axes,
         focal=options.focal,
         focal_prior=options.focal_prior,
-        alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
+        alternatives=alternatives_of(problems, solutions, minima, options) if minima > 1 else (),
         stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
         options=options,
-    )
-
-
-def _camera(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
-    """The camera that goes with a minimum of the only problem."""
-    camera = problems.cameras[0]
-    return camera if solutions.focals is None else camera.with_focal(solutions.focals[0, minimum])
-
-
-def _alternatives(
-    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
-) -> tuple[Alternative, ...]:
-    """The other minima that are likely enough."""
-    costs = solutions.costs[0, :minima]
-    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        # Costs are in units of sigma^2; below 1 they are those of exact fits.
-        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
-    else:
-        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
-    return tuple(
-        Alternative(
-            Alignment.from_packed(solutions.poses[0, k]),
-            float(ratios[k]),
-            _camera(problems, solutions, k),
-        )
-        for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
     )

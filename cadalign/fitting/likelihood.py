@@ -50,13 +50,7 @@ class Likelihood:
 
     def losses(self, residuals: FloatArray) -> FloatArray:
         """The loss (n,) on each of the residuals (n, 2) [px], at most its whitened square."""
-        squares, bend = self.squares(residuals), self.options.loss_scale
-        if self.options.loss == "huber":
-            bent = 2 * bend * np.sqrt(squares) - bend**2
-            return np.asarray(np.where(squares <= bend**2, squares, bent))
-        if self.options.loss == "cauchy":
-            return np.asarray(bend**2 * np.log1p(squares / bend**2))
-        return squares
+        return bent(self.squares(residuals), self.options.loss, self.options.loss_scale)
 
     def weights(self, residuals: FloatArray) -> FloatArray:
         """Weights (n,) of the squares that stand for the loss near residuals (n, 2) [px]."""
@@ -74,3 +68,13 @@ class Likelihood:
         if prior is not None:
             total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2
         return np.asarray(total)
+
+
+def bent(squares: FloatArray, loss: str, bend: float) -> FloatArray:
+    """The loss, linear, huber or cauchy, on squared whitened lengths of any shape."""
+    if loss == "huber":
+        linear = 2 * bend * np.sqrt(squares) - bend**2
+        return np.asarray(np.where(squares <= bend**2, squares, linear))
+    if loss == "cauchy":
+        return np.asarray(bend**2 * np.log1p(squares / bend**2))
+    return squares

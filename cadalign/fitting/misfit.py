@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
+from cadalign.fitting.chi_square import upper_tail
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.options import FitOptions
 from cadalign.fitting.uncertainty import WEAK_SCALE, percent, uncertainty_of
@@ -171,10 +172,8 @@ class _Tested:
     @property
     def passes(self) -> bool:
         """True if the noise explains the sum."""
-        from scipy.special import chdtri  # takes longer to import than a fit
-
         redundancy = self.redundancy
-        return redundancy <= 0 or self.chi_square <= chdtri(redundancy, _FALSE_ALARMS)
+        return redundancy <= 0 or upper_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
 
     def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FitResult:
         """Fit some of the keypoints anew, with changed options."""
@@ -186,8 +185,6 @@ class _Tested:
 
 def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     """The scales without the constraints on them, if these contradict the keypoints."""
-    from scipy.special import chdtri
-
     options = tested.options
     if len(options.stretched_axes) == _SCALES and options.scale_prior_sigma is None:
         return None
@@ -197,7 +194,7 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
         decrease = tested.chi_square - _Tested.of(free, free.options).chi_square
     except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
         return None
-    if decrease <= chdtri(_SCALES, _FALSE_STRETCH_ALARMS):
+    if upper_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
         return None
     x, y, z = free.alignment.scale.tolist()
     return x, y, z

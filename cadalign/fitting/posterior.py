@@ -17,10 +17,12 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.fitting.chi_square import upper_quantile
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.problems import distinct_rows
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotations_from_vectors
 
 if TYPE_CHECKING:
     from cadalign.fitting.options import FitOptions
@@ -65,10 +67,10 @@ def posterior_covariance(result: FitResult, options: FitOptions) -> FloatArray:
 
 def widening_of(unknowns: int, redundancy: float) -> float:
     """Variance of the F distribution's 95 % ellipsoid over that of a known sigma's."""
-    from scipy.special import chdtri, fdtri  # takes longer to import than a fit
+    from scipy.special import fdtri  # takes longer to import than a fit
 
     quantile = unknowns * fdtri(unknowns, redundancy, _COVERAGE)
-    return float(quantile / chdtri(unknowns, 1 - _COVERAGE))
+    return float(quantile / upper_quantile(unknowns, 1 - _COVERAGE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +116,6 @@ class _Chart:
         Returns projections (k, n, 2) [px], NaN behind the camera; deviations (k, 9) of the unknowns
         of a covariance; logarithms of the scales (k, 3) and of the focal lengths (k,).
         """
-        from scipy.spatial.transform import Rotation  # too slow to load with `import cadalign`
-
         log_scales = np.zeros((len(steps), 3))
         log_scales[:, self._stretched] = steps[:, 6:8]
         log_scales += np.log(self.alignment.scale)
@@ -124,7 +124,7 @@ class _Chart:
         centers = np.stack(
             [(u / depth + steps[:, 3]) * depths, (v / depth + steps[:, 4]) * depths, depths], axis=1
         )
-        linear = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ self.alignment.rotation
+        linear = rotations_from_vectors(steps[:, :3]) @ self.alignment.rotation
         linear = linear * np.exp(log_scales)[:, None]
         in_camera = (linear.reshape(-1, 3) @ self.points.T).reshape(len(steps), 3, -1)
         in_camera += centers[:, :, None]
@@ -173,8 +173,6 @@ def _sample(
     that the likelihood ratio does not reject at 5 % reaches farther: that region covers the truth
     as often as stated with few keypoints too.
     """
-    from scipy.special import chdtri  # takes longer to import than a fit
-
     chart = _Chart.of(result)
     free = likelihood.options.estimated_unknowns
     size = len(first)
@@ -215,7 +213,7 @@ def _sample(
         proposal = _INFLATION * (centered * adapted[:, None]).T @ centered
     at_estimate = likelihood.squares(result.residuals[kept]) @ loss_weights / widening
     at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 9)))[2:])[0]
-    limit = chdtri(len(free), 1 - _COVERAGE)
+    limit = upper_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
     moved = deviations[:, free]
     covariance = np.zeros_like(first)

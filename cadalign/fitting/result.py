@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +18,19 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior, focal_doubt
 from cadalign.fitting.options import FitOptions
+from cadalign.fitting.symmetric import equal_text, held_axes, without_free_turns
 from cadalign.fitting.uncertainty import Uncertainty, uncertainty_of, warnings_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from cadalign.export import ExportOptions
     from cadalign.fitting.misfit import Misfit
+    from cadalign.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -75,7 +84,8 @@ class FitResult:
     alignment : Alignment
         Pose and stretch.
     points_3d : (n, 3) float
-        The model's keypoints, as given.
+        The model's keypoints, as given; with a symmetry, turned by the one that leads to this
+        alignment.
     residuals : (n, 2) float
         Projected minus observed keypoint [px]; infinite, and null in JSON, for one that was
         rejected and lies behind the camera.
@@ -109,6 +119,8 @@ class FitResult:
     stats : FitStats
     options : FitOptions, optional
         Those of the fit; None in files of earlier versions.
+    symmetry : Symmetry, optional
+        The model's, as given: of all equal alignments this is the canonical one.
     """
 
     alignment: Alignment
@@ -126,6 +138,7 @@ class FitResult:
     alternatives: tuple[Alternative, ...] = ()
     stats: FitStats = FitStats(0, 0, 0.0)
     options: FitOptions | None = None
+    symmetry: Symmetry | None = None
 
     @property
     def rms(self) -> float:
@@ -151,10 +164,18 @@ class FitResult:
 
     @property
     def std(self) -> Uncertainty | None:
-        """Standard deviations from `posterior_covariance`; None for methods that have none."""
-        if self.posterior_covariance is None:
+        """Standard deviations from `posterior_covariance`; None for methods that have none.
+
+        Without that of rotations about an axis of the model's symmetry.
+        """
+        covariance = self.posterior_covariance
+        if covariance is None:
             return None
-        return uncertainty_of(self.posterior_covariance, self.known_axis)
+        if self.symmetry is not None:
+            held = held_axes(self.stretched_axes)
+            best = group_of(self.symmetry).canonical(self.alignment, held=held)
+            covariance = without_free_turns(covariance, best)
+        return uncertainty_of(covariance, self.known_axis)
 
     @cached_property
     def misfit(self) -> Misfit | None:
@@ -219,6 +240,9 @@ class FitResult:
                 for text, deviation in zip(scale, std.scale, strict=True)
             ]
         lines.append(f"  scale        ({', '.join(scale)})")
+        equal = equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
+        if equal:
+            lines.append(f"  symmetry     {equal}")
         if self.focal == "estimate":
             known_to = "" if std is None else f" +- {100 * std.focal:.2g} %"
             lines.append(f"  focal length {self.camera.fx:.4g} px{known_to}")
@@ -229,6 +253,89 @@ class FitResult:
         )
         lines.extend(f"  warning      {text}" for text in self.warnings)
         return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        scale = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
+        count = f"{int(self.inliers.sum())}/{len(self.inliers)}"
+        return (
+            f"FitResult({self.method!r}, keypoints={count}, rms={self.rms:.3g} px, "
+            f"scale=({scale}), warnings={len(self.warnings)})"
+        )
+
+    def _repr_html_(self) -> str:
+        from cadalign.fitting.plots import fit_html
+
+        return fit_html(self)
+
+    def plot(
+        self,
+        image: npt.ArrayLike | str | os.PathLike[str] | None = None,
+        mesh: Mesh | None = None,
+        *,
+        axes: Axes | None = None,
+    ) -> Axes:
+        """Draw photo, model, box, and keypoints with their residuals on matplotlib axes.
+
+        Parameters
+        ----------
+        image : (h, w, 3) uint8 or path, optional
+            The photo; grey by default.
+        mesh : Mesh, optional
+            The model's, drawn shaded with its outline. Without it the box is the keypoints'.
+        axes : matplotlib.axes.Axes, optional
+            The axes to draw on; those of a new figure by default.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            In pixels: x right, y down.
+
+        Raises
+        ------
+        InputError
+            If the photo is not of the camera's size.
+
+        Examples
+        --------
+        >>> from matplotlib.figure import Figure
+        >>> from cadalign import fit
+        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        >>> result = fit(corners, camera.project(corners + [0.1, 0.2, 5.0]), camera)
+        >>> axes = result.plot(axes=Figure().add_subplot())
+        >>> [float(y) for y in axes.get_ylim()]
+        [479.5, -0.5]
+        """
+        from cadalign.fitting.plots import plot_fit
+
+        return plot_fit(self, image, mesh, axes=axes)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as JSON, as `cadalign fit` does.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be written.
+        """
+        from cadalign.io.files import write_json
+
+        write_json(Path(path), self.to_dict())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> FitResult:
+        """Read what `save` or `cadalign fit` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read, or a field is missing or invalid; the message names both.
+        """
+        from cadalign.io.documents import in_file, read_json
+
+        data = read_json(Path(path))
+        with in_file(Path(path)):
+            return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the result as plain lists and numbers, for JSON."""
@@ -262,6 +369,7 @@ class FitResult:
             ],
             "warnings": list(self.warnings),
             "stats": asdict(self.stats),
+            "symmetry": None if self.symmetry is None else self.symmetry.to_dict(),
         }
 
     @classmethod
@@ -276,6 +384,36 @@ class FitResult:
         from cadalign.fitting.document import read_result  # takes the validation library with it
 
         return read_result(data)
+
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        format: str | None = None,
+        options: ExportOptions | None = None,
+        **of_the_object: Any,
+    ) -> Path:
+        """Write the aligned object for another tool; see `cadalign.export.export_object`.
+
+        Parameters
+        ----------
+        path : path-like
+            Its ending tells the format: ``.glb``, ``.usdz``, ``.obj``, ``.ply``, BOP's ``.csv``.
+        format, options
+            As for `cadalign.export.export_object`.
+        **of_the_object
+            ``mesh``, ``image``, ``world_from_cam``, ``name`` and ``metres`` of
+            `cadalign.fitting.exporting.object_of_fit`.
+
+        Examples
+        --------
+        >>> result.export("chair.glb", mesh=mesh, image="chair.jpg")  # doctest: +SKIP
+        """
+        from cadalign.export import export_object
+        from cadalign.fitting.exporting import object_of_fit
+
+        exported = object_of_fit(self, **of_the_object)
+        return export_object(path, exported, format=format, options=options)
 
     def to_json(self) -> str:
         """The result as JSON text; see `to_dict`."""

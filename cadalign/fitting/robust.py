@@ -58,7 +58,8 @@ def find_consensus(
             fix="leave it at 'ap4p'",
         )
     by_confidence = _by_confidence(confidences, count)
-    order = np.arange(count) if by_confidence is None else by_confidence
+    order = np.random.default_rng(ransac.seed).permutation(count)
+    ranked = np.arange(count) if by_confidence is None else np.argsort(order)[by_confidence]
     views = _views(problems.points_2d[order], camera, options)
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
     pose = np.zeros(POSE_SIZE)
@@ -74,6 +75,7 @@ def find_consensus(
         views,
         np.log(views.focals),
         log_focal_prior(camera, options),
+        ranked,
         Settings(
             threshold=float(ransac.max_reproj_error),
             minimal=minimal,

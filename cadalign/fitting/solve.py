@@ -8,10 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError
 from cadalign.fitting.degeneracy import no_redundancy_error, solver_error
-from cadalign.fitting.focal.search import search_focal
 from cadalign.fitting.noise import check_sigmas, rays_of, whitening_of
 from cadalign.fitting.options import LOSSES, FitOptions, Sigma
 from cadalign.fitting.problems import Problems
@@ -19,7 +18,7 @@ from cadalign.fitting.solutions import Solutions
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.projection import reproject_batch
+from cadalign.solvers.projection import pinhole_rays, reproject_batch
 
 _SIGMA_ROUNDS = 20
 _SIGMA_TOLERANCE = 1e-3
@@ -30,7 +29,8 @@ _HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is tak
 _EXACT_COST = 1e-6
 _TINY = 1e-100
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
-_ONE_MINIMUM = np.array([1, 0, 1, -1])
+_ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
+_NO_COST = read_only(np.array([[np.inf]]))
 
 Errors = dict[int, CadalignError]
 
@@ -42,6 +42,10 @@ def solve(
 
     ``sigmas``, one for each problem, takes the place of the options' sigma.
     """
+    if options.method == "aepnp" and sigmas is None:
+        short = _solve_one_linearly(problems, options)
+        if short is not None:
+            return short
     points = problems.points_3d
     if options.known_axis != "x":
         points = np.ascontiguousarray(points[:, options.axis_order])
@@ -64,6 +68,25 @@ def solve(
     if np.count_nonzero(statuses):
         found = found._replace(errors=_errors(problems, options, found))
     return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | None:
+    """The linear solution of a single plain problem; None of any other, and where it fails.
+
+    The short way of the usual call, which would otherwise take longer than its kernels.
+    """
+    camera = problems.cameras[0]
+    plain = len(problems.offsets) == 2 and options.known_axis == "x" and camera.focal_known
+    if not plain or camera.distortion or not _is_plain(options.sigma, None):
+        return None
+    points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    poses, solved = aepnp_batch(points, pinhole_rays(pixels, fx, fy, cx, cy), offsets)
+    calibration = np.array([[fx, fy, cx, cy]])
+    residuals, statuses = reproject_batch(points, pixels, offsets, poses, calibration, solved)
+    if statuses[0] != OK:
+        return None
+    return Solutions(poses, _NO_COST, None, statuses, _ONE_MINIMUM, residuals=residuals)
 
 
 def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
@@ -117,6 +140,9 @@ def _solve_optimal(
 ) -> Solutions:
     """The maximum-likelihood solutions, with sigma estimated in rounds where it is unknown."""
     if options.focal == "estimate":
+        # Only here: its kernels take time to import, and most cameras are calibrated.
+        from cadalign.fitting.focal.search import search_focal
+
         search = partial(search_focal, problems, options, points, sigmas)
     else:
         rays, errors = _rays(problems)

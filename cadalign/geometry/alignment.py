@@ -56,8 +56,9 @@ class Alignment:
 
     def __post_init__(self, is_valid: bool) -> None:
         if is_valid:
-            for array in (self.rotation, self.translation, self.scale):
-                array.flags.writeable = False
+            self.rotation.setflags(write=False)
+            self.translation.setflags(write=False)
+            self.scale.setflags(write=False)
             return
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         translation = as_floats(self.translation, name="translation", shape=(3,))

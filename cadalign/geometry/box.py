@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, InitVar, dataclass
+from math import isfinite
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +30,8 @@ class Box:
         Its axes are the columns.
     extents : (3,) float
         Its full side lengths along these axes, not negative.
+    is_valid : bool
+        The arrays are known to be valid: take them over unchecked, and make them read-only.
 
     Raises
     ------
@@ -39,8 +42,14 @@ class Box:
     center: FloatArray
     rotation: FloatArray
     extents: FloatArray
+    _: KW_ONLY
+    is_valid: InitVar[bool] = False
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, is_valid: bool) -> None:
+        if is_valid:
+            for array in (self.center, self.rotation, self.extents):
+                array.flags.writeable = False
+            return
         center = as_floats(self.center, name="center", shape=(3,))
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         extents = as_floats(self.extents, name="extents", shape=(3,))
@@ -70,11 +79,11 @@ class Box:
         ([0.0, 0.0, 4.0], [2.0, 4.0, 1.0])
         """
         low, high = as_floats(bounds, name="bounds", shape=(2, 3))
-        return cls(
-            center=alignment.apply([(low + high) / 2])[0],
-            rotation=alignment.rotation,
-            extents=(high - low) * alignment.scale,
-        )
+        extents = (high - low) * alignment.scale
+        (center,) = ((low + high) / 2)[None] @ alignment.linear.T + alignment.translation
+        # Python's numbers: NumPy's reductions of three take longer than the rest of this.
+        valid = min(extents.tolist()) >= 0 and isfinite(sum(extents.tolist() + center.tolist()))
+        return cls(center, alignment.rotation, extents, is_valid=valid)
 
     @property
     def corners(self) -> FloatArray:
@@ -84,4 +93,5 @@ class Box:
     @property
     def volume(self) -> float:
         """The volume [model units cubed]."""
-        return float(np.prod(self.extents))
+        width, height, length = self.extents.tolist()
+        return float(width * height * length)

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_points, is_number
+from cadalign.arrays import FloatArray, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
-from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
+from cadalign.geometry.camera_form import PixelOrigin, read_form, read_matrix, write_form
 from cadalign.geometry.distortion import distort, undistort
 from cadalign.geometry.projection import perspective
 
-# COLMAP's camera models: the names of their parameters, in COLMAP's order.
-COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
-_DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -94,7 +87,7 @@ class Camera:
             what = f"{quote(known)} is neither True nor False"
             raise InputError(what, where="camera.focal_known")
         try:
-            if np.iscomplexobj(self.distortion) or np.ma.is_masked(self.distortion):
+            if np.iscomplexobj(self.distortion) or is_masked(self.distortion):
                 raise TypeError
             coefficients = tuple(float(value) for value in self.distortion)
         except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
@@ -132,6 +125,44 @@ class Camera:
         with np.errstate(over="ignore"):
             focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @classmethod
+    def from_matrix(
+        cls,
+        matrix: npt.ArrayLike,
+        width: int,
+        height: int,
+        *,
+        pixel_origin: PixelOrigin = "center",
+        distortion: tuple[float, ...] = (),
+    ) -> Camera:
+        """Make a camera from its calibration matrix K.
+
+        Parameters
+        ----------
+        matrix : (3, 3) float
+            ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px], without skew.
+        width, height : int
+            Image size [px].
+        pixel_origin : {"center", "corner"}
+            Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
+            Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
+            renderers), half a pixel away.
+        distortion : tuple of float, optional
+            As for `Camera`.
+
+        Raises
+        ------
+        InputError
+            If it is no such matrix.
+
+        Examples
+        --------
+        >>> K = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]
+        >>> Camera.from_matrix(K, 640, 480, pixel_origin="corner").cx
+        319.5
+        """
+        return cls(width, height, *read_matrix(matrix, pixel_origin), distortion)
 
     @classmethod
     def without_focal(
@@ -194,7 +225,7 @@ class Camera:
 
     @property
     def matrix(self) -> FloatArray:
-        """The calibration matrix K, (3, 3) float."""
+        """The calibration matrix K, (3, 3) float, of pixels whose centres are integers."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=float)
 
     def require_focal(self) -> None:
@@ -323,37 +354,64 @@ class Camera:
         high = np.array([self.width, self.height]) - 0.5 - margin
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=1))
 
-    def to_dict(self) -> dict[str, Any]:
+    def _repr_html_(self) -> str:
+        from cadalign.geometry.plots import plot_photo
+        from cadalign.notebook.html import card, draw_picture
+
+        focal, angle = "unknown", "unknown"
+        if self.focal_known:
+            angles = np.degrees(2 * np.arctan(0.5 * np.array([self.width, self.height])
+                                              / (self.fx, self.fy)))  # fmt: skip
+            focal, angle = f"{self.fx:.5g}, {self.fy:.5g} px", "{:.3g}° x {:.3g}°".format(*angles)
+        lens = ", ".join(f"{value:.3g}" for value in self.distortion)
+        rows = [
+            ("image", f"{self.width} x {self.height} px"),
+            ("focal length", focal),
+            ("field of view", angle),
+            ("principal point", f"{self.cx:.5g}, {self.cy:.5g} px (pixel centres are integers)"),
+            ("distortion", lens or "none"),
+        ]
+
+        def draw(axes: Axes) -> None:
+            plot_photo(self, axes=axes)
+            axes.axvline((self.width - 1) / 2, color="0.7", linewidth=0.8)
+            axes.axhline((self.height - 1) / 2, color="0.7", linewidth=0.8)
+            axes.plot(self.cx, self.cy, "+", color="#f03232", markersize=14, markeredgewidth=2)
+
+        picture = draw_picture(draw, aspect=self.height / self.width)
+        return card("Camera", rows, picture=picture)
+
+    def to_dict(self, *, pixel_origin: PixelOrigin | None = None) -> dict[str, Any]:
         """Write the camera as COLMAP does: ``{"model", "width", "height", "params"}``.
 
         COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so the principal point there
         is larger by half a pixel than ``cx`` and ``cy`` here. An unknown focal length is None,
         ``null`` in JSON.
 
+        Parameters
+        ----------
+        pixel_origin : {"corner", "center"}, optional
+            Where (0, 0) lies for the written principal point: the top-left corner of the image,
+            or the centre of the top-left pixel; stated in ``pixel_origin``. By default COLMAP's
+            corner, not stated.
+
         Examples
         --------
-        >>> Camera(640, 480, 500, 500, 319.5, 239.5).to_dict()["params"]
+        >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+        >>> camera.to_dict()["params"]
         [500.0, 500.0, 320.0, 240.0]
+        >>> camera.to_dict(pixel_origin="center")["params"]
+        [500.0, 500.0, 319.5, 239.5]
         """
-        model = {0: "PINHOLE", 4: "OPENCV"}.get(len(self.distortion), "FULL_OPENCV")
-        values: dict[str, float | None]
-        values = dict(zip(_DISTORTION_NAMES, self.distortion, strict=False))
-        values |= {
-            "fx": self.fx if self.focal_known else None,
-            "fy": self.fy if self.focal_known else None,
-            "cx": self.cx + PIXEL_CENTRE,
-            "cy": self.cy + PIXEL_CENTRE,
-        }
-        return {
-            "model": model,
-            "width": self.width,
-            "height": self.height,
-            "params": [values.get(name, 0.0) for name in COLMAP_PARAMS[model]],
-        }
+        focals = (self.fx, self.fy) if self.focal_known else (None, None)
+        form = write_form(
+            (self.width, self.height), focals, (self.cx, self.cy), self.distortion, pixel_origin
+        )
+        return form if pixel_origin is None else {**form, "pixel_origin": pixel_origin}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Camera:
-        """Read a camera in COLMAP's form; see `to_dict`.
+        """Read a camera in COLMAP's form, see `to_dict`, or as a calibration matrix.
 
         Parameters
         ----------
@@ -361,7 +419,9 @@ class Camera:
             ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV),
             ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
             the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
-            `without_focal`.
+            `without_focal`. Or ``matrix`` (3, 3), ``width``, ``height`` and optionally
+            ``distortion``, as for `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by
+            default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
 
         Raises
         ------
@@ -373,47 +433,22 @@ class Camera:
         >>> Camera.from_dict({"model": "SIMPLE_RADIAL", "width": 640, "height": 480,
         ...                   "params": [500, 320, 240, 0.1]}).distortion
         (0.1, 0.0, 0.0, 0.0)
+        >>> matrix = [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]
+        >>> Camera.from_dict({"matrix": matrix, "width": 640, "height": 480}).cx
+        319.5
         """
-        if not isinstance(data, Mapping):
-            raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
-        if set(data) == {"width", "height"}:
-            return cls.without_focal(data["width"], data["height"])
-        missing = [key for key in ("model", "width", "height", "params") if key not in data]
-        if missing:
-            raise InputError(
-                f"missing {', '.join(missing)}",
-                where="camera",
-                fix='give {"model", "width", "height", "params"} as COLMAP does',
+        form = read_form(data)
+        if form.matrix is not None:
+            return cls.from_matrix(
+                form.matrix,
+                *form.size,
+                pixel_origin=form.pixel_origin,
+                distortion=form.distortion,
             )
-        model = data["model"]
-        if not isinstance(model, str) or model not in COLMAP_PARAMS:
-            known = ", ".join(COLMAP_PARAMS)
-            raise InputError(
-                f"unknown model {quote(model)}", where="camera.model", fix=f"known are {known}"
-            )
-        names = COLMAP_PARAMS[model]
-        params = data["params"]
-        params = params.tolist() if isinstance(params, np.ndarray) else params
-        if not isinstance(params, list | tuple) or len(params) != len(names):
-            raise InputError(
-                f"{quote(params)} are not the parameters of {model}",
-                where="camera.params",
-                fix=f"give {', '.join(names)}",
-            )
-        values = dict(zip(names, params, strict=True))
-        focals = [name for name in names if name.startswith("f")]
-        is_known = any(values[name] is not None for name in focals)
-        for name, value in values.items():
-            if not is_number(value) and (is_known or name not in focals):
-                what = f"{name} is {quote(value)}, not a finite number"
-                raise InputError(what, where="camera.params")
-        coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
-        cx, cy = values["cx"] - PIXEL_CENTRE, values["cy"] - PIXEL_CENTRE
-        distortion = coefficients if any(coefficients[4:]) else coefficients[:4]
-        size = data["width"], data["height"]
-        if not is_known:
-            return cls.without_focal(*size, cx=cx, cy=cy, distortion=distortion)
-        return cls(*size, values[focals[0]], values[focals[-1]], cx, cy, distortion)
+        if form.focals is None:
+            cx, cy = form.center
+            return cls.without_focal(*form.size, cx=cx, cy=cy, distortion=form.distortion)
+        return cls(*form.size, *form.focals, *form.center, form.distortion)
 
 
 _SIZE_FIX = "give the image size in whole pixels"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 
 GREY = (0.7, 0.7, 0.7, 1.0)
@@ -114,8 +114,15 @@ class Mesh:
     @property
     def bounds(self) -> FloatArray:
         """Lowest and highest coordinates of the vertices that faces use, (2, 3) float."""
-        used = self.vertices[np.unique(self.faces)]
+        used = self.vertices[self.is_used]
         return np.array([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def is_used(self) -> BoolArray:
+        """The vertices that faces use, (n,) bool."""
+        used = np.zeros(len(self.vertices), dtype=bool)
+        used[self.faces] = True
+        return used
 
     @property
     def triangles(self) -> FloatArray:
@@ -159,8 +166,20 @@ class Mesh:
         weights = weights / weights.sum(axis=1, keepdims=True)
         return np.asarray(np.einsum("kc,kcd->kd", weights, self.triangles[triangle]))
 
-    def to_trimesh(self) -> Any:
-        """The geometry as a `trimesh.Trimesh`, faces in the same order, nothing merged."""
-        import trimesh
+    def __repr__(self) -> str:
+        materials = f", {len(self.materials)} materials" if len(self.materials) > 1 else ""
+        return (
+            f"Mesh({self.source!r}, {len(self.vertices)} vertices, {len(self.faces)} faces"
+            f"{materials})"
+        )
 
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+    def to_trimesh(self) -> Any:
+        """The mesh as a `trimesh.Trimesh` with its colours and texture; needs trimesh.
+
+        Faces keep their order. A mesh of one look has its vertices as they are; textured ones, and
+        those of several materials, have three vertices for each face, so that texture coordinates
+        and colours belong to corners. Several textures are put side by side in one image.
+        """
+        from cadalign.geometry.mesh_trimesh import to_trimesh
+
+        return to_trimesh(self)

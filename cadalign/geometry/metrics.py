@@ -1,6 +1,7 @@
 """Errors between an estimate and the truth.
 
 All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
+Those of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
 """
 
 from __future__ import annotations
@@ -13,30 +14,65 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
+
+_SAME_STRETCH = 0.01  # relative difference of true scales that annotations do not tell from 0
 
 
-def rotation_error(*, est: Alignment, gt: Alignment) -> float:
+def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Alignment:
+    """The truth whose rotation is nearest to the estimate's, among those that are equal.
+
+    The model's symmetries take it to itself, so that several alignments place the same object; see
+    `cadalign.geometry.symmetry_group` for what a stretch leaves of them. True scales that differ
+    by up to 1 % count as equal.
+
+    Parameters
+    ----------
+    est, gt : Alignment
+    symmetry : Symmetry
+        Of the model.
+
+    Raises
+    ------
+    InputError
+        If the symmetry's motions make no group.
+
+    Examples
+    --------
+    >>> turned = Alignment(np.diag([-1.0, 1.0, -1.0]), [0, 0, 4], [1, 2, 3])
+    >>> gt = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
+    >>> found = nearest_truth(est=turned, gt=gt, symmetry=Symmetry.around((0, 1, 0), fold=2))
+    >>> bool(np.allclose(found.rotation, turned.rotation))
+    True
+    """
+    return group_of(symmetry).nearest(gt, est.rotation, tolerance=_SAME_STRETCH).alignment
+
+
+def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
     """Angle of the rotation between estimate and truth [degrees], 0 to 180.
-
-    From the chord, |R_est - R_gt| = sqrt(8) sin(angle / 2), which is exact at small angles, where
-    the usual arc cosine of the trace loses half the digits (and beyond 90 degrees from the trace).
 
     Examples
     --------
     >>> rotation_error(est=Alignment.identity(), gt=Alignment.identity())
     0.0
     """
-    chord = np.linalg.norm(est.rotation - gt.rotation) / np.sqrt(8.0)
-    cosine = np.sqrt(max(0.0, (np.sum(est.rotation * gt.rotation) + 1.0) / 4.0))
-    return float(np.degrees(2.0 * np.arctan2(chord, cosine)))
+    if symmetry is not None:
+        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
+    return angle_between(est.rotation, gt.rotation)
 
 
-def translation_error(*, est: Alignment, gt: Alignment) -> float:
+def translation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
     """Distance between the two translations [model units]."""
+    if symmetry is not None:
+        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
     return float(np.linalg.norm(est.translation - gt.translation))
 
 
-def translation_error_up_to_scale(*, est: Alignment, gt: Alignment) -> float:
+def translation_error_up_to_scale(
+    *, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None
+) -> float:
     """Distance of the true translation from the ray through the estimated one [model units].
 
     One image does not tell a large object far away from a small one nearby: the estimate may be
@@ -50,13 +86,15 @@ def translation_error_up_to_scale(*, est: Alignment, gt: Alignment) -> float:
     >>> translation_error_up_to_scale(est=est, gt=Alignment(np.eye(3), [0, 3, 4], np.ones(3)))
     3.0
     """
+    if symmetry is not None:
+        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
     square = float(est.translation @ est.translation)
     factor = max(float(est.translation @ gt.translation) / square, 0.0) if square > 0 else 0.0
     return float(np.linalg.norm(factor * est.translation - gt.translation))
 
 
-def scale_error(*, est: Alignment, gt: Alignment) -> FloatArray:
-    """Relative error of the scale along each axis, |s_est - s_gt| / s_gt; (3,) float, fractions.
+def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> FloatArray:
+    """Relative error of the scale along each axis, (3,) float: ``|s_est - s_gt| / s_gt``.
 
     Examples
     --------
@@ -64,6 +102,8 @@ def scale_error(*, est: Alignment, gt: Alignment) -> FloatArray:
     >>> scale_error(est=est, gt=Alignment.identity()).tolist()
     [0.0, 0.5, 0.5]
     """
+    if symmetry is not None:
+        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
     return np.asarray(np.abs(est.scale - gt.scale) / gt.scale)
 
 
@@ -98,9 +138,7 @@ def reprojection_error(
 def box_iou(*, est: Box, gt: Box) -> float:
     """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
 
-    Exact: a vertex of the intersection lies on an edge of one box, where that edge enters or
-    leaves the other box. All edges are clipped, and Qhull gives the volume of the hull of their
-    ends.
+    Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`.
 
     Raises
     ------
@@ -114,11 +152,11 @@ def box_iou(*, est: Box, gt: Box) -> float:
     0.333333333333
     """
     _check_volumes(est, gt)
-    # A unit of about the boxes' own size keeps Qhull's tolerances meaningful.
-    unit = max(float(est.extents.max()), float(gt.extents.max()))
+    # In a unit of about the boxes' own size no square under- or overflows.
+    unit = max(est.extents.tolist() + gt.extents.tolist())
     intersection = _intersection_volume(est, gt, unit)
     volumes = (est.volume + gt.volume) / unit**3
-    return float(np.clip(intersection / (volumes - intersection), 0.0, 1.0))
+    return float(min(max(intersection / (volumes - intersection), 0.0), 1.0))
 
 
 def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
@@ -168,15 +206,24 @@ def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
     return -min(float(search.fun), *losses)
 
 
-def alignment_box_iou(*, est: Alignment, gt: Alignment, bounds: npt.ArrayLike) -> float:
+def alignment_box_iou(
+    *,
+    est: Alignment,
+    gt: Alignment,
+    bounds: npt.ArrayLike,
+    symmetry: Symmetry | None = None,
+) -> float:
     """Box IoU of one model, with bounds (2, 3), under two alignments; see `box_iou`."""
+    if symmetry is not None:
+        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
     bounds = as_floats(bounds, name="bounds", shape=(2, 3))
     return box_iou(est=Box.from_model(bounds, est), gt=Box.from_model(bounds, gt))
 
 
 def _check_volumes(est: Box, gt: Box) -> None:
     for name, box in (("est", est), ("gt", gt)):
-        if not (box.extents > 1e-9 * box.extents.max()).all():
+        extents = box.extents.tolist()
+        if not min(extents) > 1e-9 * max(extents):
             raise InputError(
                 f"the box {box.extents.tolist()} has no volume",
                 where=name,
@@ -218,22 +265,8 @@ def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
 
 def _intersection_volume(first: Box, second: Box, unit: float) -> float:
     """Volume of the intersection, in units of ``unit`` cubed."""
-    from scipy.spatial import ConvexHull, QhullError  # neither these nor compiled code need load
+    from cadalign.geometry.clipping import intersection_volume  # `import cadalign` compiles nothing
 
-    from cadalign.geometry.clipping import clipped_edges  # with `import cadalign`
-
-    extents_1, extents_2 = first.extents / unit, second.extents / unit
     axes = np.ascontiguousarray(first.rotation.T @ second.rotation)
     center = first.rotation.T @ (second.center - first.center) / unit
-    vertices = np.empty((48, 3))
-    count = clipped_edges(extents_2, extents_1, axes, center, vertices)
-    ends = np.empty((24, 3))
-    back = np.ascontiguousarray(axes.T)
-    more = clipped_edges(extents_1, extents_2, back, -back @ center, ends)
-    vertices[count : count + more] = ends[:more] @ back + center
-    if count + more < 4:
-        return 0.0
-    try:
-        return float(ConvexHull(vertices[: count + more]).volume)
-    except QhullError:  # the boxes touch in a face, an edge or a corner
-        return 0.0
+    return intersection_volume(first.extents / unit, second.extents / unit, axes, center)

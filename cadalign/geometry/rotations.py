@@ -11,16 +11,36 @@ from cadalign.errors import InputError
 
 
 def rotation_from_vector(vector: FloatArray) -> FloatArray:
-    """The rotation matrix (3, 3) of a rotation vector (3,): axis times angle [rad].
+    """The rotation matrix (3, 3) of a rotation vector (3,), axis times angle [rad]: Rodrigues.
 
     Examples
     --------
     >>> rotation_from_vector(np.array([0.0, 0.0, np.pi / 2])).round(12).tolist()
     [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    from scipy.spatial.transform import Rotation  # too slow to load with `import cadalign`
+    angle = float(np.linalg.norm(vector))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = np.asarray(vector) / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # 1 - cos written with the half angle keeps its digits where the angle is small.
+    square = 2 * math.sin(angle / 2) ** 2 * (cross @ cross)
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + square)
 
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+
+def rotations_from_vectors(vectors: FloatArray) -> FloatArray:
+    """The rotation matrices (n, 3, 3) of rotation vectors (n, 3), as `rotation_from_vector`.
+
+    Examples
+    --------
+    >>> rotations_from_vectors(np.array([[0.0, 0.0, np.pi / 2]])).round(12).tolist()
+    [[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
+    """
+    angles = np.linalg.norm(vectors, axis=1)
+    axes = vectors / np.where(angles > 0, angles, 1.0)[:, None]
+    cross = np.cross(axes[:, None], -np.eye(3))
+    squares = 2 * np.sin(angles / 2)[:, None, None] ** 2 * (cross @ cross)
+    return np.asarray(np.eye(3) + np.sin(angles)[:, None, None] * cross + squares)
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
@@ -56,6 +76,22 @@ def _quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
     length = math.copysign(math.hypot(*quaternion), quaternion[0])
     w, x, y, z = (each / length for each in quaternion)
     return w, x, y, z
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> float:
+    """Angle of the rotation that leads from one matrix (3, 3) to another [degrees], 0 to 180.
+
+    From the chord, |first - second| = sqrt(8) sin(angle / 2), which is exact at small angles, where
+    the usual arc cosine of the trace loses half the digits (and beyond 90 degrees from the trace).
+
+    Examples
+    --------
+    >>> round(angle_between(np.eye(3), rotation_from_vector(np.array([0.0, 0.0, np.pi]))), 9)
+    180.0
+    """
+    chord = np.linalg.norm(first - second) / np.sqrt(8.0)
+    cosine = np.sqrt(max(0.0, (np.sum(first * second) + 1.0) / 4.0))
+    return float(np.degrees(2.0 * np.arctan2(chord, cosine)))
 
 
 def nearest_rotation(matrix: FloatArray, *, tolerance: float = 1e-2) -> FloatArray:

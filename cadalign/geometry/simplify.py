@@ -47,14 +47,15 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     >>> small.vertices.tolist(), small.faces.tolist()
     ([[0.0, 0.0, 0.0], [0.05, 3.0, 0.0], [4.0, 0.0, 0.0]], [[0, 2, 1]])
     """
-    used, faces = np.unique(mesh.faces, return_inverse=True)
+    used = mesh.is_used
     vertices = mesh.vertices[used]
+    faces = (np.cumsum(used) - 1)[mesh.faces]
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
     cell = np.floor((vertices - low) * (cells / max(size, 1e-300)) + 0.5).astype(np.int64)
     number, place, count = np.unique(cell @ _CELL_NUMBER, return_inverse=True, return_counts=True)
     sums = [np.bincount(place, weights=axis, minlength=len(count)) for axis in vertices.T]
     centers = np.stack(sums, axis=1) / count[:, None]
-    faces = place[faces.reshape(-1, 3)]
+    faces = place[faces]
     ordered = np.sort(faces, axis=1)
     solid = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
     kept = np.flatnonzero(solid)

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, read_only
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.metrics import rotation_error
-from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
+from cadalign.geometry.rotations import angle_between, rotation_from_vector
 
 _ORTHONORMAL_TOLERANCE = 1e-3
+_UP = (0.0, 1.0, 0.0)
+SCAN2CAD_FOLDS: dict[str, int | None] = {
+    "__SYM_NONE": 1,
+    "__SYM_ROTATE_UP_2": 2,
+    "__SYM_ROTATE_UP_4": 4,
+    "__SYM_ROTATE_UP_INF": None,
+}
+"""Numbers of rotations about y by Scan2CAD's names; None for any angle."""
+_DISCRETE, _CONTINUOUS = "symmetries_discrete", "symmetries_continuous"
+_FORMS = (
+    f"give one of {', '.join(SCAN2CAD_FOLDS)}, an `axis` with `fold` (null for any angle), or "
+    f"BOP's `{_DISCRETE}` and `{_CONTINUOUS}`"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +126,65 @@ class Symmetry:
         steps = [axis.turned(2 * np.pi * step / fold) for step in range(1, fold)]
         return cls(np.reshape(steps, (-1, 4, 4)))
 
+    @classmethod
+    def from_dict(cls, data: object) -> Symmetry:
+        """Read a symmetry as data sets and observation files write it.
+
+        Parameters
+        ----------
+        data : str or mapping
+            Scan2CAD's name, ``"__SYM_ROTATE_UP_2"``, ``_4``, ``_INF`` or ``"__SYM_NONE"``, about
+            y through the model's origin; ``{"axis": (3,), "fold": int or None}`` with an optional
+            ``offset``, a point on the axis; or BOP's ``symmetries_discrete``, matrices row by row,
+            and ``symmetries_continuous``, each an ``axis`` with an ``offset``, as `to_dict` writes.
+
+        Raises
+        ------
+        InputError
+            If it is in no such form, or a value is invalid.
+
+        Examples
+        --------
+        >>> len(Symmetry.from_dict("__SYM_ROTATE_UP_4").motions)
+        3
+        >>> Symmetry.from_dict({"axis": [0, 0, 1], "fold": None}).axes[0].direction.tolist()
+        [0.0, 0.0, 1.0]
+        """
+        if isinstance(data, str):
+            if data not in SCAN2CAD_FOLDS:
+                raise InputError(f"{quote(data)} is no symmetry", where="symmetry", fix=_FORMS)
+            return cls.around(_UP, fold=SCAN2CAD_FOLDS[data])
+        names = set(data) if isinstance(data, Mapping) else set()
+        if not isinstance(data, Mapping):
+            what = f"expected a name or an object, got {type(data).__name__}"
+            raise InputError(what, where="symmetry", fix=_FORMS)
+        if names <= {"axis", "fold", "offset"} and {"axis", "fold"} <= names:
+            return cls.around(
+                _vector(data, "axis"), fold=_fold(data["fold"]), offset=_vector(data, "offset")
+            )
+        if not names or not names <= {_DISCRETE, _CONTINUOUS}:
+            what = f"the fields {', '.join(sorted(map(str, names)))} are no symmetry's"
+            raise InputError(what, where="symmetry", fix=_FORMS)
+        motions = [
+            as_floats(each, name=f"symmetry.{_DISCRETE}[{row}]", shape=(16,))
+            for row, each in enumerate(_listed(data, _DISCRETE))
+        ]
+        axes = [
+            SymmetryAxis(_vector(each, "axis"), _vector(each, "offset"))
+            for each in _listed(data, _CONTINUOUS)
+        ]
+        return cls(np.reshape(motions, (-1, 4, 4)), tuple(axes))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the symmetry as plain lists, for JSON, in BOP's form."""
+        return {
+            _DISCRETE: self.motions.reshape(-1, 16).tolist(),
+            _CONTINUOUS: [
+                {"axis": axis.direction.tolist(), "offset": axis.offset.tolist()}
+                for axis in self.axes
+            ],
+        }
+
     @property
     def is_trivial(self) -> bool:
         """True if there is no motion but the identity."""
@@ -158,7 +231,24 @@ def symmetric_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetr
         between = motion @ est.rotation.T @ gt.rotation
         angle = np.arctan2(np.trace(between @ cross), -np.trace(between @ cross @ cross))
         candidates.append(gt.rotation @ axis.turned(float(angle))[:3, :3] @ motion)
-    return min(
-        rotation_error(est=est, gt=Alignment(nearest_rotation(each), gt.translation, gt.scale))
-        for each in candidates
-    )
+    return min(angle_between(est.rotation, each) for each in candidates)
+
+
+def _vector(data: Any, name: str) -> FloatArray:
+    """A field of three numbers, zeros where it is missing."""
+    given = data.get(name, (0.0, 0.0, 0.0)) if isinstance(data, Mapping) else data
+    return as_floats(given, name=f"symmetry.{name}", shape=(3,))
+
+
+def _fold(value: object) -> int | None:
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    what = f"{quote(str(value))} is no number of rotations"
+    raise InputError(what, where="symmetry.fold", fix="give 1, 2, 3 ..., or null for any angle")
+
+
+def _listed(data: Mapping[Any, Any], name: str) -> list[Any]:
+    given = data.get(name, [])
+    if not isinstance(given, list | tuple):
+        raise InputError(f"expected a list, got {type(given).__name__}", where=f"symmetry.{name}")
+    return list(given)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.contours.choice import surfaces_of
-from cadalign.fitting.contours.loop import Noise, contour_view, noise_of, rim_rows
-from cadalign.fitting.contours.mask import mask_contour
+from cadalign.fitting.contours.extraction import extraction_bias
+from cadalign.fitting.contours.loop import (
+    Noise,
+    ViewContour,
+    contour_view,
+    noise_of,
+    poses_of,
+    rim_rows,
+)
 from cadalign.fitting.contours.rims import find_rims
-from cadalign.fitting.contours.stack import with_rims, with_room
+from cadalign.fitting.contours.stack import RimRows, count_of, state_with_points, with_rims
+from cadalign.fitting.contours.surface import PosedSurface
 from cadalign.fitting.joint.deviations import pose_and_lengths
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.pack import evidence_of
@@ -19,7 +29,7 @@ from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
-from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.evidence import Evidence, State
 
 _REACH = 8.0  # [px]
 _INLIER = 3.5  # in deviations
@@ -44,23 +54,49 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
     """
     if view.mask_image is None or model.shape_sigma is not None:
         raise InputError("expected a view with a mask, and an exact model", where="view")
-    prior = prior_of(model)
-    evidence = evidence_of(prior, [view], None, loss=LINEAR, loss_scale=1.0)
-    contour = mask_contour(view.mask_image, "view.mask")
-    seen = contour_view(0, view.camera, contour, view.mask_sigma)
-    (surface,) = surfaces_of(model, evidence.shape.mean[: len(prior.ids)], "view.mask")
+    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
     pose = np.concatenate([gt.rotation.ravel(), gt.translation])[None]
     still = np.zeros_like(evidence.shape.mean)
     state = State(pose, np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
+    full, stacked = with_contours(model, [view], evidence, state)
+    return pose_and_lengths(full, stacked, joint_covariance(full, stacked).unknowns)
+
+
+def with_contours(
+    model: Model, views: Sequence[View], evidence: Evidence, state: State
+) -> tuple[Evidence, State]:
+    """The evidence of an exact model's views with the contours of their masks.
+
+    Their deviation and correlation are those that their residuals show at the state.
+
+    Raises
+    ------
+    InputError
+        If a mask has no contour, or the model has no mesh.
+    """
+    masked = [number for number, view in enumerate(views) if view.mask_image is not None]
+    if not masked:
+        return evidence, state
+    keypoints = len(evidence.shape.mean) - 2
+    where = f"views[{masked[0]}].mask"
+    (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
     posed = surface.at(evidence.shape, state)
-    rims = find_rims(posed.caster, view.camera, gt, contour, _REACH)
-    offset = float(np.median(rims.offset[rims.found]))
+    poses = poses_of(evidence, state)
+    rows = [
+        _contour_rows(contour_view(n, views[n], f"views[{n}].mask"), posed, poses[n])
+        for n in masked
+    ]
+    full = with_rims(evidence, keypoints, rows)
+    return full, state_with_points(state, keypoints, count_of(rows), np.zeros(len(rows)))
+
+
+def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> RimRows:
+    rims = find_rims(posed.caster, seen.camera, gt, seen.contour, _REACH)
+    offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
     centred = np.where(rims.found, rims.offset - offset, np.nan)
     known = Noise(1.0, 1.0, max(abs(offset), _LEAST_OFFSET))
-    noise = noise_of(seen, rims, centred, known, correlated=True)
-    agreeing = rims.found & (np.abs(np.nan_to_num(centred)) < _INLIER * noise.sigma)
-    rows = [rim_rows(seen, rims._replace(found=agreeing), noise, posed, gt)]
-    rows = [rows[0]._replace(loss=np.full(len(rows[0].loss), LINEAR))]
-    full = with_rims(evidence, len(prior.ids), rows)
-    stacked = with_room(state, len(prior.ids), rows, np.zeros(1))
-    return pose_and_lengths(full, stacked, joint_covariance(full, stacked).unknowns)
+    bias = extraction_bias(posed.caster, seen.camera, gt, seen.mask, seen.contour, rims)
+    noise = noise_of(seen, rims, centred - bias, known, correlated=True)
+    agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
+    rows = rim_rows(seen, rims._replace(found=agreeing), noise, posed, gt, bias)
+    return rows._replace(loss=np.full(len(rows.loss), LINEAR))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.fitting.contours.hull import ConvexSurface
 from cadalign.fitting.contours.surface import RigidSurface, Surface, WarpedSurface
 from cadalign.fitting.joint.model import Model
 from cadalign.geometry.mesh import Mesh
@@ -18,7 +20,14 @@ from cadalign.shapes.parts import TrainingShapes
 _MOST_MESHES = 3  # training models that are tried, the nearest ones
 
 
-def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> list[Surface]:
+class Choice(NamedTuple):
+    """Surfaces, the likeliest first; ``hulls`` are their convex hulls, none of an exact one."""
+
+    surfaces: list[Surface]
+    hulls: list[Surface]
+
+
+def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> Choice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
     Raises
@@ -33,11 +42,17 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
             fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
             raise InputError("the model has no mesh, which a mask wants", where=where, fix=fix)
         if model.shape_sigma is None:
-            return [RigidSurface(model.mesh)]
+            return Choice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
-        return [WarpedSurface(model.mesh, points, np.arange(len(points)))]
+        return _warped([(model.mesh, points, np.arange(len(points)))])
     nearest = _nearest_with_mesh(model, points_3d, where)
-    return [_of_training(alone) for alone in nearest]
+    return _warped([_of_training(alone) for alone in nearest])
+
+
+def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> Choice:
+    return Choice(
+        [WarpedSurface(*each) for each in given], [ConvexSurface(*each) for each in given]
+    )
 
 
 def _nearest_with_mesh(
@@ -66,10 +81,11 @@ def _only(training: TrainingShapes, row: int) -> TrainingShapes:
     )
 
 
-def _of_training(alone: TrainingShapes) -> Surface:
+def _of_training(alone: TrainingShapes) -> tuple[Mesh, FloatArray, IntArray]:
+    """The mesh of a training model, its keypoints, and their numbers in the shape."""
     source = alone.points_3d[0].astype(np.float64)
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
-    return WarpedSurface(_load(cast(Path, alone.mesh_paths[0])), source[known], known)
+    return _load(cast(Path, alone.mesh_paths[0])), source[known], known
 
 
 def _load(path: Path) -> Mesh:

@@ -55,7 +55,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     object may go on outside.
     """
     image = np.ascontiguousarray(probability, dtype=np.float32)
-    level = _blurred(image, _SMOOTHING)
+    level = smoothed(image)
     soft = _blurred(image, _NORMAL_SMOOTHING)
     slope_x: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 0, ksize=3), dtype=np.float32)
     slope_y: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 0, 1, ksize=3), dtype=np.float32)
@@ -69,6 +69,11 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
             curves.append(np.full(len(piece), count))
             count += 1
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
+
+
+def smoothed(image: Image) -> Image:
+    """The image (h, w) whose level line 0.5 is the contour of a mask."""
+    return _blurred(image, _SMOOTHING)
 
 
 def _blurred(image: Image, sigma: float) -> Image:
@@ -97,25 +102,25 @@ def _on_level(
     chain: FloatArray, level: Image, slope_x: Image, slope_y: Image
 ) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) of the level line next to boundary pixels (n, 2), and outward normals."""
-    normals = -np.column_stack([_sampled(slope_x, chain), _sampled(slope_y, chain)])
+    normals = -np.column_stack([sampled(slope_x, chain), sampled(slope_y, chain)])
     length = np.linalg.norm(normals, axis=1)
     kept = length > 1e-6
     chain, normals = chain[kept], normals[kept] / length[kept, None]
     steps = np.arange(-_STEP, _REACH + _STEP / 2, _STEP)
     along = chain[:, None] + steps[:, None] * normals[:, None]
-    values = _sampled(level, along.reshape(-1, 2)).reshape(len(chain), len(steps))
+    values = sampled(level, along.reshape(-1, 2)).reshape(len(chain), len(steps))
     falls = (values[:, :-1] >= 0.5) & (values[:, 1:] < 0.5)
     first = falls.argmax(axis=1)
     rows = np.flatnonzero(falls.any(axis=1))
     before, after = values[rows, first[rows]], values[rows, first[rows] + 1]
     places = steps[first[rows]] + _STEP * (before - 0.5) / (before - after)
     points = chain[rows] + places[:, None] * normals[rows]
-    outwards = -np.column_stack([_sampled(slope_x, points), _sampled(slope_y, points)])
+    outwards = -np.column_stack([sampled(slope_x, points), sampled(slope_y, points)])
     outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
     return points, outwards
 
 
-def _sampled(image: Image, points: FloatArray) -> FloatArray:
+def sampled(image: Image, points: FloatArray) -> FloatArray:
     """Values (n,) of an image at points (n, 2), bilinear."""
     single = points.astype(np.float32)
     blocks = [

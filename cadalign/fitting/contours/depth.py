@@ -14,8 +14,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.fitting.contours.choice import surfaces_of
+from cadalign.fitting.contours.deviation import robust_deviation
 from cadalign.fitting.contours.loop import poses_of
-from cadalign.fitting.contours.stack import displacements_with_points, with_points
+from cadalign.fitting.contours.stack import (
+    state_with_points,
+    state_without_points,
+    with_points,
+)
 from cadalign.fitting.contours.surface import PosedSurface, Surface
 from cadalign.fitting.joint.assemble import Minimum
 from cadalign.fitting.joint.model import Model
@@ -26,7 +31,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, Shape, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, Planes, points_of
 from cadalign.solvers.joint.refine import refine_joint
 from cadalign.solvers.joint.search import score_of
 from cadalign.solvers.joint.system import empty_system
@@ -36,6 +41,7 @@ _LEAST_SPACING = 8  # [px], of samples that count as independent
 _MOST_SAMPLES = 100  # of a view
 _LOSS_SCALE = 3.0
 _GRAZING = 0.2  # cosine between ray and normal below which the depth is not to be trusted
+_INDEPENDENT_PARTS = 10.0  # of a surface that is only similar
 _ROUNDS = 6
 _ITERATIONS = 12
 _SETTLED = 0.01  # change of the cost
@@ -81,7 +87,7 @@ def fit_depths(
     keypoints, first = len(prior.ids), minima[0]
     points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
     where = f"views[{samples[0].image}].depth"
-    surface = surfaces_of(model, points[:keypoints], where)[0]
+    surface = surfaces_of(model, points[:keypoints], where).surfaces[0]
     likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
     found = [_settled(each, keypoints, samples, surface) for each in likely[:_MOST_STARTS]]
     found.sort(key=lambda minimum: minimum.score)
@@ -117,19 +123,20 @@ def _settled(
     own = score_of(start.evidence, start.state, empty_system(start.evidence))
     extra = start.score - own if np.isfinite(start.score - own) else 0.0
     for _ in range(_ROUNDS):
-        posed = surface.at(
-            _without_extras(start.evidence.shape, keypoints), _bare(state, keypoints)
-        )
+        posed = surface.at(start.evidence.shape, state)
         poses = poses_of(bare, state)
-        rows = [_rows(posed, poses[each.image], each) for each in samples]
+        rows = [
+            _rows(posed, poses[each.image], each, is_exact=surface.is_exact) for each in samples
+        ]
         full = _with_rows(bare, keypoints, rows)
-        room = _with_room(state, keypoints, sum(len(each.mean) for each in rows))
+        total = sum(len(each.mean) for each in rows)
+        room = state_with_points(state, keypoints, total)
         cost, _, _ = refine_joint(full, _ITERATIONS, room)
         if not cost < np.inf:
             return start
         score = score_of(full, room, empty_system(full))
         result = start._replace(evidence=full, state=room, cost=cost, score=score + extra)
-        state = _without_room(room, keypoints, len(start.evidence.shape.mean))
+        state, _ = state_without_points(room, keypoints, total)
         if abs(last - cost) < _SETTLED:
             break
         last = cost
@@ -142,18 +149,7 @@ def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evide
     return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
-def _without_extras(shape: Shape, keypoints: int) -> Shape:
-    """The keypoints and the box of a shape that holds rims between them."""
-    rows = np.r_[:keypoints, -2:0]
-    return Shape(shape.mean[rows], np.ascontiguousarray(shape.modes[:, rows]), shape.spread[rows])
-
-
-def _bare(state: State, keypoints: int) -> State:
-    rows = np.r_[:keypoints, -2:0]
-    return state._replace(displacements=np.ascontiguousarray(state.displacements[rows]))
-
-
-def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples) -> _Rows:
+def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples, *, is_exact: bool) -> _Rows:
     """Points where the rays of samples meet the surface, and planes at their measured depths."""
     origin, model_from_ray = model_rays(pose)
     directions = samples.rays @ model_from_ray.T
@@ -168,14 +164,28 @@ def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples) -> _Rows:
     points = origin + depth[hit, None] * directions[hit]
     mean, modes = surface.rows(points, face[hit])
     measured = samples.depths[hit]
+    sigma = samples.sigma
+    if not is_exact:
+        sigma = _sigma_of_similar(depth[hit] / measured - 1, sigma)
     return _Rows(
         mean,
         modes,
         samples.image,
         normals / along[:, None],
         measured,
-        1.0 / (samples.sigma * measured),
+        1.0 / (sigma * measured),
     )
+
+
+def _sigma_of_similar(relative: FloatArray, sigma: float) -> float:
+    """Deviation of depths over a surface that is only similar to the object's.
+
+    Its own error, which shows in the residuals (n,), is alike over large parts of the surface, of
+    which only a few are independent.
+    """
+    own = robust_deviation(relative - np.median(relative)) if len(relative) else 0.0
+    alike = max(len(relative) / _INDEPENDENT_PARTS, 1.0)
+    return float(np.hypot(sigma, own * np.sqrt(alike)))
 
 
 def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evidence:
@@ -199,22 +209,4 @@ def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evi
             np.concatenate([planes.loss, np.full(total, CAUCHY)]),
             np.concatenate([planes.loss_scale, np.full(total, _LOSS_SCALE)]),
         ),
-    )
-
-
-def _with_room(state: State, keypoints: int, total: int) -> State:
-    return State(
-        state.poses.copy(),
-        state.log_scales.copy(),
-        state.coefficients.copy(),
-        displacements_with_points(state.displacements, keypoints, total),
-    )
-
-
-def _without_room(state: State, keypoints: int, count: int) -> State:
-    """The state with ``count`` points, those of the surface left out again."""
-    still = state.displacements
-    extra = len(still) - count
-    return state._replace(
-        displacements=np.concatenate([still[:keypoints], still[keypoints + extra :]])
     )

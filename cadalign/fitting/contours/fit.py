@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.errors import DegenerateError
 from cadalign.fitting.contours.choice import surfaces_of
+from cadalign.fitting.contours.hull import hull_contour
 from cadalign.fitting.contours.loop import (
     ContourFit,
     Settled,
@@ -17,7 +19,6 @@ from cadalign.fitting.contours.loop import (
     contour_view,
     settle,
 )
-from cadalign.fitting.contours.mask import mask_contour
 from cadalign.fitting.contours.residuals import MaskResiduals
 from cadalign.fitting.contours.stack import with_displacement_modes
 from cadalign.fitting.contours.surface import Surface
@@ -42,6 +43,7 @@ _RELATIVE_TOLERANCE = 0.02
 _WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
 _LARGEST = 24.0  # [px]
+_HULL_GAIN = 0.5  # misfit of hulls, relative, below which these take the place of the outlines
 _INLIER = 3.5  # in deviations
 
 
@@ -109,12 +111,7 @@ def fit_masks(
         If there is no estimate without the masks and no rim near them.
     """
     contours = [
-        contour_view(
-            number,
-            view.camera,
-            mask_contour(view.mask_image, f"views[{number}].mask"),
-            view.mask_sigma,
-        )
+        contour_view(number, view, f"views[{number}].mask")
         for number, view in enumerate(views)
         if view.mask_image is not None
     ]
@@ -123,21 +120,27 @@ def fit_masks(
     keypoints = len(prior.ids)
     first = minima[0]
     points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
-    surfaces = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
+    choice = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
     is_open = not _is_determined(first)
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
+    settle_all = partial(
+        _settled,
+        likely[:most],
+        keypoints,
+        follows_displacements=isinstance(model, Model),
+        is_wide=is_open,
+    )
     best: list[_Candidate] = []
     while used:
-        best = _settled(
-            likely[:most],
-            keypoints,
-            used,
-            surfaces,
-            follows_displacements=isinstance(model, Model),
-            is_wide=is_open,
-        )
+        best = settle_all(used, choice.surfaces)
+        hulls = [hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
+        known = [each for each in hulls if each is not None]
+        if known and len(known) == len(used):
+            by_hulls = settle_all(known, choice.hulls)
+            if by_hulls and (not best or _is_better(by_hulls[0], best[0])):
+                best, used = by_hulls, known
         wrong = _contradicting(best, used)
         if wrong is None:
             break
@@ -162,6 +165,11 @@ def fit_masks(
     for contour in left_out:
         residuals[contour.image] = _unused(contour)
     return MaskFit([_minimum(each) for each in best], tuple(residuals), tuple(warnings))
+
+
+def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
+    """True if hulls agree so much better that the rest of the outline is another object's."""
+    return _misfit(by_hulls.settled) < _HULL_GAIN * _misfit(other.settled)
 
 
 def _is_determined(minimum: Minimum) -> bool:

@@ -8,16 +8,25 @@ first order, so the rounds converge as fast as Gauss-Newton steps do.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.fitting.contours.contour import Contour
 from cadalign.fitting.contours.deviation import correlation_length, robust_deviation
+from cadalign.fitting.contours.extraction import MaskImage, extraction_bias, mask_image
+from cadalign.fitting.contours.mask import mask_contour
 from cadalign.fitting.contours.rims import Rims, find_rims
-from cadalign.fitting.contours.stack import RimRows, with_rims, with_room, without_rims
+from cadalign.fitting.contours.stack import (
+    RimRows,
+    count_of,
+    state_with_points,
+    state_without_points,
+    with_rims,
+)
 from cadalign.fitting.contours.surface import PosedSurface, Surface
+from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY
@@ -39,6 +48,9 @@ _LEAST_SIGMA = 0.1  # [px]
 _LOSS_SCALE = 2.4  # in deviations: Cauchy's loss then keeps 95 % of the information
 _FIRST_OFFSET = 1.0  # [px], deviation of the offset that all of a contour has in common
 _LEAST_OFFSET = 0.1
+_UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
+_EDGE = 30.0  # samples of an edge
+_OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
 _FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
 _LEAST_INFORMATION = 1e-12  # about an unknown, relative
 
@@ -48,7 +60,8 @@ class ViewContour:
     """The contour in view number ``image``.
 
     ``rays`` (S, 2) are its samples, ``across`` (S, 2) the derivative of the place along the normal
-    [px] by the ray; ``sigma`` is the given deviation [px], None to estimate it.
+    [px] by the ray; ``sigma`` is the given deviation [px], None to estimate it. The contour is that
+    of ``mask``.
     """
 
     image: int
@@ -57,6 +70,7 @@ class ViewContour:
     rays: FloatArray
     across: FloatArray
     sigma: float | None
+    mask: MaskImage
 
 
 class Noise(NamedTuple):
@@ -88,14 +102,24 @@ class Settled(NamedTuple):
     rounds: int
 
 
-def contour_view(image: int, camera: Camera, contour: Contour, sigma: float | None) -> ViewContour:
-    """The contour with what the sightings need of the camera; samples outside its lens dropped."""
+def contour_view(image: int, view: View, where: str) -> ViewContour:
+    """The contour of a view's mask, with what the sightings need of the camera.
+
+    Samples outside of its lens are dropped.
+
+    Raises
+    ------
+    InputError
+        If the mask ``where`` has no contour.
+    """
+    camera, mask = view.camera, cast("FloatArray | BoolArray", view.mask_image)
+    contour = mask_contour(mask, where)
     rays, valid = camera.normalize_where_valid(contour.points)
     kept = contour.taken(valid)
     rays = rays[valid]
     slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays)
     across = np.einsum("ni,nij->nj", kept.normals, slopes)
-    return ViewContour(image, camera, kept, rays, across, sigma)
+    return ViewContour(image, camera, kept, rays, across, view.mask_sigma, mask_image(mask))
 
 
 def settle(
@@ -129,37 +153,48 @@ def settle(
             for view in views
         ]
         moved = _change(last, rims)
-        residuals = [
-            _residuals(view, each, offset * noise.offset)
-            for view, each, offset, noise in zip(views, rims, offsets, current, strict=True)
-        ]
         widest = max(noise.sigma for noise in current)
-        if moved < _SETTLED * max(1.0, widest) or number >= _COARSE_ROUNDS - _FINE_ROUNDS:
+        if fine or moved < _SETTLED * max(1.0, widest) or number >= _COARSE_ROUNDS - _FINE_ROUNDS:
             fine += 1
+        biases = [np.zeros(len(each.found)) for each in rims]
+        if fine and surface.is_exact:
+            biases = [
+                extraction_bias(
+                    posed.caster, view.camera, poses[view.image], view.mask, view.contour, each
+                )
+                for view, each in zip(views, rims, strict=True)
+            ]
+        residuals = [
+            np.where(each.found, each.offset + offset * noise.offset, np.nan)
+            for each, offset, noise in zip(rims, offsets, current, strict=True)
+        ]
         if noises is None:
             before = current
             current = [
-                noise_of(view, each, residual, noise, correlated=fine > 0)
+                noise_of(view, each, residual - bias, noise, correlated=fine > 0)
                 if surface.is_exact
                 else _noise_of_similar(view, each, residual, reach)
-                for view, each, residual, noise in zip(views, rims, residuals, current, strict=True)
+                for view, each, residual, bias, noise in zip(
+                    views, rims, residuals, biases, current, strict=True
+                )
             ]
             if surface.is_exact:
                 reach = min(reach, _reach_of(max(noise.sigma for noise in current)))
         rows = [
-            rim_rows(view, each, noise, posed, poses[view.image])
-            for view, each, noise in zip(views, rims, current, strict=True)
+            rim_rows(view, each, noise, posed, poses[view.image], bias)
+            for view, each, noise, bias in zip(views, rims, current, biases, strict=True)
         ]
         if not any(len(each.mean) for each in rows):
             return None
         full = with_rims(evidence, keypoints, rows)
         if noises is None:
             offsets = offsets * [b.offset / n.offset for b, n in zip(before, current, strict=True)]
-        stacked = with_room(state, keypoints, rows, offsets)
+        total = count_of(rows)
+        stacked = state_with_points(state, keypoints, total, offsets)
         cost, _, _ = refine_joint(full, _ITERATIONS, stacked)
         if not cost < np.inf:
             return None
-        state, offsets = without_rims(stacked, keypoints, rows)
+        state, offsets = state_without_points(stacked, keypoints, total, len(rows))
         if noises is None and surface.is_exact:
             current, offsets = _relearned(full, stacked, current, offsets)
         last = rims
@@ -205,21 +240,27 @@ def _change(last: list[Rims], rims: list[Rims]) -> float:
     return float(np.median(every)) if len(every) else np.inf
 
 
-def _residuals(view: ViewContour, rims: Rims, offset: float) -> FloatArray:
-    return np.where(rims.found, rims.offset + offset, np.nan)
-
-
 def noise_of(
     view: ViewContour, rims: Rims, residuals: FloatArray, noise: Noise, *, correlated: bool
 ) -> Noise:
-    """Deviation and correlation that the residuals show."""
-    some = residuals[rims.found]
-    sigma = max(robust_deviation(some), _LEAST_SIGMA)
+    """Deviation and correlation that the residuals (S,) [px] show, free of the extraction's bias.
+
+    The correlation is that of the samples' influence on the estimate, which runs of outliers have,
+    too; what the residuals don't reach of the deviation is correlated as pixels are. A contour
+    beside the rim lies there unevenly, by a share of the offset that all of an edge has in common.
+    """
+    found = robust_deviation(residuals[rims.found])
+    measured = max(found, _LEAST_SIGMA)
+    sigma = measured if view.sigma is None else view.sigma
     length = 1.0
     if correlated:
-        kept = rims.found & (np.abs(np.nan_to_num(residuals)) < 3 * sigma)
-        length = correlation_length(view.contour, np.nan_to_num(residuals), kept)
-    return Noise(sigma if view.sigma is None else view.sigma, length, noise.offset)
+        some = np.nan_to_num(residuals)
+        influence = some / (1 + (some / (_LOSS_SCALE * measured)) ** 2)
+        share = min((found / sigma) ** 2, 1.0)
+        along = correlation_length(view.contour, influence, rims.found)
+        length = share * along + (1 - share) * _OF_PIXELS
+        length += _EDGE * (_UNEVEN * noise.offset / sigma) ** 2
+    return Noise(sigma, length, noise.offset)
 
 
 def _first_noise(view: ViewContour, reach: float, *, is_exact: bool) -> Noise:
@@ -263,9 +304,17 @@ def _relearned(
 
 
 def rim_rows(
-    view: ViewContour, rims: Rims, noise: Noise, surface: PosedSurface, pose: Alignment
+    view: ViewContour,
+    rims: Rims,
+    noise: Noise,
+    surface: PosedSurface,
+    pose: Alignment,
+    bias: FloatArray,
 ) -> RimRows:
-    """The rims that were found, in the form of the evidence."""
+    """The rims that were found, in the form of the evidence.
+
+    They are to lie outside of the contour by the ``bias`` (S,) of its extraction [px].
+    """
     kept = np.flatnonzero(rims.found)
     points = rims.points[kept]
     mean, modes = surface.rows(points, rims.face[kept])
@@ -283,7 +332,7 @@ def rim_rows(
         mean,
         modes,
         offset_mode,
-        view.rays[kept],
+        view.rays[kept] + bias[kept, None] * step,
         whitening,
         np.full(count, CAUCHY),
         np.full(count, _LOSS_SCALE / np.sqrt(noise.correlation)),

@@ -16,7 +16,8 @@ class MaskResiduals:
     Parameters
     ----------
     points : (s, 2) float
-        Samples of the contour, without those near the image's border [px].
+        Samples of the contour, without those near the image's border [px]; of the mask's convex
+        hull where the model is similar to the object in its outermost points alone.
     normals : (s, 2) float
         Unit normals, from the object outwards.
     residuals : (s,) float

@@ -56,20 +56,13 @@ def with_points(
     )
 
 
-def displacements_with_points(displacements: FloatArray, keypoints: int, total: int) -> FloatArray:
-    """Displacements (m, 3) with those of more points, which are zero, behind the keypoints'."""
-    return np.concatenate(
-        [displacements[:keypoints], np.zeros((total, 3)), displacements[keypoints:]]
-    )
-
-
 def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Evidence:
     """The evidence with rims; their points stand between the keypoints and the box's corners.
 
     Each view's rims have one more mode, the last ones of the shape in the order of the views.
     """
     own, views = len(evidence.shape.modes), len(rims)
-    total = sum(len(each.mean) for each in rims)
+    total = count_of(rims)
     modes = np.zeros((own + views, total, 3))
     start = 0
     for number, each in enumerate(rims):
@@ -118,28 +111,38 @@ def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence,
     )
 
 
-def with_room(state: State, keypoints: int, rims: list[RimRows], offsets: FloatArray) -> State:
-    """A state of the evidence without rims as one of the evidence with them.
+def state_with_points(
+    state: State, keypoints: int, total: int, more: FloatArray | None = None
+) -> State:
+    """A copy of a state for evidence with ``total`` more points, see `with_points`.
 
-    ``offsets`` (V,) are the coefficients of the rims' own modes.
+    ``more`` are the coefficients of modes that move these alone.
     """
-    total = sum(len(each.mean) for each in rims)
+    still = state.displacements
+    coefficients = [state.coefficients, np.empty(0) if more is None else more]
     return State(
         state.poses.copy(),
         state.log_scales.copy(),
-        np.concatenate([state.coefficients, offsets]),
-        displacements_with_points(state.displacements, keypoints, total),
+        np.concatenate(coefficients),
+        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
     )
 
 
-def without_rims(state: State, keypoints: int, rims: list[RimRows]) -> tuple[State, FloatArray]:
-    """A state of the evidence without rims, and the coefficients (V,) of the rims' own modes."""
-    total, own = sum(len(each.mean) for each in rims), len(state.coefficients) - len(rims)
-    still = state.displacements
-    bare = State(
-        state.poses,
-        state.log_scales,
-        state.coefficients[:own].copy(),
-        np.concatenate([still[:keypoints], still[keypoints + total :]]),
+def state_without_points(
+    state: State, keypoints: int, total: int, modes: int = 0
+) -> tuple[State, FloatArray]:
+    """Invert `state_with_points`: the state without ``total`` points, and the ``modes`` of these.
+
+    The coefficients of modes that move them alone are (modes,).
+    """
+    still, own = state.displacements, len(state.coefficients) - modes
+    bare = state._replace(
+        coefficients=state.coefficients[:own].copy(),
+        displacements=np.concatenate([still[:keypoints], still[keypoints + total :]]),
     )
     return bare, state.coefficients[own:].copy()
+
+
+def count_of(rims: list[RimRows]) -> int:
+    """Number of rims of all views."""
+    return sum(len(each.mean) for each in rims)

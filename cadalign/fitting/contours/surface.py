@@ -77,11 +77,11 @@ class WarpedSurface:
         bounds = np.sort(points[-2:], axis=0)
         vertices = self._warp.apply(points[self._rows], bounds)
         mesh = Mesh(vertices, self._mesh.faces)
-        return _Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
+        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
 
 
-class _Warped:
-    """A `WarpedSurface` at one state."""
+class Warped:
+    """A mesh at one state, its vertices warped; ``modes`` and ``coefficients`` of the shape."""
 
     def __init__(
         self,

@@ -53,10 +53,17 @@ def _of_keypoints(
         return []
     seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
     errors = seen[:, :2] / seen[:, 2:] - sightings.rays[rows]
-    a, b, c = sightings.whitening[rows].T
+    return [summary_of_keypoints(errors, sightings.whitening[rows], view, camera)]
+
+
+def summary_of_keypoints(
+    errors: FloatArray, whitening: FloatArray, view: int, camera: Camera
+) -> EvidenceSummary:
+    """The summary of errors (n, 2) of rays, with their whitening (n, 3)."""
+    a, b, c = whitening.T
     whitened = np.hypot(a * errors[:, 0] + b * errors[:, 1], c * errors[:, 1])
-    in_pixels = np.linalg.norm(errors * [camera.fx, camera.fy], axis=1)
-    return [_summary("keypoints", view, in_pixels, whitened, "px", 2)]
+    in_pixels = np.hypot(errors[:, 0] * camera.fx, errors[:, 1] * camera.fy)
+    return _summary("keypoints", view, in_pixels, whitened, "px", 2)
 
 
 def _of_depths(

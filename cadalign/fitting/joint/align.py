@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -19,15 +19,24 @@ from cadalign.fitting.joint.plain import align_plain, is_plain
 from cadalign.fitting.joint.prior import prior_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.joint.robust import Consensus, find_consensus, state_of
+from cadalign.fitting.joint.single import align_single, is_single
 from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.starts import Start, starts_of
 from cadalign.fitting.joint.view import View
+from cadalign.fitting.joint.weak_views import (
+    check_first,
+    numbered_without,
+    views_without_pose,
+    with_views_left_out,
+)
 from cadalign.fitting.options import LOSSES, FitOptions, RansacOptions
 from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.search import search_joint
+
+T = TypeVar("T")
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -95,7 +104,24 @@ def align(
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
+    if size is None and ransac is None and is_single(model, given):
+        return align_single(cast(ShapeModel, model), given[0], options=options, init=init)
     prior = prior_of(model)
+    left_out = views_without_pose(prior, given, is_started=init is not None)
+    if left_out:
+        check_first(left_out)
+        others = [view for number, view in enumerate(given) if number not in left_out]
+        with numbered_without(left_out, len(given)):
+            found_by_used = align(
+                model,
+                others,
+                size=size,
+                init=init,
+                loss=loss,
+                loss_scale=loss_scale,
+                ransac=ransac,
+            )
+        return with_views_left_out(found_by_used, prior, given, left_out)
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     everything = evidence_of(
@@ -136,6 +162,8 @@ def align_batch(
     model: Model | ShapeModel,
     objects: Sequence[View | Sequence[View]],
     *,
+    size: Size | Sequence[Size | None] | None = None,
+    init: Alignment | Sequence[Alignment | None] | None = None,
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
@@ -149,31 +177,76 @@ def align_batch(
         As for `align`.
     objects : sequence of View or of sequences of View
         The views of every object.
+    size, init
+        As for `align`: one for all objects, or a sequence of one or None for each.
     workers : int
         Number of threads that share the objects; -1 for all cores.
 
     Returns
     -------
     list of AlignResult or CadalignError
-        The error takes the place of the result where an object has none.
+        The error takes the place of the result where an object has none. `cadalign.to_dataframe`
+        makes a table of them.
 
     Raises
     ------
     InputError
-        If workers is invalid.
+        If workers is invalid, or there are more or fewer sizes or starts than objects.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> view = View(camera, camera.project(truth.apply(corners)))
+    >>> boxes = align_batch(Model(points_3d=corners), [view, view], size=[None, Size(width=2.0)])
+    >>> [round(float(box.alignment.scale[0]), 3) for box in boxes]
+    [1.0, 2.0]
     """
     threads = worker_count(workers)
+    sizes = _one_each(size, len(objects), "size", Size)
+    starts = _one_each(init, len(objects), "init", Alignment)
 
-    def one(views: View | Sequence[View]) -> AlignResult | CadalignError:
+    def one(
+        views: View | Sequence[View], size: Size | None, init: Alignment | None
+    ) -> AlignResult | CadalignError:
         try:
-            return align(model, views, loss=loss, loss_scale=loss_scale, ransac=ransac)
+            return align(
+                model,
+                views,
+                size=size,
+                init=init,
+                loss=loss,
+                loss_scale=loss_scale,
+                ransac=ransac,
+            )
         except CadalignError as error:
             return error
 
     if threads == 1:
-        return [one(views) for views in objects]
+        return [one(*each) for each in zip(objects, sizes, starts, strict=True)]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(one, objects))
+        return list(pool.map(one, objects, sizes, starts))
+
+
+def _one_each(
+    given: T | Sequence[T | None] | None, count: int, where: str, kind: type[T]
+) -> Sequence[T | None]:
+    """An argument given for each of so many objects, or for all."""
+    if given is None or isinstance(given, kind):
+        return [given] * count
+    if not isinstance(given, Sequence):
+        what = f"expected a cadalign.{kind.__name__} or a sequence of them"
+        raise InputError(f"{what}, got {type(given).__name__}", where=where)
+    if len(given) != count:
+        fix = "give one for all, or one or None for each"
+        raise InputError(f"{len(given)} for {count} objects", where=where, fix=fix)
+    for number, each in enumerate(given):
+        if each is not None and not isinstance(each, kind):
+            what = f"expected a cadalign.{kind.__name__} or None, got {type(each).__name__}"
+            raise InputError(what, where=f"{where}[{number}]")
+    return given
 
 
 def _search(evidence: Evidence, init: Start | None) -> tuple[list[Consensus], int, int]:

@@ -8,23 +8,37 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.fitting.fit import LEAST_LIKELIHOOD
+from cadalign.errors import DegenerateError
+from cadalign.fitting.alternatives import LEAST_LIKELIHOOD
 from cadalign.fitting.joint.agreement import summaries_of
+from cadalign.fitting.joint.boxes import with_box
 from cadalign.fitting.joint.contributions import Basis
-from cadalign.fitting.joint.deviations import pose_and_lengths
+from cadalign.fitting.joint.deviations import (
+    curvature_of_rotations,
+    is_exact,
+    pose_and_lengths,
+    widened,
+)
+from cadalign.fitting.joint.equal_estimates import one_of_equals
+from cadalign.fitting.joint.estimates import (
+    Estimate,
+    is_other,
+    moments_of_estimates,
+    stretch_of,
+)
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import ShapePrior
 from cadalign.fitting.joint.result import AlignAlternative, AlignResult
 from cadalign.fitting.joint.view import View
-from cadalign.fitting.joint.warnings import warnings_of
+from cadalign.fitting.joint.warnings import another_pose, warnings_of
 from cadalign.fitting.result import FitStats
+from cadalign.fitting.symmetric import equal_text
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-
-_SAME = 9.0  # squared distance of rotations, in the best one's deviations, of equal estimates
 
 
 class Minimum(NamedTuple):
@@ -38,19 +52,6 @@ class Minimum(NamedTuple):
     score: float
 
 
-class _Estimate(NamedTuple):
-    """A minimum in the terms of the result, points and ``lengths`` of the box with its corners."""
-
-    points: FloatArray
-    scale: FloatArray
-    poses: tuple[Alignment, ...]
-    lengths: FloatArray
-    covariance: FloatArray
-    of_points: FloatArray
-    of_seen: FloatArray
-    likelihood: float
-
-
 def assemble(
     model: Model | ShapeModel,
     prior: ShapePrior,
@@ -62,29 +63,45 @@ def assemble(
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
     the likely minima are, each with the shape's deviations widened by the inflation.
+
+    Raises
+    ------
+    DegenerateError
+        If the evidence determines none of them.
     """
+    minima = [each for each in minima if np.isfinite(each.score)]
+    if not minima:
+        what = "the evidence does not determine pose and shape"
+        raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
     likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
+    inflation = prior.inflation
+    if all(view.mask is None for view in views):  # a contour tells as much as many keypoints
+        given = len(minima[0].evidence.sightings.point)
+        inflation = inflation_with(given, inflation, prior.few_keypoints)
     likely = [
-        _estimate(_widened(each, prior.inflation), likelihood, len(prior.ids))
+        _estimate(_widened(each, inflation), likelihood, prior)
         for each, likelihood in zip(minima, likelihoods, strict=True)
         if likelihood >= LEAST_LIKELIHOOD
     ]
-    best, minimum = likely[0], minima[0]
-    steps = [_step(best, each) for each in likely]
-    covariance, of_points, of_seen = _moments(likely, steps)
+    minimum = minima[0]
+    symmetry = model.symmetry if isinstance(model, Model) else None
+    x, y, z = (minimum.evidence.scales.free == 0).tolist()
+    likely = one_of_equals(likely, symmetry, (x, y, z))
+    best = likely[0]
+    moments = moments_of_estimates(likely)
+    if symmetry is None and not is_exact(minimum.evidence):
+        turns = moments.covariance[:3, :3]
+        turns += curvature_of_rotations(turns)
+    alternatives = tuple(
+        AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
+        for k, each in enumerate(likely)
+        if is_other(moments, k)
+    )
     residuals = []
     for view, pose in zip(views, best.poses, strict=True):
         rows = prior.rows_of(view.keypoint_ids, "ids")
         seen = view.camera.project(pose.apply(best.points[rows]))
         residuals.append(seen - cast(FloatArray, view.points_2d))
-    of_mean = prior.lengths
-    stretch = np.where(of_mean > 0, best.lengths / np.where(of_mean > 0, of_mean, 1.0), 1.0)
-    information = np.linalg.pinv(best.covariance[:3, :3]) if len(likely) > 1 else np.zeros((3, 3))
-    alternatives = tuple(
-        AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
-        for each, step in zip(likely[1:], steps[1:], strict=True)
-        if float(step[:3] @ information @ step[:3]) > _SAME
-    )
     return AlignResult(
         alignment=best.poses[0],
         ids=prior.ids,
@@ -93,34 +110,41 @@ def assemble(
         poses=best.poses,
         residuals=tuple(residuals),
         inliers=_inliers(prior, views, minimum),
-        covariance=covariance,
-        points_covariance=of_points[:-2],
-        points_cam_covariance=of_seen[:-2],
-        stretch=stretch,
+        covariance=moments.covariance,
+        points_covariance=moments.of_points[:-2],
+        points_cam_covariance=moments.of_seen[:-2],
+        stretch=stretch_of(best.lengths, prior.lengths),
         component=minimum.component,
         model=model,
         alternatives=alternatives,
-        warnings=warnings_of(minimum.evidence, minimum.state, minimum.cost, best.poses, covariance),
+        warnings=(
+            *warnings_of(
+                minimum.evidence, minimum.state, minimum.cost, best.poses, moments.covariance
+            ),
+            *another_pose(best.poses[0], alternatives),
+        ),
         stats=stats,
         evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
-        rig_from_model=_in_rig(views, minimum, best.scale),
-        basis=Basis(minimum.evidence, minimum.state),
+        rig_from_model=_in_rig(views, minimum, best),
+        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
+        equal_under_symmetry=equal_text(best.poses[0], symmetry, held=(x, y, z)),
+        cameras=tuple(view.camera for view in views),
+        observed=tuple(cast(FloatArray, view.points_2d) for view in views),
+        degrees_of_freedom=prior.degrees_of_freedom,
     )
 
 
 def _widened(minimum: Minimum, factor: float) -> Minimum:
     """The same points under a prior of wider deviations."""
-    if factor == 1:
-        return minimum
-    shape, state = minimum.evidence.shape, minimum.state
-    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
-    return minimum._replace(
-        evidence=minimum.evidence._replace(shape=wide),
-        state=state._replace(coefficients=state.coefficients / factor),
-    )
+    evidence, state = widened(minimum.evidence, minimum.state, factor)
+    return minimum._replace(evidence=evidence, state=state)
 
 
-def _estimate(minimum: Minimum, likelihood: float, keypoints: int) -> _Estimate:
+def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
+    keypoints = len(prior.ids)
+    if prior.box_margins is not None:
+        evidence, state = with_box(minimum.evidence, minimum.state, keypoints, prior.box_margins)
+        minimum = minimum._replace(evidence=evidence, state=state)
     scale = np.exp(minimum.state.log_scales)
     rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
     stretched = points_of(minimum.evidence.shape, minimum.state)[rows]
@@ -130,7 +154,7 @@ def _estimate(minimum: Minimum, likelihood: float, keypoints: int) -> _Estimate:
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
     unknowns, of_points, of_seen = joint_covariance(minimum.evidence, minimum.state)
-    return _Estimate(
+    return Estimate(
         stretched / scale,
         scale,
         _poses(minimum, scale),
@@ -142,43 +166,15 @@ def _estimate(minimum: Minimum, likelihood: float, keypoints: int) -> _Estimate:
     )
 
 
-def _in_rig(views: Sequence[View], minimum: Minimum, scale: FloatArray) -> Alignment | None:
+def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
     """The alignment in the frame that the views share."""
     if views[0].cam_from_rig is None:
         return None
-    pose = minimum.state.poses[0]
-    return Alignment(pose[:9].reshape(3, 3), pose[9:], scale)
-
-
-def _moments(
-    likely: Sequence[_Estimate], steps: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Second moments (9, 9) and twice (m + 2, 3, 3) of a mixture of estimates about the first.
-
-    ``steps`` lead from the first to each.
-    """
-    best = likely[0]
-    share = 1.0 / sum(each.likelihood for each in likely)
-    covariance = share * best.covariance
-    of_points, of_seen = share * best.of_points, share * best.of_seen
-    for each, step in zip(likely[1:], steps[1:], strict=True):
-        weight = share * each.likelihood
-        covariance += weight * (each.covariance + step[:, None] * step)
-        moved = each.points * each.scale - best.points * best.scale
-        of_points += weight * (each.of_points + moved[:, :, None] * moved[:, None, :])
-        moved = each.poses[0].apply(each.points) - best.poses[0].apply(best.points)
-        of_seen += weight * (each.of_seen + moved[:, :, None] * moved[:, None, :])
-    return covariance, of_points, of_seen
-
-
-def _step(best: _Estimate, other: _Estimate) -> FloatArray:
-    """Rotation vector, translation and log lengths (9,) that lead from one estimate to another."""
-    first, second = best.poses[0], other.poses[0]
-    logs = np.zeros(3)
-    safe = (best.lengths > 0) & (other.lengths > 0)
-    logs[safe] = np.log(other.lengths[safe] / best.lengths[safe])
-    turn = vector_from_rotation(second.rotation @ first.rotation.T)
-    return np.concatenate([turn, second.translation - first.translation, logs])
+    camera = minimum.evidence.rig.cam_from_rig[0]
+    rotation, shift = camera[:9].reshape(3, 3), camera[9:]
+    pose = best.poses[0]
+    turned = nearest_rotation(rotation.T @ pose.rotation)
+    return Alignment(turned, rotation.T @ (pose.translation - shift), best.scale)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:

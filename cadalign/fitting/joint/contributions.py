@@ -8,6 +8,7 @@ import numpy as np
 
 from cadalign.fitting.joint.deviations import pose_and_lengths
 from cadalign.fitting.joint.pieces import pieces_of, without
+from cadalign.fitting.joint.single_basis import SingleBasis
 from cadalign.fitting.joint.summary import Contribution
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.solvers.joint.evidence import Evidence, State
@@ -20,18 +21,29 @@ _UNKNOWN_SCALE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """The evidence in the form of the kernels, and the state that was estimated from it."""
+    """The evidence in the form of the kernels, and the state that was estimated from it.
+
+    ``numbers`` are those of its views among all that were given; None where all are used.
+    """
 
     evidence: Evidence
     state: State
+    numbers: tuple[int, ...] | None = None
 
 
-def contributions_of(basis: Basis) -> tuple[Contribution, ...]:
+AnyBasis = Basis | SingleBasis
+"""What contributions are computed from."""
+
+
+def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
     """Deviations at the estimate without each piece."""
     found = []
     for piece in pieces_of(basis.evidence):
         rest, state = without(basis.evidence, basis.state, piece)
-        found.append(Contribution(*piece, _deviations(rest, state)))
+        view = piece.view
+        if view is not None and basis.numbers is not None:
+            view = basis.numbers[view]
+        found.append(Contribution(piece.kind, view, _deviations(rest, state)))
     return tuple(found)
 
 

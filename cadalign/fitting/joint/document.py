@@ -13,7 +13,16 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.fitting.joint.summary import EvidenceSummary
 from cadalign.fitting.result import FitStats
 from cadalign.geometry.alignment import Alignment
-from cadalign.io.documents import Finite, ForeignDocument, NotNegative, Point3, convert, within
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    NotNegative,
+    Point3,
+    Positive,
+    convert,
+    within,
+)
 
 if TYPE_CHECKING:
     from cadalign.fitting.joint.result import AlignAlternative, AlignResult
@@ -32,6 +41,8 @@ class _View(ForeignDocument):
     alignment: Any
     residuals: list[tuple[float, float]]
     inliers: list[bool]
+    camera: Any = None  # with `observed`, not in files of earlier versions
+    observed: list[tuple[Finite, Finite]] | None = None
 
     def __post_init__(self) -> None:
         if len(self.inliers) != len(self.residuals):
@@ -65,6 +76,8 @@ class _Result(ForeignDocument):
     stats: FitStats
     evidence: tuple[_Summary, ...] = ()
     rig_from_model: Any = None
+    equal_under_symmetry: str = ""
+    degrees_of_freedom: Positive | None = None
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -85,16 +98,7 @@ def write_result(result: AlignResult) -> dict[str, Any]:
         "points_3d": result.points_3d.tolist(),
         "bounds": result.bounds.tolist(),
         "rms": result.rms,
-        "views": [
-            {
-                "alignment": pose.to_dict(),
-                "residuals": residuals.tolist(),
-                "inliers": inliers.tolist(),
-            }
-            for pose, residuals, inliers in zip(
-                result.poses, result.residuals, result.inliers, strict=True
-            )
-        ],
+        "views": [_written_view(result, number) for number in range(len(result.poses))],
         "covariance": result.covariance.tolist(),
         "points_covariance": result.points_covariance.tolist(),
         "points_cam_covariance": result.points_cam_covariance.tolist(),
@@ -114,7 +118,21 @@ def write_result(result: AlignResult) -> dict[str, Any]:
         "stats": asdict(result.stats),
         "evidence": [asdict(summary) for summary in result.evidence],
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
+        "equal_under_symmetry": result.equal_under_symmetry,
+        "degrees_of_freedom": result.degrees_of_freedom,
     }
+
+
+def _written_view(result: AlignResult, number: int) -> dict[str, Any]:
+    view: dict[str, Any] = {
+        "alignment": result.poses[number].to_dict(),
+        "residuals": result.residuals[number].tolist(),
+        "inliers": result.inliers[number].tolist(),
+    }
+    if result.cameras:
+        view["camera"] = result.cameras[number].to_dict()
+        view["observed"] = result.observed[number].tolist()
+    return view
 
 
 def read_result(data: Mapping[str, Any]) -> AlignResult:
@@ -129,10 +147,13 @@ def read_result(data: Mapping[str, Any]) -> AlignResult:
 
     try:
         read = convert(data, _Result)
-        poses = []
+        poses, cameras = [], []
         for row, view in enumerate(read.views):
             with within(f"views[{row}]"):
                 poses.append(Alignment.from_dict(view.alignment))
+                if view.camera is not None and view.observed is not None:
+                    cameras.append(Camera.from_dict(view.camera))
+        is_complete = len(cameras) == len(poses)
         return AlignResult(
             alignment=poses[0],
             ids=tuple(read.ids),
@@ -159,7 +180,13 @@ def read_result(data: Mapping[str, Any]) -> AlignResult:
                 EvidenceSummary(**{name: getattr(each, name) for name in each.__struct_fields__})
                 for each in read.evidence
             ),
+            cameras=tuple(cameras) if is_complete else (),
+            observed=tuple(np.array(view.observed).reshape(-1, 2) for view in read.views)
+            if is_complete
+            else (),
             rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
+            equal_under_symmetry=read.equal_under_symmetry,
+            degrees_of_freedom=read.degrees_of_freedom,
         )
     except CadalignError as error:
         place = f"alignment result: {error.where}" if error.where else "alignment result"
@@ -167,6 +194,8 @@ def read_result(data: Mapping[str, Any]) -> AlignResult:
 
 
 def _array(value: Any, name: str, shape: tuple[int | None, ...]) -> FloatArray:
+    if not value and shape[0] is None:  # of a model without keypoints
+        return np.empty((0, *(length or 0 for length in shape[1:])))
     return as_floats(value, name=name, shape=shape)
 
 

@@ -179,7 +179,11 @@ def _screened(evidence: Evidence, rows: _Rows, rotations: FloatArray) -> FloatAr
     normal = left.swapaxes(1, 2) @ left
     ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
     normal = normal + ridge * np.eye(left.shape[2])
-    found = np.linalg.solve(normal, (left.swapaxes(1, 2) @ right)[:, :, None])
+    projected = (left.swapaxes(1, 2) @ right)[:, :, None]
+    try:
+        found = np.linalg.solve(normal, projected)
+    except np.linalg.LinAlgError:  # of one rotation, where the ridge is lost in rounding
+        found = np.linalg.pinv(normal, hermitian=True) @ projected
     errors = (((left @ found)[:, :, 0] - right) ** 2).sum(axis=1)
     costs = errors + [_cost_of_up(evidence, rotation) for rotation in rotations]
     return np.asarray(rotations[np.argsort(costs)[:_SCREENED]])

@@ -12,7 +12,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, quote
 from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions
+from cadalign.fitting.symmetric import checked_symmetry
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.symmetry import Symmetry
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -22,7 +24,7 @@ class Model:
     Parameters
     ----------
     points_3d : (n, 3) float
-        Keypoints, in the model's own coordinates.
+        Keypoints, in the model's own coordinates; a model with a mesh needs none for masks.
     ids : sequence of n int or str, optional
         Their semantic ids or names; by default their numbers 0 to n - 1.
     bounds : (2, 3) float, optional
@@ -38,6 +40,9 @@ class Model:
     scale_prior_sigma : float, optional
         As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
         similar has similar proportions, and its keypoints alone would say otherwise.
+    symmetry : Symmetry, optional
+        As for `cadalign.fit`: motions that take the model to itself. Where the object's size is
+        estimated, a quarter turn that exchanges two stretches is an equal alignment, too.
 
     Raises
     ------
@@ -51,7 +56,7 @@ class Model:
     [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
     """
 
-    points_3d: npt.ArrayLike
+    points_3d: npt.ArrayLike = ()
     ids: Sequence[Hashable] | None = None
     bounds: npt.ArrayLike | None = None
     mesh: Mesh | None = None
@@ -59,11 +64,18 @@ class Model:
     stretch: str | None = None
     scale_prior_sigma: float | None = None
     known_axis: str = "x"
+    symmetry: Symmetry | None = None
+
+    def __repr__(self) -> str:
+        mesh = "" if self.mesh is None else f", {self.mesh!r}"
+        sigma = "" if self.shape_sigma is None else f", shape_sigma={self.shape_sigma:g}"
+        return f"Model({np.shape(self.points_3d)[0]} keypoints{mesh}{sigma})"
 
     def __post_init__(self) -> None:
-        points = as_points(self.points_3d, name="points_3d", dimension=3)
-        if not len(points):
-            raise InputError("a model needs keypoints", where="points_3d")
+        given_points = np.empty((0, 3)) if np.size(self.points_3d) == 0 else self.points_3d
+        points = as_points(given_points, name="points_3d", dimension=3)
+        if not len(points) and self.mesh is None:
+            raise InputError("a model needs keypoints", where="points_3d", fix="or give a mesh")
         object.__setattr__(self, "points_3d", read_only(points))
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         given = self.bounds
@@ -76,6 +88,7 @@ class Model:
         if self.shape_sigma is not None:
             sigma = as_positive(self.shape_sigma, name="shape_sigma")
             object.__setattr__(self, "shape_sigma", sigma)
+        checked_symmetry(self.symmetry)
         self.fit_options(1.0)
 
     def fit_options(self, sigma: float) -> FitOptions:

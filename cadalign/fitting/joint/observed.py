@@ -60,6 +60,7 @@ def model_of(
         stretch=options.stretch,
         scale_prior_sigma=options.scale_prior_sigma,
         known_axis=options.known_axis,
+        symmetry=observation.symmetry,
     )
 
 

@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.fitting.canonical import canonical_fit
 from cadalign.fitting.fit import fit
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.prior import prior_of
@@ -17,6 +18,7 @@ from cadalign.fitting.joint.view import View
 from cadalign.fitting.noise import pixel_information
 from cadalign.fitting.options import RansacOptions
 from cadalign.fitting.result import FitResult
+from cadalign.fitting.symmetric import equal_text, held_axes, without_free_turns
 from cadalign.fitting.uncertainty import unknown_axes
 from cadalign.geometry.alignment import Alignment
 
@@ -52,8 +54,14 @@ def align_plain(
     )
     columns = [0, 1, 2, 3, 4, 5, *(6 + axis for axis in unknown_axes(model.known_axis))]
     covariance = np.zeros((9, 9))
+    of_others = [points] * len(found.alternatives)
+    if model.symmetry is not None:
+        found, best, others = canonical_fit(found, model.symmetry)
+        points, of_others = best.relabelled(points), [each.relabelled(points) for each in others]
     if found.covariance is not None:
         covariance[np.ix_(columns, columns)] = found.covariance
+    if model.symmetry is not None:
+        covariance = without_free_turns(covariance, best)
     scale = found.alignment.scale
     of_points, of_seen = _points_covariances(points, found.alignment, covariance)
     bounds = cast(FloatArray, model.bounds)
@@ -72,12 +80,17 @@ def align_plain(
         component=0,
         model=model,
         alternatives=tuple(
-            AlignAlternative(other.alignment, points, bounds, other.relative_likelihood)
-            for other in found.alternatives
+            AlignAlternative(other.alignment, of_other, bounds, other.relative_likelihood)
+            for other, of_other in zip(found.alternatives, of_others, strict=True)
         ),
         warnings=found.warnings,
         stats=found.stats,
         evidence=(_summary(found, view),),
+        equal_under_symmetry=equal_text(
+            found.alignment, model.symmetry, held=held_axes(found.stretched_axes)
+        ),
+        cameras=(view.camera,),
+        observed=(cast(FloatArray, view.points_2d),),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -11,6 +11,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
 from cadalign.fitting.joint.model import Model
+from cadalign.shapes.box_margins import BoxMargins
+from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import ScalePriors, Shape
 
@@ -20,7 +22,8 @@ class ShapePrior:
     """Gaussian components of a shape, and what is known of its scales.
 
     The rows of a component are the keypoints with ``ids`` (m,), then the least and the greatest
-    corner of the box. ``inflation`` is that of `cadalign.ShapeModel`.
+    corner of the box. ``inflation``, ``degrees_of_freedom``, ``box_margins`` and ``few_keypoints``
+    are those of `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -29,6 +32,9 @@ class ShapePrior:
     scales: ScalePriors
     up: FloatArray | None
     inflation: float = 1.0
+    degrees_of_freedom: float | None = None
+    box_margins: BoxMargins | None = None
+    few_keypoints: FewKeypoints | None = None
 
     @property
     def lengths(self) -> FloatArray:
@@ -44,15 +50,20 @@ class ShapePrior:
         InputError
             If the model has no such keypoint.
         """
-        place = {name: row for row, name in enumerate(self.ids)}
-        missing = [name for name in ids if name not in place]
-        if missing:
-            listed = ", ".join(quote(name) for name in missing[:5])
-            known = ", ".join(quote(name) for name in self.ids[:12])
-            more = ", ..." if len(self.ids) > 12 else ""
-            fix = f"the model has {known}{more}"
-            raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
-        return [place[name] for name in ids]
+        return rows_among(self.ids, ids, where)
+
+
+def rows_among(known: Sequence[Hashable], ids: Sequence[Hashable], where: str) -> list[int]:
+    """Row numbers of keypoints among a model's; see `ShapePrior.rows_of`."""
+    place = {name: row for row, name in enumerate(known)}
+    missing = [name for name in ids if name not in place]
+    if missing:
+        listed = ", ".join(quote(name) for name in missing[:5])
+        names = ", ".join(quote(name) for name in known[:12])
+        more = ", ..." if len(known) > 12 else ""
+        fix = f"the model has {names}{more}"
+        raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
+    return [place[name] for name in ids]
 
 
 def prior_of(model: object) -> ShapePrior:
@@ -94,7 +105,17 @@ def _of_category(model: ShapeModel) -> ShapePrior:
     weights = tuple(component.weight for component in model.components)
     up = None if model.up_axis is None else np.eye(3)["xyz".index(model.up_axis)]
     held = ScalePriors(np.zeros(3), np.zeros((3, 3)))
-    return ShapePrior(model.ids, shapes, weights, held, up, model.inflation)
+    return ShapePrior(
+        model.ids,
+        shapes,
+        weights,
+        held,
+        up,
+        inflation=model.inflation,
+        degrees_of_freedom=model.degrees_of_freedom,
+        box_margins=model.box_margins,
+        few_keypoints=model.few_keypoints,
+    )
 
 
 _Y = np.array([0.0, 1.0, 0.0])

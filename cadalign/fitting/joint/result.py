@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+import os
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.fitting.contours.residuals import MaskResiduals
-from cadalign.fitting.joint.contributions import Basis, contributions_of
+from cadalign.fitting.joint.contributions import AnyBasis, contributions_of
 from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
 from cadalign.fitting.result import FitStats
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import NearestShape
+from cadalign.shapes.tails import radius_of
 from cadalign.shapes.warp import warp_mesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from cadalign.export import ExportOptions
+    from cadalign.fitting.joint.view import View
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +111,19 @@ class AlignResult:
         Agreement of the contour of every view's mask with the estimate; empty without masks.
     rig_from_model : Alignment, optional
         The alignment in the frame that views with ``cam_from_rig`` share; None without them.
-    basis : Basis, optional
+    basis : AnyBasis, optional
         What `contributions` is computed from.
+    equal_under_symmetry : str
+        Clause about the alignments that are equal to this one under the model's symmetry; empty
+        without one. This is the canonical one of them, in which ``covariance`` leaves out rotations
+        about an axis of the symmetry.
+    cameras : tuple of Camera
+        The camera of every view; empty for a result that an earlier version wrote.
+    observed : tuple of (n_v, 2) float
+        Observed keypoints of every view [px]; empty where ``cameras`` is.
+    degrees_of_freedom : float, optional
+        Of the t distribution of the errors, whose covariance the stated ones are; None if they are
+        Gaussian. `radius` depends on it.
     """
 
     alignment: Alignment
@@ -123,7 +145,11 @@ class AlignResult:
     evidence: tuple[EvidenceSummary, ...] = ()
     mask_residuals: tuple[MaskResiduals | None, ...] = ()
     rig_from_model: Alignment | None = None
-    basis: Basis | None = field(default=None, repr=False)
+    basis: AnyBasis | None = field(default=None, repr=False)
+    equal_under_symmetry: str = ""
+    cameras: tuple[Camera, ...] = ()
+    observed: tuple[FloatArray, ...] = ()
+    degrees_of_freedom: float | None = None
 
     @property
     def rms(self) -> float:
@@ -139,6 +165,33 @@ class AlignResult:
         tx, ty, tz, sx, sy, sz = np.sqrt(variance[3:]).tolist()
         rotation_deg = float(np.degrees(np.sqrt(variance[:3].sum())))
         return Uncertainty(rotation_deg, (tx, ty, tz), (sx, sy, sz), focal=0.0)
+
+    @property
+    def probability(self) -> float:
+        """Probability of the estimate itself rather than of one of its alternatives."""
+        return 1 / (1 + sum(other.relative_likelihood for other in self.alternatives))
+
+    def radius(self, probability: float, *, dimension: int = 1) -> float:
+        """Radius, in stated deviations, of the region that holds the truth with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        dimension : int
+            Number of coordinates that the region has: 1 for an interval, 3 for a rotation or a
+            keypoint, whose regions are ellipsoids.
+
+        Raises
+        ------
+        InputError
+            If the probability is not between 0 and 1, or the dimension is not positive.
+        """
+        if not 0 < probability < 1:
+            raise InputError(f"{probability!r} is not between 0 and 1", where="probability")
+        if dimension < 1:
+            raise InputError(f"{dimension!r} is not a positive number", where="dimension")
+        return radius_of(probability, dimension, self.degrees_of_freedom)
 
     @property
     def box(self) -> Box:
@@ -190,6 +243,33 @@ class AlignResult:
             raise InputError("only a learned shape has training models", where="model")
         return self.model.nearest(self.points_3d)
 
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        views: View | Sequence[View],
+        *,
+        format: str | None = None,
+        options: ExportOptions | None = None,
+        **of_the_object: Any,
+    ) -> Path:
+        """Write the aligned object for another tool; see `cadalign.export.export_object`.
+
+        Parameters
+        ----------
+        path, format, options
+            As for `cadalign.FitResult.export`.
+        views : View or sequence of View
+            Those of the alignment.
+        **of_the_object
+            ``mesh``, ``images``, ``world_from_cam``, ``name`` and ``metres`` of
+            `cadalign.fitting.exporting.object_of_align`.
+        """
+        from cadalign.export import export_object
+        from cadalign.fitting.exporting import object_of_align
+
+        exported = object_of_align(self, views, **of_the_object)
+        return export_object(path, exported, format=format, options=options)
+
     def contributions(self) -> tuple[Contribution, ...]:
         """Standard deviations without each piece of evidence; compare them with ``std``.
 
@@ -219,6 +299,65 @@ class AlignResult:
             what = "the result holds no evidence: it was read from a file"
             raise InputError(what, where="contributions", fix="align again")
         return contributions_of(self.basis)
+
+    def __repr__(self) -> str:
+        stretch = ", ".join(f"{value:.3g}" for value in self.stretch)
+        return (
+            f"AlignResult(views={len(self.poses)}, rms={self.rms:.3g} px, stretch=({stretch}), "
+            f"warnings={len(self.warnings)})"
+        )
+
+    def _repr_html_(self) -> str:
+        from cadalign.fitting.plots import alignment_html
+
+        return alignment_html(self)
+
+    def plot(
+        self,
+        image: npt.ArrayLike | str | os.PathLike[str] | None = None,
+        mesh: Mesh | None = None,
+        *,
+        view: int = 0,
+        axes: Axes | None = None,
+    ) -> Axes:
+        """Draw photo, model, box, and keypoints with their residuals on matplotlib axes.
+
+        Parameters
+        ----------
+        image, axes
+            As for `FitResult.plot`.
+        mesh : Mesh, optional
+            As for `mesh`; by default that of the `Model`, if it has one.
+        view : int
+            Number of the view to draw.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+
+        Raises
+        ------
+        InputError
+            If there is no such view, or the photo is not of its camera's size.
+        """
+        from cadalign.fitting.plots import plot_alignment
+
+        return plot_alignment(self, image, mesh, view=view, axes=axes)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as JSON, without its model; see `FitResult.save`."""
+        from cadalign.io.files import write_json
+
+        write_json(Path(path), self.to_dict())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> AlignResult:
+        """Read what `save` or `cadalign fit` wrote; see `FitResult.load`."""
+        from cadalign.io.documents import in_file, read_json
+
+        data = read_json(Path(path))
+        with in_file(Path(path)):
+            return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the result as plain lists and numbers, for JSON; its model is not part of it."""
@@ -258,6 +397,8 @@ class AlignResult:
             f"  translation  ({shift}) +- ({shift_std})",
             f"  stretch      ({stretch})",
         ]
+        if self.equal_under_symmetry:
+            lines.append(f"  symmetry     {self.equal_under_symmetry}")
         lines.extend(
             f"  also likely  ({other.relative_likelihood:.2g} x)" for other in self.alternatives
         )

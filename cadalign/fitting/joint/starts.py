@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.fitting.joint.carried_starts import carried_starts, weakly_determined
 from cadalign.fitting.joint.contradictions import count_equations
 from cadalign.fitting.joint.half_turns import half_turned
 from cadalign.fitting.joint.metric_starts import metric_starts
@@ -44,6 +45,9 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray
         placed = metric_starts(evidence, rotations)
         if len(placed[0]):
             return placed
+    for view in weakly_determined(evidence):
+        carried = carried_starts(evidence, view, per_pose)
+        per_pose[rig.pose[view]][:0] = carried
     if not all(per_pose):
         return np.empty((0, poses, 12)), np.empty((0, 3))
     if is_metric and init is None and (np.bincount(rig.pose) > 1).any():

@@ -125,6 +125,11 @@ class View:
         if self.mask_sigma is not None:
             as_positive(self.mask_sigma, name="mask_sigma")
 
+    def __repr__(self) -> str:
+        names = ("mask", "depth", "up", "camera_height", "cam_from_rig")
+        given = [name for name in names if getattr(self, name) is not None]
+        return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *given])})"
+
     @property
     def keypoint_ids(self) -> tuple[Hashable, ...]:
         """Ids of the keypoints; see ``ids``."""

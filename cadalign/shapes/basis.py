@@ -33,8 +33,7 @@ def component_of_basis(
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
     extended += _size_modes(rows, size_sigma)
-    flat = np.array(extended).reshape(len(extended), rows.size)
-    return ShapeComponent(1.0, rows, _orthogonal(flat, len(rows)), residual_sigma)
+    return ShapeComponent(1.0, rows, orthogonal(np.array(extended), len(rows)), residual_sigma)
 
 
 def component_of_covariance(
@@ -124,10 +123,10 @@ def _size_modes(rows: FloatArray, size_sigma: npt.ArrayLike | None) -> list[Floa
     return [rows * (wide * np.eye(3)[axis]) for axis in range(3)]
 
 
-def _orthogonal(modes: FloatArray, count: int) -> FloatArray:
-    """Modes of the same covariance that are orthogonal, the longest first."""
+def orthogonal(modes: FloatArray, count: int) -> FloatArray:
+    """Modes (K, count, 3) of the same covariance that are orthogonal, the longest first."""
     if not len(modes):
         return modes.reshape(0, count, 3)
-    _, lengths, directions = np.linalg.svd(modes, full_matrices=False)
+    _, lengths, directions = np.linalg.svd(modes.reshape(len(modes), -1), full_matrices=False)
     keep = lengths > 1e-12 * max(float(lengths[0]), 1e-300)
     return np.asarray((lengths[keep, None] * directions[keep]).reshape(-1, count, 3))

@@ -1,10 +1,13 @@
-"""Calibration of a shape model's covariances by models that were held out.
+"""Calibration of a shape model's covariances and tails by models that were held out.
 
 An image determines some directions of shape and pose and leaves others to the prior. Where few
 models were learned from, or shapes have heavier tails than Gaussians, errors in the latter are
 larger than the prior's covariance says, and no residual shows it. Held-out models tell how much:
-each is seen once from a random direction in weak perspective, and pose and shape follow in closed
-form, as the equations are linear about the truth.
+each is seen from random directions in weak perspective, once with all of its keypoints and once
+with a few, and pose and shape follow in closed form, as the equations are linear about the truth.
+Found are a factor of the deviations for either number of keypoints, and the degrees of freedom of
+the t distribution that the errors follow, as most objects of a category are nearer to the others
+than a Gaussian of that covariance says, and few far away.
 """
 
 from __future__ import annotations
@@ -13,25 +16,35 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammainc
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.shapes.gaussians import Gaussians
+from cadalign.shapes.inflation import FEW, FewKeypoints
 from cadalign.shapes.parts import BOX_ROWS
+from cadalign.shapes.tails import probability_within
 
-_FACTORS = np.geomspace(1.0, 3.0, 12)  # deviations are never narrowed
+_FACTORS = np.geomspace(1.0, 3.0, 12)  # deviations are never narrowed; the first is no factor
+_DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 _LEAST_KEYPOINTS = 4
 _NOMINAL = np.array([0.68, 0.95])
 _TOLERANCE = np.array([0.08, 0.05])  # of these shares of truths
 _POSE = 6  # a rotation vector, a translation in the image, the logarithm of the scale
 
 
-class _View(NamedTuple):
-    """A model's n keypoints in an image.
+class Calibration(NamedTuple):
+    """Factor of the deviations, and degrees of freedom of the errors; None if Gaussian."""
 
-    ``entries`` (3 n,) of the shape vector; derivatives of the image ``by_shape`` (2 n, 3 n) and
-    ``by_pose`` (2 n, 6), rotation first; the image ``seen`` (2 n,) and the ``truth`` (3 n,).
+    inflation: float = 1.0
+    degrees_of_freedom: float | None = None
+    few_keypoints: FewKeypoints | None = None
+
+
+class _View(NamedTuple):
+    """Some of a model's n keypoints, g, in an image.
+
+    ``entries`` (3 n,) of the shape vector; derivatives of the image ``by_shape`` (2 g, 3 n) and
+    ``by_pose`` (2 g, 6), rotation first; the image ``seen`` (2 g,) and the ``truth`` (n, 3).
     """
 
     entries: IntArray
@@ -41,13 +54,13 @@ class _View(NamedTuple):
     truth: FloatArray
 
 
-def find_inflation(
+def calibrate(
     parts: Iterable[tuple[FloatArray, Gaussians]], *, sigma: float, rng: np.random.Generator
-) -> float:
-    """Find the factor of the shapes' deviations at which held-out truths lie where they should.
+) -> Calibration:
+    """Find the deviations and tails at which held-out truths lie where they should.
 
-    Of the regions of rotation and keypoints the one whose share of truths is furthest from its
-    nominal probability decides.
+    Shares of truths in regions of rotations and of keypoints, given or not, are to depart least
+    from their nominal probabilities, in the sum of squares.
 
     Parameters
     ----------
@@ -56,100 +69,144 @@ def find_inflation(
     sigma : float
         Standard deviation of the image's noise [model units].
     rng : Generator
-        Of the directions and the noise.
+        Of the directions, the keypoints that are given, and the noise.
 
     Returns
     -------
-    float
-        1 or more; 1 if no model has enough keypoints.
+    Calibration
+        The factor is 1 or more. Gaussian with a factor of 1 if no model has enough keypoints.
     """
-    turned, moved = [], []
+    every, few, counts = _Errors([], []), _Errors([], []), []
     for rows, mixture in parts:
         for row in rows:
-            view = _view(row, sigma, rng)
-            if view is not None:
-                squares = _squares(view, mixture, sigma)
-                turned.append(squares[0])
-                moved.append(squares[1])
-    if not turned:
-        return 1.0
-    gaps = np.maximum(_departures(np.array(turned)), _departures(np.concatenate(moved, axis=1).T))
-    return float(_FACTORS[np.argmin(gaps)])
+            known = np.flatnonzero(np.isfinite(row[:-BOX_ROWS]).all(axis=1))
+            count = len(known)
+            if count >= _LEAST_KEYPOINTS:
+                counts.append(count)
+                view = _view(known, np.arange(count), row, sigma, rng)
+                every.append(_squares(view, mixture, sigma))
+            if count > FEW:
+                view = _view(known, rng.permutation(count)[:FEW], row, sigma, rng)
+                few.append(_squares(view, mixture, sigma))
+    if not counts:
+        return Calibration()
+    gaps, typical = every.departures()[:, :, None], float(np.mean(counts))
+    if few.turned and typical > FEW:
+        is_less = np.tri(len(_FACTORS), dtype=bool)  # or as large
+        gaps = np.where(is_less, gaps + few.departures()[:, None], np.inf)
+    freedom, row, lower = np.unravel_index(np.argmin(gaps), gaps.shape)
+    factor, of_few = float(_FACTORS[row]), None
+    if gaps.shape[2] > 1:
+        of_few = FewKeypoints(typical, float(_FACTORS[lower]) / factor)
+    return Calibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
 
 
-def _departures(squares: FloatArray) -> FloatArray:
-    """Largest departure of coverage from its nominal value, in tolerances, for every factor (F,).
+class _Errors(NamedTuple):
+    """Squared errors in stated deviations: (F,) of rotations and (F, n) of keypoints per view."""
+
+    turned: list[FloatArray]
+    moved: list[FloatArray]
+
+    def append(self, squares: tuple[FloatArray, FloatArray]) -> None:
+        """Add those of a view."""
+        self.turned.append(squares[0])
+        self.moved.append(squares[1])
+
+    def departures(self) -> FloatArray:
+        """Squared departures of coverage by degrees of freedom and factor."""
+        turned, moved = np.array(self.turned), np.concatenate(self.moved, axis=1).T
+        return np.array(
+            [
+                _departure(turned, freedom) + _departure(moved, freedom)
+                for freedom in _DEGREES_OF_FREEDOM
+            ]
+        )
+
+
+def _departure(squares: FloatArray, degrees_of_freedom: float | None) -> FloatArray:
+    """Squared departures of coverage from its nominal values, in tolerances, by factor (F,).
 
     ``squares`` (N, F) are those of errors along three coordinates, in stated deviations.
     """
-    levels = gammainc(1.5, squares / 2)  # the distribution of chi-square
+    levels = probability_within(squares, 3, degrees_of_freedom)
     shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
-    gaps = np.abs(shares - _NOMINAL[:, None]) / _TOLERANCE[:, None]
-    return np.asarray(gaps.max(axis=0))
+    gaps = (shares - _NOMINAL[:, None]) / _TOLERANCE[:, None]
+    return np.asarray((gaps**2).sum(axis=0))
 
 
-def _view(row: FloatArray, sigma: float, rng: np.random.Generator) -> _View | None:
-    """A random view of a model, or None if it has too few keypoints."""
-    known = np.flatnonzero(np.isfinite(row[:-BOX_ROWS]).all(axis=1))
+def _view(
+    known: IntArray, given: IntArray, row: FloatArray, sigma: float, rng: np.random.Generator
+) -> _View:
+    """A random view of a model's known keypoints (n,), of which some are given (g,)."""
     quat = rng.standard_normal(4)
     rotation = rotation_from_quat_wxyz(quat / np.linalg.norm(quat))
-    noise = rng.standard_normal(2 * (len(row) - BOX_ROWS))[: 2 * len(known)]
-    if len(known) < _LEAST_KEYPOINTS:
-        return None
     points = row[known]
-    turned = (points - points.mean(axis=0)) @ rotation.T
-    count = len(known)
-    by_pose = np.zeros((count, 2, 6))
+    turned = (points[given] - points[given].mean(axis=0)) @ rotation.T
+    by_pose = np.zeros((len(given), 2, _POSE))
     by_pose[:, 0, 1], by_pose[:, 0, 2] = turned[:, 2], -turned[:, 1]
     by_pose[:, 1, 0], by_pose[:, 1, 2] = -turned[:, 2], turned[:, 0]
     by_pose[:, 0, 3] = by_pose[:, 1, 4] = 1.0
     by_pose[:, :, 5] = turned[:, :2]
-    by_shape = np.asarray(np.kron(np.eye(count), rotation[:2]), dtype=float)
-    truth = np.asarray(points.ravel())
+    by_shape = np.asarray(np.kron(np.eye(len(known))[given], rotation[:2]), dtype=float)
     entries = (3 * known[:, None] + np.arange(3)).ravel()
-    return _View(entries, by_shape, by_pose.reshape(-1, 6), by_shape @ truth + sigma * noise, truth)
+    seen = by_shape @ points.ravel() + sigma * rng.standard_normal(len(by_shape))
+    return _View(entries, by_shape, by_pose.reshape(-1, _POSE), seen, points)
 
 
 class _Posterior(NamedTuple):
-    """Pose (6,) and shape (3 n,) given an image and one Gaussian, and their covariances."""
+    """Pose (6,) and keypoints (n, 3) given an image and one Gaussian.
+
+    Covariances of the rotation (F, 3, 3) and of each keypoint (F, n, 3, 3) are those with the
+    deviations widened by every factor.
+    """
 
     pose: FloatArray
-    shape: FloatArray
-    of_pose: FloatArray
-    of_shape: FloatArray
+    points: FloatArray
+    of_turn: FloatArray
+    of_points: FloatArray
     log_evidence: float
 
 
 def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: float) -> _Posterior:
     """Generalised least squares for the pose, whose prior is flat, then the shape given it."""
+    squares = (_FACTORS**2)[:, None, None]
     across = view.by_shape @ covariance
-    root = np.linalg.cholesky(across @ view.by_shape.T + sigma**2 * np.eye(len(view.seen)))
-    gap, by_pose, gain = np.split(
-        np.linalg.solve(
-            root, np.column_stack([view.seen - view.by_shape @ mean, view.by_pose, across])
-        ),
-        [1, 1 + _POSE],
-        axis=1,
+    noise = sigma**2 * np.eye(len(view.seen))
+    roots = np.linalg.cholesky(squares * (across @ view.by_shape.T) + noise)
+    known = np.column_stack([view.seen - view.by_shape @ mean, view.by_pose])
+    right = np.concatenate(
+        [np.broadcast_to(known, (len(roots), *known.shape)), squares * across], axis=2
     )
-    of_pose = np.linalg.inv(by_pose.T @ by_pose)
-    pose = of_pose @ (by_pose.T @ gap)
-    rest = gap - by_pose @ pose
-    left = gain - by_pose @ (of_pose @ (by_pose.T @ gain))
+    whitened = np.linalg.solve(roots, right)
+    by_pose, gain = whitened[:, :, 1 : 1 + _POSE], whitened[:, :, 1 + _POSE :]
+    of_pose = np.linalg.inv(by_pose.swapaxes(1, 2) @ by_pose)
+    left = gain - by_pose @ (of_pose @ (by_pose.swapaxes(1, 2) @ gain))
+    n = len(mean) // 3
+    parts = (-1, gain.shape[1], n, 3)
+    own = np.einsum("iaib->iab", covariance.reshape(n, 3, n, 3))
+    told = np.einsum("fria,frib->fiab", gain.reshape(parts), left.reshape(parts))
+    gap = whitened[0, :, 0]  # without a factor, as estimates are
+    pose = of_pose[0] @ (by_pose[0].T @ gap)
+    rest = gap - by_pose[0] @ pose
     return _Posterior(
-        pose[:, 0],
-        mean + (gain.T @ rest)[:, 0],
-        of_pose,
-        covariance - gain.T @ left,
+        pose,
+        (mean + gain[0].T @ rest).reshape(-1, 3),
+        of_pose[:, :3, :3],
+        squares[..., None] * own - told,
         float(
-            np.linalg.slogdet(of_pose)[1] / 2
-            - np.log(root.diagonal()).sum()
-            - (rest * rest).sum() / 2
+            np.linalg.slogdet(of_pose[0])[1] / 2
+            - np.log(roots[0].diagonal()).sum()
+            - (rest @ rest) / 2
         ),
     )
 
 
 def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Squared errors in deviations of the rotation (F,) and each keypoint (F, n)."""
+    """Squared errors in deviations of the rotation (F,) and each keypoint (F, n).
+
+    Covariances are the second moments of the mixture about the likeliest component's estimate, as
+    `cadalign.align` states them.
+    """
     means = mixture.means[:, view.entries]
     covariances = mixture.covariances[:, view.entries[:, None], view.entries]
     found = [
@@ -157,12 +214,14 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
         for mean, covariance in zip(means, covariances, strict=True)
     ]
     logs = np.log(mixture.weights) + np.array([each.log_evidence for each in found])
-    best = int(np.argmax(logs))
-    turn, gaps = found[best].pose[:3], (found[best].shape - view.truth).reshape(-1, 3, 1)
-    turned, moved = [], []
-    for factor in _FACTORS:
-        wide = _posterior(view, means[best], factor**2 * covariances[best], sigma)
-        turned.append(turn @ np.linalg.solve(wide.of_pose[:3, :3], turn))
-        own = np.einsum("iaib->iab", wide.of_shape.reshape(len(gaps), 3, -1, 3))
-        moved.append((gaps * np.linalg.solve(own, gaps)).sum(axis=(1, 2)))
-    return np.array(turned), np.array(moved)
+    shares = np.exp(logs - np.logaddexp.reduce(logs))
+    best = found[int(np.argmax(shares))]
+    of_turn, of_points = np.zeros_like(best.of_turn), np.zeros_like(best.of_points)
+    for share, each in zip(shares, found, strict=True):
+        turn, steps = (each.pose - best.pose)[:3], each.points - best.points
+        of_turn += share * (each.of_turn + np.outer(turn, turn))
+        of_points += share * (each.of_points + steps[:, :, None] * steps[:, None])
+    turn, gaps = best.pose[:3, None], (best.points - view.truth)[:, :, None]
+    turned = turn * np.linalg.solve(of_turn, np.broadcast_to(turn, (len(of_turn), 3, 1)))
+    solved = np.linalg.solve(of_points, np.broadcast_to(gaps, (*of_points.shape[:-1], 1)))
+    return turned.sum(axis=(1, 2)), (gaps * solved).sum(axis=(2, 3))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from cadalign.arrays import FloatArray, IntArray
 
@@ -243,6 +242,8 @@ def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Pri
 # SciPy's own checks would take longer than the factorisation of such small matrices.
 def _root(covariance: FloatArray) -> FloatArray:
     """Lower Cholesky factor."""
+    from scipy.linalg.lapack import dpotrf
+
     root, info = dpotrf(covariance, lower=1, clean=1)
     if info:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
@@ -251,5 +252,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
     """Solve with a lower Cholesky factor."""
+    from scipy.linalg.lapack import dtrtrs
+
     solution, _ = dtrtrs(root, right, lower=1)
     return np.asarray(solution)

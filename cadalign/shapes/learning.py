@@ -10,15 +10,16 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 from threadpoolctl import threadpool_limits
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance
-from cadalign.shapes.calibration import find_inflation
+from cadalign.shapes.box_margins import BoxMargins, excesses_of, learn_margins
+from cadalign.shapes.calibration import Calibration, calibrate
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -37,7 +38,7 @@ _UNLIKE = 0.01  # share of models
 _TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
 _MODE_TOLERANCE = 0.1  # modes cost next to nothing
 _FOLDS = 3
-_MOST_CALIBRATED = 100  # models of a fold
+_MOST_CALIBRATED = 80  # models of a fold
 _LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
@@ -71,7 +72,8 @@ class Learned:
 
     components: tuple[ShapeComponent, ...]
     reflection: Reflection | None
-    inflation: float
+    calibration: Calibration
+    box_margins: BoxMargins | None = None
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,15 @@ class _Trial:
     scores: FloatArray
 
 
+class _Choice(NamedTuple):
+    """Choices made by held-out models, and figures learned from them."""
+
+    recipe: _Recipe
+    modes: int | None
+    calibration: Calibration = Calibration()
+    margins: BoxMargins | None = None
+
+
 class _CrossValidation:
     """Recipes compared by the likelihood of models that were held out."""
 
@@ -168,14 +179,14 @@ class _CrossValidation:
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
         self._on_progress, self._done = on_progress, 0
 
-    def choose(self, options: LearnOptions) -> tuple[_Recipe, int, float]:
-        """Choose a recipe, the number of modes, and the factor of stated deviations."""
+    def choose(self, options: LearnOptions) -> _Choice:
+        """Choose a recipe and the number of modes, and calibrate what they give."""
         best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
         if options.reflection:
             best = self._with_reflection(best)
         best = self._with_components(best, options.components)
         modes = options.modes or self._modes(best)
-        return best.recipe, modes, self._inflation(best, modes)
+        return _Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -198,13 +209,21 @@ class _CrossValidation:
         parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
         return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
 
-    def _inflation(self, trial: _Trial, modes: int) -> float:
+    def _calibration(self, trial: _Trial, modes: int) -> Calibration:
         held_out = [
             (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
             for fold, mixture in enumerate(trial.learned)
         ]
         sigma = _RESOLUTION * self._models.size
-        return find_inflation(held_out, sigma=sigma, rng=np.random.default_rng(0))
+        return calibrate(held_out, sigma=sigma, rng=np.random.default_rng(0))
+
+    def _margins(self, trial: _Trial) -> BoxMargins | None:
+        rows = self._models.rows
+        excesses = np.empty((len(rows), 2, 3))
+        for fold, mixture in enumerate(trial.learned):
+            held_out = self._folds == fold
+            excesses[held_out] = excesses_of(rows[held_out], mixture)
+        return learn_margins(rows, excesses)
 
     def _try(self, recipe: _Recipe) -> _Trial:
         learned = []
@@ -237,13 +256,13 @@ def learn_components(
     # Threads of the linear algebra library make products of such small matrices 30 times slower.
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
-            recipe = _Recipe(components=options.components or 1)
-            modes, inflation = options.modes, 1.0
+            choice = _Choice(_Recipe(components=options.components or 1), options.modes)
         else:
-            recipe, modes, inflation = _CrossValidation(models, on_progress).choose(options)
-        mixture = models.mixture(recipe)
+            choice = _CrossValidation(models, on_progress).choose(options)
+        mixture = models.mixture(choice.recipe)
     on_progress(_STEPS, _STEPS)
-    return Learned(_components(mixture, modes), recipe.reflection, inflation)
+    components = _components(mixture, choice.modes)
+    return Learned(components, choice.recipe.reflection, choice.calibration, choice.margins)
 
 
 def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:
@@ -257,6 +276,8 @@ def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[Keyp
 
 def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     """Cluster the completed vectors by their main coefficients."""
+    from scipy.cluster.vq import kmeans2
+
     _, directions = np.linalg.eigh(common.covariances[0])
     coefficients = (vectors.completed(common) - common.means[0]) @ directions[:, -_CLUSTER_MODES:]
     tries = []

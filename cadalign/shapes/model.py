@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,10 +15,13 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import in_file
 from cadalign.shapes.basis import component_of_basis, component_of_covariance
+from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.examples import Dataset, Example, Table, examples_of
+from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
+    Gaussians,
     KeypointId,
     NearestShape,
     Reflection,
@@ -26,6 +30,7 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
 )
+from cadalign.shapes.reflections import symmetric_component
 from cadalign.shapes.shape_file import read_shape, write_shape
 
 OnProgress = Callable[[int, int], object]
@@ -63,6 +68,14 @@ class ShapeModel:
         Factor of the shapes' standard deviations in stated covariances: the one at which, while it
         was learned, the regions of held-out models held the truth as often as they said. Estimates
         don't depend on it.
+    degrees_of_freedom : float, optional
+        Of the t distribution that the errors of estimates follow, found likewise: more than 2, None
+        if they are Gaussian. Covariances are those of the errors in any case.
+    few_keypoints : FewKeypoints, optional
+        Decrease of the inflation where few keypoints are given, found likewise; None for none.
+    box_margins : BoxMargins, optional
+        Where the faces of boxes are beyond the keypoints; None if that is not known, and boxes are
+        the learned ones, enlarged by the given keypoints.
 
     Raises
     ------
@@ -93,6 +106,9 @@ class ShapeModel:
     training: TrainingShapes | None = None
     unit: str = "model units"
     inflation: float = 1.0
+    degrees_of_freedom: float | None = None
+    box_margins: BoxMargins | None = None
+    few_keypoints: FewKeypoints | None = None
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
@@ -117,6 +133,12 @@ class ShapeModel:
             raise InputError(what, where="training")
         if not is_number(self.inflation) or self.inflation <= 0:
             raise InputError(f"{self.inflation!r} is not a positive number", where="inflation")
+        freedom = self.degrees_of_freedom
+        if freedom is not None:
+            if not is_number(freedom) or freedom <= 2:
+                what = f"{freedom!r} is not a number above 2, nor None"
+                raise InputError(what, where="degrees_of_freedom")
+            object.__setattr__(self, "degrees_of_freedom", float(freedom))
         object.__setattr__(self, "inflation", float(self.inflation))
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "components", tuple(self.components))
@@ -173,7 +195,10 @@ class ShapeModel:
             reflection=learned.reflection,
             training=table.shapes,
             unit=unit,
-            inflation=learned.inflation,
+            inflation=learned.calibration.inflation,
+            degrees_of_freedom=learned.calibration.degrees_of_freedom,
+            box_margins=learned.box_margins,
+            few_keypoints=learned.calibration.few_keypoints,
         )
 
     @classmethod
@@ -243,6 +268,7 @@ class ShapeModel:
         box: npt.ArrayLike | None = None,
         residual_sigma: float = 0.0,
         size_sigma: npt.ArrayLike | None = None,
+        reflection: Reflection | None = None,
         category: str = "object",
         up_axis: Literal["x", "y", "z"] | None = None,
         unit: str = "model units",
@@ -270,14 +296,17 @@ class ShapeModel:
             Standard deviation of the logarithm of the size, overall or along x, y and z, where the
             modes are of objects of one size: further modes, which scale mean and box about the
             origin.
+        reflection : Reflection, optional
+            The category's mirror symmetry. Mean and covariance are averaged with their mirror
+            images, since a mean whose left and right differ a little turns the estimates.
         category, up_axis, unit
             See `ShapeModel`.
 
         Raises
         ------
         InputError
-            If a shape is wrong, a value is NaN or infinite, a deviation is negative, or an id
-            occurs twice.
+            If a shape is wrong, a value is NaN or infinite, a deviation is negative, an id occurs
+            twice, or the reflection names an unknown one.
 
         Examples
         --------
@@ -296,12 +325,16 @@ class ShapeModel:
             residual_sigma=residual_sigma,
             size_sigma=size_sigma,
         )
+        labels = _given_ids(ids, names, len(component.mean) - BOX_ROWS)
+        if reflection is not None:
+            component = symmetric_component(component, labels, reflection)
         return cls(
             category=category,
-            ids=_given_ids(ids, names, len(component.mean) - BOX_ROWS),
+            ids=labels,
             components=(component,),
             has_box=box is not None,
             up_axis=up_axis,
+            reflection=reflection,
             unit=unit,
         )
 
@@ -367,10 +400,24 @@ class ShapeModel:
         models = "" if self.training is None else f", {len(self.training)} models"
         return f"ShapeModel({self.category!r}, {text}{models})"
 
+    def _repr_html_(self) -> str:
+        from cadalign.shapes.plots import shape_html
+
+        return shape_html(self)
+
     @property
     def mean(self) -> FloatArray:
         """Mean of the mixture: keypoints, then the box's corners, (m + 2, 3) float."""
         return np.asarray(sum(each.weight * each.mean for each in self.components))
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """The components as arrays, computed once."""
+        return Gaussians(
+            np.array([each.mean for each in self.components]),
+            np.array([each.covariance for each in self.components]),
+            np.array([each.weight for each in self.components]),
+        )
 
     def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
         """Rows of the keypoints that have these ids, (n,) int.

@@ -1,14 +1,15 @@
-"""Mirror symmetries of a category, found from its models' keypoints."""
+"""Mirror symmetries of a category: finding them, and making shapes symmetric."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from cadalign.arrays import FloatArray
-from cadalign.shapes.parts import AXES, BOX_ROWS, KeypointId, Reflection
+from cadalign.shapes.basis import orthogonal
+from cadalign.shapes.parts import AXES, BOX_ROWS, KeypointId, Reflection, ShapeComponent
 
 _ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
 
@@ -27,6 +28,8 @@ def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int)
     axis : int
         0, 1 or 2: the axis across which the models are mirrored.
     """
+    from scipy.optimize import linear_sum_assignment
+
     points = completed[:, :-BOX_ROWS]
     offset = float(completed[:, -BOX_ROWS:, axis].mean())
     partner = np.arange(len(ids))
@@ -52,9 +55,33 @@ def mirrored_rows(
     rows: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
 ) -> FloatArray:
     """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
+    mirrored = mirrored_motions(rows, ids, reflection)
+    mirrored[..., AXES.index(reflection.axis)] += 2 * reflection.offset
+    return mirrored
+
+
+def mirrored_motions(
+    motions: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
+) -> FloatArray:
+    """Mirror displacements of models' keypoints and box corners, (N, m + 2, 3) float."""
     axis = AXES.index(reflection.axis)
-    partner = reflection.partners(ids)
-    exchanged = rows[:, [*partner, -BOX_ROWS, -1]]
-    exchanged[..., axis] = 2 * reflection.offset - exchanged[..., axis]
+    exchanged = motions[:, [*reflection.partners(ids), -BOX_ROWS, -1]]
+    exchanged[..., axis] = -exchanged[..., axis]
     exchanged[:, [-BOX_ROWS, -1], axis] = exchanged[:, [-1, -BOX_ROWS], axis]
     return exchanged
+
+
+def symmetric_component(
+    component: ShapeComponent, ids: Sequence[KeypointId], reflection: Reflection
+) -> ShapeComponent:
+    """Make a component symmetric: an object is as likely as its mirror image.
+
+    Mean and covariance are the average of the component's own and of the mirrored ones.
+    """
+    mean, modes = component.mean, component.modes
+    mirrored = mirrored_motions(modes, ids, reflection)
+    return replace(
+        component,
+        mean=(mean + mirrored_rows(mean[None], ids, reflection)[0]) / 2,
+        modes=orthogonal(np.concatenate([modes, mirrored]) / np.sqrt(2), len(mean)),
+    )

@@ -20,6 +20,8 @@ from cadalign.errors import InputError
 from cadalign.io.documents import Count, Document, Finite, Index, NotNegative, PathText, Positive
 from cadalign.io.files import damaged, reading
 from cadalign.io.sealed import Seal
+from cadalign.shapes.box_margins import BoxMargins
+from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent, TrainingShapes
 
 if TYPE_CHECKING:
@@ -73,6 +75,16 @@ class _Training(Document):
     mesh_paths: list[PathText | None]
 
 
+class _Margins(Document):
+    margins: _Array
+    tolerances: _Array
+
+
+class _Few(Document):
+    typical: Positive
+    share: Positive
+
+
 class _Shape(Document):
     category: str
     ids: list[Label]
@@ -82,7 +94,10 @@ class _Shape(Document):
     reflection: _Reflection | None
     training: _Training | None
     unit: str
-    inflation: Positive = 1.0  # files of before have none
+    inflation: Positive = 1.0  # files of before have none of these
+    degrees_of_freedom: Positive | None = None
+    box_margins: _Margins | None = None
+    few_keypoints: _Few | None = None
 
 
 class ShapeFields(NamedTuple):
@@ -97,11 +112,15 @@ class ShapeFields(NamedTuple):
     training: TrainingShapes | None
     unit: str
     inflation: float
+    degrees_of_freedom: float | None
+    box_margins: BoxMargins | None
+    few_keypoints: FewKeypoints | None
 
 
 def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
     """Write a shape model's file atomically."""
-    mirror, training = model.reflection, model.training
+    mirror, training, margins = model.reflection, model.training, model.box_margins
+    few = model.few_keypoints
     document = _Shape(
         category=model.category,
         ids=list(model.ids),
@@ -125,6 +144,11 @@ def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
         ),
         unit=model.unit,
         inflation=model.inflation,
+        degrees_of_freedom=model.degrees_of_freedom,
+        box_margins=None
+        if margins is None
+        else _Margins(_Array.of(margins.margins), _Array.of(margins.tolerances)),
+        few_keypoints=None if few is None else _Few(few.typical, few.share),
     )
     SEAL.write(Path(path), msgspec.msgpack.encode(document))
 
@@ -151,7 +175,7 @@ def _fields(read: _Shape) -> ShapeFields:
         )
         for each in read.components
     )
-    mirror, training = read.reflection, read.training
+    mirror, training, few = read.reflection, read.training, read.few_keypoints
     return ShapeFields(
         category=read.category,
         ids=tuple(read.ids),
@@ -170,4 +194,13 @@ def _fields(read: _Shape) -> ShapeFields:
         ),
         unit=read.unit,
         inflation=read.inflation,
+        degrees_of_freedom=read.degrees_of_freedom,
+        box_margins=_box_margins(read.box_margins),
+        few_keypoints=None if few is None else FewKeypoints(few.typical, few.share),
     )
+
+
+def _box_margins(read: _Margins | None) -> BoxMargins | None:
+    if read is None:
+        return None
+    return BoxMargins(read.margins.read("<f8"), read.tolerances.read("<f8"))

@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import RBFInterpolator
-from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
@@ -138,6 +136,8 @@ def _weights(
     points: FloatArray, box: FloatArray, places: FloatArray, diagonal: float
 ) -> FloatArray:
     """Shares (p, n) of the keypoints' displacements in those of points."""
+    from scipy.interpolate import RBFInterpolator
+
     everything = np.vstack([box, places])
     around = _corners(everything.min(axis=0), everything.max(axis=0), _MARGIN * diagonal)
     shares = RBFInterpolator(
@@ -157,6 +157,8 @@ def _diagonal(box: FloatArray, places: FloatArray) -> float:
 
 def _rounding(places: FloatArray, diagonal: float) -> float:
     """Radius within which the kernel's tip is rounded: less where keypoints are near each other."""
+    from scipy.spatial.distance import pdist
+
     least = float(pdist(places).min()) if len(places) > 1 else diagonal
     return min(_ROUNDING * diagonal, least)
 

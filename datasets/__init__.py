@@ -1,37 +1,42 @@
 """Loaders: annotated CAD models (KeypointNet, ShapeNet, mesh files), photos, correspondences."""
 
-from cadalign.datasets.detections.image_keypoints import (
-    ImageKeypoints,
-    choose_object,
-    join_keypoints,
-)
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
-from cadalign.datasets.meshes.load import check_solid, flat_axes, load_mesh
-from cadalign.datasets.models.categories import SYNSETS
-from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
-from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.datasets.models.shapenet import ShapeNet, ShapeNetModel
-from cadalign.datasets.photos.bop import Bop
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
-from cadalign.datasets.photos.kitti import KittiCars
-from cadalign.datasets.photos.objectron import Objectron
-from cadalign.datasets.photos.pascal3d import Pascal3D
-from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
-from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
-from cadalign.datasets.photos.pix3d import Pix3D
-from cadalign.datasets.photos.posed_photos import PosedPhotos
-from cadalign.datasets.photos.recognise import open_photos
-from cadalign.datasets.photos.scan2cad import Scan2CAD
-from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
-from cadalign.datasets.sfm.blind_pnp import BlindPnP
-from cadalign.datasets.sfm.bundler import Bundler
-from cadalign.datasets.sfm.colmap import Colmap
-from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
-from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
+from typing import TYPE_CHECKING
 
-# Not in __all__: a star import must not hide the built-in function.
-open = open_photos
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.datasets.detections.image_keypoints import (
+        ImageKeypoints,
+        choose_object,
+        join_keypoints,
+    )
+    from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+    from cadalign.datasets.meshes.load import check_solid, flat_axes, load_mesh
+    from cadalign.datasets.models.categories import SYNSETS
+    from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
+    from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
+    from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+    from cadalign.datasets.models.shapenet import ShapeNet, ShapeNetModel
+    from cadalign.datasets.photos.bop import Bop
+    from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
+    from cadalign.datasets.photos.kitti import KittiCars
+    from cadalign.datasets.photos.objectron import Objectron
+    from cadalign.datasets.photos.pascal3d import Pascal3D
+    from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
+    from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
+    from cadalign.datasets.photos.pix3d import Pix3D
+    from cadalign.datasets.photos.posed_photos import PosedPhotos
+
+    # `open` is not in __all__: a star import must not hide the built-in function.
+    from cadalign.datasets.photos.recognise import open_photos
+    from cadalign.datasets.photos.recognise import open_photos as open  # noqa: F401
+    from cadalign.datasets.photos.scan2cad import Scan2CAD
+    from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
+    from cadalign.datasets.sfm.blind_pnp import BlindPnP
+    from cadalign.datasets.sfm.bundler import Bundler
+    from cadalign.datasets.sfm.colmap import Colmap
+    from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
+    from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",
@@ -78,3 +83,9 @@ __all__ = [
     "sample_models",
     "write_sample_dataset",
 ]
+
+__getattr__ = lazy_names(__name__)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,30 +1,37 @@
 """Drawing: scenes, renderers, visibility, views, overlays and pictures."""
 
-from cadalign.render.drawing.movie import contact_sheet, write_movie
-from cadalign.render.drawing.overlay import draw_overlay
-from cadalign.render.drawing.pictures import (
-    depth_picture,
-    face_picture,
-    feature_lines,
-    keypoint_picture,
-    line_picture,
-    normal_picture,
-)
-from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
-from cadalign.render.frame import Frame, Geometry, Renderer
-from cadalign.render.probe import Probe, probe_renderer
-from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
-from cadalign.render.raycast.shading import Studio
-from cadalign.render.scene import Scene
-from cadalign.render.select import make_renderer
-from cadalign.render.views.silhouette import silhouette_iou
-from cadalign.render.views.viewpoints import Viewpoint, frame_object, look_at, sample_view
-from cadalign.render.views.visibility import visible_keypoints
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.render.drawing.model_overlay import OverlayStyle, overlay_model, overlay_models
+    from cadalign.render.drawing.movie import contact_sheet, write_movie
+    from cadalign.render.drawing.overlay import draw_overlay
+    from cadalign.render.drawing.pictures import (
+        depth_picture,
+        face_picture,
+        feature_lines,
+        keypoint_picture,
+        line_picture,
+        normal_picture,
+    )
+    from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
+    from cadalign.render.frame import Frame, Geometry, Renderer
+    from cadalign.render.probe import Probe, probe_renderer
+    from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
+    from cadalign.render.raycast.shading import Studio
+    from cadalign.render.scene import Scene
+    from cadalign.render.select import make_renderer
+    from cadalign.render.views.silhouette import silhouette_iou
+    from cadalign.render.views.viewpoints import Viewpoint, frame_object, look_at, sample_view
+    from cadalign.render.views.visibility import visible_keypoints
 
 __all__ = [
     "Angles",
     "Frame",
     "Geometry",
+    "OverlayStyle",
     "Probe",
     "RaycastRenderer",
     "Renderer",
@@ -44,6 +51,8 @@ __all__ = [
     "look_at",
     "make_renderer",
     "normal_picture",
+    "overlay_model",
+    "overlay_models",
     "pose_in_view",
     "probe_renderer",
     "sample_view",
@@ -52,3 +61,9 @@ __all__ = [
     "visible_keypoints",
     "write_movie",
 ]
+
+__getattr__ = lazy_names(__name__)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

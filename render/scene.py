@@ -84,7 +84,7 @@ class Scene:
     @cached_property
     def used_vertices(self) -> FloatArray:
         """The vertices that faces use, (n, 3) float."""
-        return np.asarray(self.mesh.vertices[np.unique(self.mesh.faces)])
+        return np.asarray(self.mesh.vertices[self.mesh.is_used])
 
     @cached_property
     def triangles(self) -> FloatArray:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from cadalign.geometry.camera import Camera
 
 ByteImage = npt.NDArray[np.uint8]
+JPEG_ENDING = ".jpg"
+_JPEG_QUALITY = 95
 
 _ORIENTATION = 0x0112
 _ON_ITS_SIDE = frozenset((5, 6, 7, 8))
@@ -106,13 +108,18 @@ def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
 
 
 def write_image(path: Path, image: ByteImage) -> None:
-    """Write an image as PNG, whole or not at all: RGB (h, w, 3) uint8, RGBA (h, w, 4) or grey."""
+    """Write an image, whole or not at all: RGB (h, w, 3) uint8, RGBA (h, w, 4) or grey.
+
+    As JPEG where the name ends in ``.jpg``, otherwise as PNG.
+    """
     import cv2  # on first use: it takes longer to import than all the rest
 
     if image.ndim == 3:
         colors = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
         image = np.asarray(cv2.cvtColor(image, colors), dtype=np.uint8)
-    encoded, data = cv2.imencode(".png", image)
+    kind = JPEG_ENDING if path.suffix.lower() == JPEG_ENDING else ".png"
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if kind == JPEG_ENDING else []
+    encoded, data = cv2.imencode(kind, image, quality)
     if not encoded:
-        raise DataError("the picture cannot be encoded as PNG", where=str(path))
+        raise DataError(f"the picture cannot be encoded as {kind[1:].upper()}", where=str(path))
     write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))

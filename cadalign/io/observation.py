@@ -15,16 +15,25 @@ The file of one image holds one object::
       "fit": {"sigma": null, "loss": "linear"}
     }
 
-``camera`` is COLMAP's form, principal point in COLMAP's convention (the top-left corner of the
-image is (0, 0)), see `cadalign.Camera.from_dict`; an unknown focal length is ``null`` there, or
-``{"width": 640, "height": 480}`` is all that is given. ``xyz`` is in model units, ``uv`` in pixels
-with integers at pixel centres, of the photo as it is seen: turned upright where EXIF says so.
+``camera`` is COLMAP's form, or a calibration ``matrix``, see `cadalign.Camera.from_dict`; an
+unknown focal length is ``null`` there, or ``{"width": 640, "height": 480}`` is all that is given.
+``xyz`` is in model units, ``uv`` in pixels of the photo as it is seen: turned upright where EXIF
+says so. ``pixel_origin`` says where pixel (0, 0) lies: ``"center"`` of the top-left pixel, or
+``"corner"`` of the image, half a pixel away. In ``camera`` it is that of the principal point, by
+default ``"corner"`` for COLMAP's ``params`` and ``"center"`` for a ``matrix``; beside ``keypoints``
+it is that of ``uv``, by default ``"center"``. `Observation.save` states both.
 ``sigma`` [px], ``semantic_id``, ``name`` and ``confidence`` (a detector's score, not negative) are
 optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis`` and ``focal``; and
-``shape_sigma`` of `cadalign.Model`, for a model that is only similar.
+``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
+``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``null`` for none, by default that of
+the photo's EXIF data); and ``shape_sigma`` of `cadalign.Model`, for a model that is only similar.
+
+``object`` is the object's name, to tell the objects of a photo apart.
+
+``symmetry`` says what takes the model to itself, in any form of `cadalign.Symmetry.from_dict`:
+``"__SYM_ROTATE_UP_4"``, ``{"axis": [0, 1, 0], "fold": null}``, or BOP's lists.
 
 Evidence beyond keypoints stands beside them, each field optional, deviations and scales as
 `cadalign.View` and `cadalign.Size` describe them::
@@ -34,11 +43,15 @@ Evidence beyond keypoints stands beside them, each field optional, deviations an
       "up": [0.02, -0.97, 0.24], "up_sigma_deg": 1.0,
       "camera_height": 1.45, "camera_height_sigma": 0.02,
       "size": {"width": 0.45, "height": 0.91, "length": 0.52, "sigma": 0.01},
-      "shape": "chair.shape"
+      "shape": "chair.shape",
+      "init": {"rotation": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+               "translation": [0.1, 0.05, 2.4], "scale": [1, 1.1, 0.9]}
 
 ``mask`` and ``depth`` are PNG files of the camera's size, ``depth`` of 16 bits with ``depth_scale``
 units per count; in its place keypoints may have a ``depth`` [units], left out where unknown.
-``shape`` is a file of `cadalign shape learn`, which takes the model's place. Several images of one
+``shape`` is a file of `cadalign shape learn`, which takes the model's place. ``init`` is an
+alignment to start from, as `cadalign.align` takes it, in the form of ``alignment`` in a fit.json;
+its ``scale`` is 1 unless given. With it ``keypoints`` may be few, or none. Several images of one
 object stand in ``views``, each with camera, image, keypoints (or none) and evidence of its own; and
 ``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the cameras' motion is
 known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``) are the same::
@@ -63,6 +76,8 @@ from typing import Any
 
 import msgspec
 
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.files import write_json
 from cadalign.io.observation_file import (
@@ -70,6 +85,7 @@ from cadalign.io.observation_file import (
     read_fields,
     read_image_fields,
     read_size,
+    read_start,
     write_image_fields,
 )
 from cadalign.io.observed_image import KnownSize, ObservedImage
@@ -93,6 +109,12 @@ class Observation(ObservedImage):
         Known lengths of the object.
     shape : Path, optional
         File of the learned shape that takes the model's place.
+    symmetry : Symmetry, optional
+        Of the model.
+    init : Alignment, optional
+        Where to start, as for `cadalign.align`.
+    object_name : str, optional
+        Name of the object.
     """
 
     model: Path | None = None
@@ -100,6 +122,9 @@ class Observation(ObservedImage):
     others: tuple[ObservedImage, ...] = field(default=(), kw_only=True)
     size: KnownSize | None = field(default=None, kw_only=True)
     shape: Path | None = field(default=None, kw_only=True)
+    symmetry: Symmetry | None = field(default=None, kw_only=True)
+    init: Alignment | None = field(default=None, kw_only=True)
+    object_name: str | None = field(default=None, kw_only=True)
 
     @property
     def views(self) -> tuple[ObservedImage, ...]:
@@ -109,7 +134,12 @@ class Observation(ObservedImage):
     @property
     def is_plain(self) -> bool:
         """True where nothing but keypoints in one image is known."""
-        return not self.others and self.size is None and not self.has_more
+        return not (self.others or self.size or self.init or self.has_more)
+
+    def __repr__(self) -> str:
+        counts = ", ".join(str(len(view.points_2d)) for view in self.views)
+        source = "" if self.image is None else f"{self.image.name!r}, "
+        return f"Observation({source}{len(self.views)} views with {counts} keypoints)"
 
     @classmethod
     def load(cls, path: str | Path, *, needs_xyz: bool = True) -> Observation:
@@ -150,24 +180,37 @@ class Observation(ObservedImage):
             others=tuple(others),
             size=read_size(read.size),
             shape=None if read.shape is None else path_from(read.shape, folder),
+            symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
+            init=read_start(read.init),
+            object_name=read.object,
         )
 
-    def to_dict(self, *, folder: Path | None = None) -> dict[str, Any]:
-        """The parsed form of an observation file, its paths relative to ``folder``."""
-        data: dict[str, Any]
-        if self.others:
-            data = {"views": [write_image_fields(view, folder) for view in self.views]}
-        else:
-            data = write_image_fields(self, folder)
+    def to_dict(
+        self, *, folder: Path | None = None, states_origins: bool = False
+    ) -> dict[str, Any]:
+        """The parsed form of an observation file, its paths relative to ``folder``.
+
+        ``states_origins`` writes every ``pixel_origin``, too.
+        """
+        written = [
+            write_image_fields(view, folder, states_origins=states_origins) for view in self.views
+        ]
+        data: dict[str, Any] = {"views": written} if self.others else written[0]
         for name, path in (("model", self.model), ("shape", self.shape)):
             if path is not None:
                 data[name] = written_path(path, folder=folder)
+        if self.object_name is not None:
+            data["object"] = self.object_name
         if self.size is not None:
             data["size"] = self.size.given
+        if self.symmetry is not None:
+            data["symmetry"] = self.symmetry.to_dict()
+        if self.init is not None:
+            data["init"] = self.init.to_dict()
         if self.fit_options:
             data["fit"] = dict(self.fit_options)
         return data
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
-        write_json(Path(path), self.to_dict(folder=Path(path).parent))
+        write_json(Path(path), self.to_dict(folder=Path(path).parent, states_origins=True))

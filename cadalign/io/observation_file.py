@@ -15,7 +15,9 @@ from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera_form import PixelOrigin, shift_of
 from cadalign.io.documents import (
     Document,
     Finite,
@@ -48,6 +50,13 @@ class Keypoint(Labelled, kw_only=True):
     depth: Positive | None = None
 
 
+class FocalPriorFields(Document):
+    """The entry ``fit.focal_prior``."""
+
+    focal: Positive
+    relative_sigma: Positive
+
+
 class FitFields(Document):
     """The entry ``fit``; fields that are not given keep the defaults of `cadalign.fit`."""
 
@@ -59,6 +68,7 @@ class FitFields(Document):
     scale_prior_sigma: Positive | UnsetType | None = UNSET
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
+    focal_prior: FocalPriorFields | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET
 
 
@@ -72,10 +82,19 @@ class SizeFields(Document):
     sigma: Positive | list[Positive] | None = None
 
 
+class StartFields(Document):
+    """The entry ``init``."""
+
+    rotation: tuple[Point3, Point3, Point3]
+    translation: Point3
+    scale: Point3 = (1.0, 1.0, 1.0)
+
+
 class _ImageFields(Document, kw_only=True):
     """Fields of one image, beside its keypoints."""
 
     camera: Any  # in the form of `Camera.from_dict`
+    pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
     image: PathText | None = None
     mask: PathText | None = None
     mask_sigma: Positive | None = None
@@ -102,7 +121,16 @@ class OneView(_ImageFields, kw_only=True):
     model: PathText | None = None
     shape: PathText | None = None
     size: SizeFields | None = None
+    object: Text | None = None
+    symmetry: Any = None  # in a form of `Symmetry.from_dict`
+    init: StartFields | None = None
     fit: FitFields = msgspec.field(default_factory=FitFields)
+
+
+class StartedView(OneView, kw_only=True):
+    """A file of one image with a start, which needs no keypoints."""
+
+    keypoints: list[Keypoint] = msgspec.field(default_factory=list)
 
 
 class SeveralViews(Document, kw_only=True):
@@ -112,6 +140,9 @@ class SeveralViews(Document, kw_only=True):
     model: PathText | None = None
     shape: PathText | None = None
     size: SizeFields | None = None
+    object: Text | None = None
+    symmetry: Any = None  # in a form of `Symmetry.from_dict`
+    init: StartFields | None = None
     fit: FitFields = msgspec.field(default_factory=FitFields)
 
 
@@ -124,7 +155,8 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
         If a field is missing, unknown or invalid.
     """
     if not isinstance(data, Mapping) or "views" not in data:
-        one: OneView = convert(data, OneView)
+        is_started = isinstance(data, Mapping) and data.get("init") is not None
+        one: OneView = convert(data, StartedView if is_started else OneView)
         sigma = one.fit.sigma
         if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
             what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"
@@ -155,7 +187,8 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
         evidence["cam_from_rig"] = np.array(evidence["cam_from_rig"])
     return ObservedImage(
         points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
-        points_2d=np.array([each.uv for each in read.keypoints]).reshape(-1, 2),
+        points_2d=np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
+        - shift_of(read.pixel_origin),
         camera=Camera.from_dict(read.camera),
         sigma=_column(read.keypoints, "sigma"),
         semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
@@ -181,8 +214,27 @@ def read_size(read: SizeFields | None) -> KnownSize | None:
         return KnownSize(**msgspec.structs.asdict(read))
 
 
-def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, Any]:
-    """Camera, keypoints, photo and evidence of an image as they are written."""
+def read_start(read: StartFields | None) -> Alignment | None:
+    """The alignment to start from, if there is any.
+
+    Raises
+    ------
+    DataError
+        If the rotation is none, or a scale is not positive.
+    """
+    if read is None:
+        return None
+    with within("init"):
+        return Alignment(np.array(read.rotation), np.array(read.translation), np.array(read.scale))
+
+
+def write_image_fields(
+    image: ObservedImage, folder: Path | None, *, states_origins: bool = False
+) -> dict[str, Any]:
+    """Camera, keypoints, photo and evidence of an image as they are written.
+
+    ``states_origins`` writes the pixel conventions of camera and keypoints, which are the defaults.
+    """
     keypoints: list[dict[str, Any]] = [
         {"xyz": xyz, "uv": uv}
         for xyz, uv in zip(image.points_3d.tolist(), image.points_2d.tolist(), strict=True)
@@ -199,7 +251,11 @@ def write_image_fields(image: ObservedImage, folder: Path | None) -> dict[str, A
             for keypoint, value in zip(keypoints, listed, strict=True):
                 if value == value:  # an unknown depth is NaN
                     keypoint[name] = value
-    data: dict[str, Any] = {"camera": image.camera.to_dict(), "keypoints": keypoints}
+    camera = image.camera.to_dict(pixel_origin="corner" if states_origins else None)
+    data: dict[str, Any] = {"camera": camera}
+    if states_origins:
+        data["pixel_origin"] = "center"
+    data["keypoints"] = keypoints
     if image.image is not None:
         data["image"] = written_path(image.image, folder=folder)
     for name, value in image.evidence.given.items():

@@ -8,17 +8,30 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.datasets.meshes.obj import read_obj
-from cadalign.datasets.meshes.scenes import read_ply, read_scene
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 
+
+def _read_ply(path: Path) -> Mesh:
+    # Only here: trimesh takes longer to import than an OBJ file to be read.
+    from cadalign.datasets.meshes.scenes import read_ply
+
+    return read_ply(path)
+
+
+def _read_scene(path: Path) -> Mesh:
+    from cadalign.datasets.meshes.scenes import read_scene  # trimesh, as above
+
+    return read_scene(path)
+
+
 _READERS = {
     ".obj": read_obj,
-    ".ply": read_ply,
-    ".glb": read_scene,
-    ".gltf": read_scene,
-    ".stl": read_scene,
-    ".off": read_scene,
+    ".ply": _read_ply,
+    ".glb": _read_scene,
+    ".gltf": _read_scene,
+    ".stl": _read_scene,
+    ".off": _read_scene,
 }
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from trimesh.exchange.obj import parse_mtl
 
 from cadalign.errors import brief, quote
 from cadalign.geometry.mesh import GREY, Material
@@ -20,6 +19,7 @@ from cadalign.io.images import check_pixels
 logger = logging.getLogger("cadalign")
 
 Texture = npt.NDArray[np.uint8]
+_Entry = dict[str, list[str]]
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
 # How many values follow each option of map_Kd, after "The MTL file format", Wavefront 1995.
@@ -37,7 +37,7 @@ def load_materials(
     ``libraries`` is what the OBJ file's ``mtllib`` lines name; only the textures of ``names`` are
     read.
     """
-    entries: dict[str, tuple[Path, dict[str, Any]]] = {}
+    entries: dict[str, tuple[Path, _Entry]] = {}
     for library in libraries:
         for path in _library_paths(obj_path, library):
             entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
@@ -88,38 +88,35 @@ def _find(folder: Path, name: str) -> Path | None:
     return None
 
 
-class _DeferredTextures:
-    """Gives trimesh's parser no texture: it would drop unreadable ones without a word."""
-
-    def get(self, name: str) -> bytes:
-        raise FileNotFoundError(name)
-
-
-def _parse_library(path: Path) -> dict[str, dict[str, Any]]:
+def _parse_library(path: Path) -> dict[str, _Entry]:
+    """The materials of a library by name: of each, the words that follow its keywords."""
     try:
         text = path.read_bytes().decode("utf-8", errors="replace")
-        # Renamed, so that the parser keeps the texture's name instead of opening the file.
-        lines = (_rename_map(line) for line in text.splitlines())
-        return dict(parse_mtl("\n".join(lines), resolver=_DeferredTextures()))  # type: ignore[no-untyped-call]
-    except Exception as error:  # the parser promises nothing about damaged files
+    except OSError as error:
         logger.warning("%s: the material library cannot be read (%s)", path, brief(error))
         return {}
-
-
-def _rename_map(line: str) -> str:
-    words = line.split(None, 1)
-    return f"texture_file {words[1]}" if words and words[0].lower() == "map_kd" else line
+    entries: dict[str, _Entry] = {}
+    current: _Entry = {}  # of what stands before the first name
+    for line in text.splitlines():
+        key, *words = line.split() or [""]
+        if not words:
+            continue
+        if key.lower() == "newmtl":
+            current = entries[" ".join(words)] = {}
+        else:
+            current[key.lower()] = words
+    return entries
 
 
 def _material(
     name: str,
     path: Path,
-    entry: dict[str, Any],
+    entry: _Entry,
     load_texture: Callable[[Path, tuple[str, ...]], Texture | None],
 ) -> Material:
-    texture = load_texture(path, tuple(entry.get("texture_file", [])))
+    texture = load_texture(path, tuple(entry.get("map_kd", [])))
     color = _color(entry)
-    if texture is None and "texture_file" in entry:
+    if texture is None and "map_kd" in entry:
         color = (*GREY[:3], color[3])
     elif texture is not None and not any(color[:3]):
         # Exporters write a black Kd beside a texture; multiplied, the texture would vanish.
@@ -127,16 +124,15 @@ def _material(
     return Material(name=name, color=color, texture=texture)
 
 
-def _color(entry: dict[str, Any]) -> tuple[float, float, float, float]:
-    diffuse = entry.get("kd", GREY[:3])
-    values = diffuse if isinstance(diffuse, list | tuple) else [diffuse] * 3
-    if len(values) < 3 or not np.isfinite(values).all():
-        values = GREY[:3]
+def _color(entry: _Entry) -> tuple[float, float, float, float]:
+    values = [_number([word]) for word in entry.get("kd", [])]
+    rgb = values * 3 if len(values) == 1 else values[:3]
+    known = GREY[:3] if len(rgb) < 3 or None in values else rgb
     opacity = _number(entry.get("d"))
     if opacity is None:
         transparency = _number(entry.get("tr"))
         opacity = 1.0 if transparency is None else 1.0 - transparency
-    red, green, blue, alpha = (float(v) for v in np.clip([*values[:3], opacity], 0.0, 1.0))
+    red, green, blue, alpha = (float(v) for v in np.clip([*known, opacity], 0.0, 1.0))
     return red, green, blue, alpha
 
 

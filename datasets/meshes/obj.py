@@ -113,20 +113,24 @@ def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
 
 def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
     found = _Statements()
+    # Nearly all lines are these three.
+    vertices, texture_coordinates, faces = found.vertices, found.texture_coordinates, found.faces
     by_assimp = False
     counted = (-1, -1)
     for number, line in _logical_lines(file):
         key, _, body = line.partition(b" ")
         if key == b"f":
-            counts = (len(found.vertices), len(found.texture_coordinates))
+            counts = (len(vertices), len(texture_coordinates))
             if counts != counted:
-                found.counts_at.append((len(found.faces), *counts))
+                found.counts_at.append((len(faces), *counts))
                 counted = counts
-            found.faces.append(body)
+            faces.append(body)
         elif key == b"v":
-            found.vertices.append(body)
+            vertices.append(body)
         elif key == b"vt":
-            found.texture_coordinates.append(body)
+            texture_coordinates.append(body)
+        elif key in (b"vn", b""):
+            continue
         elif key in (b"l", b"p"):
             found.other_elements += 1
         elif key == b"usemtl":
@@ -145,18 +149,24 @@ def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
 
 def _logical_lines(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
+    # A tab may separate the keyword too.
+    lines = file.read().replace(b"\t", b" ").split(b"\n")
+    return _joined(enumerate(map(bytes.strip, lines), start=1))
+
+
+def _joined(lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
     parts: list[bytes] = []
     number = 0
-    for number, raw in enumerate(file, start=1):
-        line = raw.strip()
-        if line.endswith(b"\\"):
+    for number, line in lines:
+        if line[-1:] == b"\\":
             parts.append(line[:-1])
-            continue
-        # A tab may separate the keyword too.
-        yield number, b" ".join([*parts, line]).replace(b"\t", b" ")
-        parts = []
+        elif parts:
+            yield number, b" ".join([*parts, line])
+            parts = []
+        else:
+            yield number, line
     if parts:
-        yield number, b" ".join(parts).replace(b"\t", b" ")
+        yield number, b" ".join(parts)
 
 
 def _require_complete(statements: _Statements, path: Path) -> None:
@@ -175,12 +185,20 @@ def _require_complete(statements: _Statements, path: Path) -> None:
         raise damaged(f"{announced}, but only {found} are there", path)
 
 
-def _parse_rows(bodies: list[bytes]) -> FloatArray:
+def _lengths(bodies: list[bytes], text: bytes) -> IntArray:
+    """Numbers of words of the statements (n,), whose joined text is ``text``."""
+    if text != text.strip() or b"  " in text or len(text.translate(None, b"\r\v\f")) < len(text):
+        return np.array([len(body.split()) for body in bodies], dtype=np.int64)
+    return np.array([body.count(b" ") for body in bodies], dtype=np.int64) + 1
+
+
+def _parse_rows(bodies: list[bytes], *, least: int = 1) -> FloatArray:
     """The numbers of statements that may differ in length, padded with zeros; (n, width) float."""
-    values = np.fromstring(b" ".join(bodies), sep=" ", dtype=np.float64)
-    lengths = np.array([len(body.split()) for body in bodies], dtype=np.int64)
-    if lengths.sum() != len(values) or (lengths < 1).any():
-        raise ValueError("not all of it is numbers")
+    text = b" ".join(bodies)
+    values = np.fromstring(text, sep=" ", dtype=np.float64)
+    lengths = _lengths(bodies, text)
+    if lengths.sum() != len(values) or (lengths < least).any():
+        raise ValueError("not all of it is numbers, or they are too few")
     width = int(lengths.max(initial=0))
     if width > _MAX_VALUES:
         raise ValueError("too many numbers in a line")
@@ -193,10 +211,8 @@ def _parse_rows(bodies: list[bytes]) -> FloatArray:
 
 def _parse_vertices(bodies: list[bytes]) -> tuple[FloatArray, FloatArray | None]:
     """Positions (n, 3), and colours (n, 4) if there are any: ``x y z [w] [r g b]``."""
-    rows = _parse_rows(bodies)
+    rows = _parse_rows(bodies, least=3)
     width = rows.shape[1]
-    if width < 3 or min(len(body.split()) for body in bodies) < 3:
-        raise ValueError("a vertex has fewer than 3 coordinates")
     if width < 6:
         return np.ascontiguousarray(rows[:, :3]), None
     colors = np.ones((len(rows), 4))
@@ -208,10 +224,10 @@ def _parse_vertices(bodies: list[bytes]) -> tuple[FloatArray, FloatArray | None]
 
 def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     """Corners (c, 2) as (vertex, texture coordinate or 0), as in the file, and faces' sizes."""
-    sizes = np.array([len(body.split()) for body in bodies], dtype=np.int64)
+    text = b" ".join(bodies)
+    sizes = _lengths(bodies, text)
     if sizes.min() < 3:
         raise ValueError("a face has fewer than 3 corners")
-    text = b" ".join(bodies)
     total = int(sizes.sum())
     # What stays when digits and signs go is the form of each corner: "", "/" or "//".
     forms = set(text.translate(None, _DIGITS).split())

@@ -17,12 +17,14 @@ from typing import NamedTuple, overload
 import numpy as np
 
 from cadalign.datasets.meshes.load import load_mesh
+from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
 from cadalign.datasets.models.annotations import entry_id, parse_entry, read_entries
 from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
 from cadalign.datasets.models.keypoints import Keypoints, Symmetries
 from cadalign.datasets.models.locate import MeshLocator
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.symmetry import Symmetry
 
 logger = logging.getLogger("cadalign")
 
@@ -66,6 +68,11 @@ class AnnotatedModel:
     def key(self) -> ModelKey:
         """(category, model id)"""
         return self.category, self.model_id
+
+    @property
+    def symmetry(self) -> Symmetry:
+        """The rotations that map the model onto itself, as far as its annotation shows them."""
+        return annotated_symmetry(self.keypoints.xyz, self.symmetries)
 
     def load_mesh(self, *, check: bool = True) -> Mesh:
         """Read the mesh.

@@ -17,13 +17,21 @@ from msgspec import Meta, Raw
 
 from cadalign.datasets.photos.bop_models import BopModels
 from cadalign.datasets.photos.dataset import PhotoDataset, read_each
-from cadalign.datasets.photos.photo import DepthImage, Photo, PhotoObject, Truth, existing
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    DepthImage,
+    Photo,
+    PhotoObject,
+    Truth,
+    existing,
+)
 from cadalign.datasets.photos.records import parse, read_table
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
@@ -141,6 +149,7 @@ class Bop(PhotoDataset):
         self.problems |= bad
         self._scene: _Scene | None = None
         self._models: BopModels | None = None
+        self._known: dict[int, tuple[CadModel, Symmetry]] = {}
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -149,8 +158,9 @@ class Bop(PhotoDataset):
         if self._scene is None or self._scene.folder != folder:
             self._scene = _read_scene(folder)
             models = BopModels.find(folder)
-            self._models = models if self._models != models else self._models
-        scene, models = self._scene, self._models
+            if self._models != models:
+                self._models, self._known = models, {}
+        scene = self._scene
         image = _image(folder, _COLOR_FOLDERS, key)
         camera, depth_scale = _camera(scene, key, image)
         poses: list[Any] = parse(scene.truth[key], list[Any], path=folder / TRUTH, where=key)
@@ -159,7 +169,8 @@ class Bop(PhotoDataset):
             infos = parse(scene.info[key], list[_Info], path=folder / _INFO, where=key)
 
         def read_object(number: int, pose: Any) -> PhotoObject:
-            found = _object(number, convert(pose, _Pose), models)
+            checked: _Pose = convert(pose, _Pose)
+            found = _object(number, checked, *self._model(checked.obj_id))
             if number < len(infos):
                 found = _with_info(found, infos[number])
             name = f"{int(key):06d}_{number:06d}.png"
@@ -170,6 +181,14 @@ class Bop(PhotoDataset):
         depth_path = _image(folder, ("depth",), key)
         depth = None if depth_path is None else DepthImage(depth_path, depth_scale)
         return Photo(self.names[index], image, camera, objects, depth=depth, problems=problems)
+
+    def _model(self, obj_id: int) -> tuple[CadModel | None, Symmetry]:
+        """A model and its symmetries, read once while photos have the same models."""
+        if self._models is None:
+            return None, Symmetry.none()
+        if obj_id not in self._known:
+            self._known[obj_id] = self._models.model(obj_id), self._models.symmetry(obj_id)
+        return self._known[obj_id]
 
 
 def find_scenes(folder: Path) -> Iterator[Path]:
@@ -238,20 +257,19 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
     return None
 
 
-def _object(number: int, pose: _Pose, models: BopModels | None) -> PhotoObject:
-    matrix = np.reshape(pose.cam_R_m2c, (3, 3)).astype(float)
-    alignment = Alignment(nearest_rotation(matrix), np.array(pose.cam_t_m2c), np.ones(3))
-    model = None if models is None else models.model(pose.obj_id)
+def _object(number: int, pose: _Pose, model: CadModel | None, symmetry: Symmetry) -> PhotoObject:
+    rotation = nearest_rotation(np.reshape(pose.cam_R_m2c, (3, 3)).astype(float))
+    alignment = Alignment(rotation, np.array(pose.cam_t_m2c), np.ones(3), is_valid=True)
     box = None
     if model is not None and model.bounds is not None:
         box = Box.from_model(model.bounds, alignment)
-    found = PhotoObject(
+    return PhotoObject(
         object_id=str(number),
         category=f"obj_{pose.obj_id:06d}",
         truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
         model=model,
+        symmetry=symmetry,
     )
-    return found if models is None else replace(found, symmetry=models.symmetry(pose.obj_id))
 
 
 def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:

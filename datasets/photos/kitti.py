@@ -18,6 +18,7 @@ from cadalign.datasets.photos.kitti_files import KittiLabel, read_labels, read_p
 from cadalign.datasets.photos.kitti_keypoints import (
     CARS,
     TRACKS,
+    UP,
     KeypointFrame,
     list_cars,
     list_tracks,
@@ -116,7 +117,7 @@ class KittiCars(PhotoDataset):
             return self._object(number, label, shift)
 
         objects, problems = read_each(self._labels(frame), read_object, where=str(frame.labels))
-        return Photo(frame.name, image, camera, objects, problems=problems)
+        return Photo(frame.name, image, camera, objects, up=UP, problems=problems)
 
     def _labels(self, frame: _LabelFrame) -> list[KittiLabel | DataError]:
         if frame.frame is None:

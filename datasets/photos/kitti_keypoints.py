@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from msgspec import Raw
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, read_only
 from cadalign.datasets.photos.kitti_files import car_box
 from cadalign.datasets.photos.photo import (
     CadModel,
@@ -59,6 +59,9 @@ CARS = "cars.json"
 TRACKS = "car_tracks.json"
 HIDDEN = 0.1
 """Scores below this are those of keypoints that something hides."""
+UP = read_only(np.array([0.0, -1.0, 0.0]))
+"""KITTI's cameras are level, and so are the boxes of its labels."""
+_MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
 _Matrix = tuple[Point3, Point3, Point3]
 _Dims = tuple[Positive, Positive, Positive]
 _Four = tuple[Finite, Finite, Finite, Finite]
@@ -98,7 +101,9 @@ class _Track(ForeignDocument):
     frames: list[Any]
 
 
-class _Model(ForeignDocument):
+class MeanCar(ForeignDocument):
+    """The mean car: names and places of its keypoints [m]."""
+
     names: list[Text]
     model_xyz: list[Point3]
 
@@ -130,7 +135,7 @@ class KeypointFrame:
     path: Path
     place: str
     entry: Any
-    model: _Model | None = None
+    model: MeanCar | None = None
     track: _Track | None = None
 
     def photo(self, size: tuple[int, int]) -> Photo:
@@ -158,17 +163,17 @@ class KeypointFrame:
         camera = _camera(car.K, size if image is None else photo_size(image))
         marked = _marked(pixels, names, scores or None)
         found = _object("0", car, np.array(car.dims_hwl), points, marked)
-        return Photo(self.name, image, camera, (found,))
+        return Photo(self.name, image, camera, (found,), up=UP)
 
     def _photo_of_track(
-        self, frame: _Frame, model: _Model, track: _Track, size: tuple[int, int]
+        self, frame: _Frame, model: MeanCar, track: _Track, size: tuple[int, int]
     ) -> Photo:
         names = tuple(model.names)
         points = NamedPoints(names, np.array(model.model_xyz).reshape(-1, 3))
         marked = _marked(np.array(frame.uv, dtype=float).reshape(-1, 2), names, frame.score)
         dims = np.array(track.dims_hwl)
         found = _object(str(track.track), frame, dims, points, marked)
-        return Photo(self.name, None, _camera(track.K, size), (found,))
+        return Photo(self.name, None, _camera(track.K, size), (found,), up=UP)
 
 
 def list_cars(path: Path) -> Iterator[KeypointFrame | DataError]:
@@ -199,7 +204,7 @@ def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
             for name in ("names", "model_xyz", "tracks")
         }
         with in_file(path):
-            model = convert({key: raw[key] for key in ("names", "model_xyz")}, _Model)
+            model = convert({key: raw[key] for key in ("names", "model_xyz")}, MeanCar)
             tracks = convert(raw["tracks"], list[Any], "tracks")
     except DataError as error:
         yield error
@@ -215,6 +220,19 @@ def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
         for row, frame in enumerate(track.frames):
             name = f"{track.sequence}/track {track.track}/{row}"
             yield KeypointFrame(name, path, f"{place}.frames[{row}]", frame, model, track)
+
+
+def car_bounds(points: FloatArray) -> FloatArray:
+    """The box (2, 3) of the mean car with these keypoints (k, 3), which lie within it.
+
+    Keypoints reach to the roof, and at the wheels to their hubs. The sides are those of KITTI's
+    average car.
+    """
+    if not len(points):
+        return np.array([-_MEAN_CAR / 2, _MEAN_CAR / 2])
+    low, high = points.min(axis=0), points.max(axis=0)
+    center = np.array([*(low[:2] + high[:2]) / 2, high[2] - _MEAN_CAR[2] / 2])
+    return np.array([center - _MEAN_CAR / 2, center + _MEAN_CAR / 2])
 
 
 def _camera(k: _Matrix, size: tuple[int, int]) -> Camera:
@@ -237,6 +255,6 @@ def _object(
         category="Car",
         truth=Truth(box=box, metres=1.0),
         keypoints=marked,
-        model=CadModel("mean car", ModelFiles(None, points)),
+        model=CadModel("mean car", ModelFiles(None, points), bounds=car_bounds(points.xyz)),
         bbox=np.array(pose.bbox),
     )

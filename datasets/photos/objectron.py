@@ -170,7 +170,9 @@ class Objectron(PhotoDataset):
             where=f"{path}: frame_annotations[{number}]",
         )
         image = _image(self.root, path, frame.frame_id)
-        return Photo(self.names[index], image, camera, objects, problems=problems)
+        # The phone's world is upright: y points up.
+        up = cam_from_world.rotation[:, 1]
+        return Photo(self.names[index], image, camera, objects, up=up, problems=problems)
 
 
 def list_annotations(folder: Path) -> list[Path]:

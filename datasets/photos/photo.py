@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Protocol
 
@@ -194,6 +195,9 @@ class Truth:
         return None if self.box is None else self.box.rotation
 
 
+_no_symmetry = cache(Symmetry.none)
+
+
 @dataclass(frozen=True, eq=False)
 class PhotoObject:
     """One object in a photo.
@@ -227,7 +231,7 @@ class PhotoObject:
     truth: Truth = field(default_factory=Truth)
     keypoints: PhotoKeypoints | None = None
     model: CadModel | None = None
-    symmetry: Symmetry = field(default_factory=Symmetry.none)
+    symmetry: Symmetry = field(default_factory=_no_symmetry)
     mask_path: Path | None = None
     bbox: FloatArray | None = None
     visible_fraction: float | None = None
@@ -301,6 +305,8 @@ class Photo:
         The objects whose annotation could be read.
     depth : DepthImage, optional
         The photo's depth image.
+    up : (3,) float, optional
+        The direction against gravity in the camera's frame, as a sensor or the rig tells it.
     problems : tuple of DataError
         Why further objects of this photo could not be read.
     """
@@ -310,6 +316,7 @@ class Photo:
     camera: Camera | None
     objects: tuple[PhotoObject, ...]
     depth: DepthImage | None = None
+    up: FloatArray | None = None
     problems: tuple[DataError, ...] = ()
 
     def read_image(self) -> npt.NDArray[np.uint8]:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from msgspec import field
 
 from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.photos.dataset import PhotoDataset
@@ -38,8 +39,6 @@ from cadalign.io.documents import (
     Point3,
     Positive,
     Text,
-    convert,
-    in_file,
 )
 from cadalign.io.files import damaged, reading
 
@@ -57,29 +56,38 @@ class _Entry(ForeignDocument):
     img_size: tuple[Positive, Positive]
     model: PathText | None = None
     mask: PathText | None = None
-    keypoints_2d: list[list[Point2]] | None = None
-    keypoints_3d: PathText | None = None
+    keypoints_2d: list[list[Point2]] | None = field(default=None, name="2d_keypoints")
+    keypoints_3d: PathText | None = field(default=None, name="3d_keypoints")
     rot_mat: tuple[Point3, Point3, Point3] | None = None
     trans_mat: Point3 | None = None
     focal_length: Positive | None = None
     bbox: tuple[Finite, Finite, Finite, Finite] | None = None
-    truncated: bool = False
-    occluded: bool = False
-    slightly_occluded: bool = False
+    # Some entries have texts.
+    truncated: bool | str = False
+    occluded: bool | str = False
+    slightly_occluded: bool | str = False
+
+    def flags(self) -> frozenset[str]:
+        named = ((flag, getattr(self, name)) for name, flag in _FLAGS.items())
+        return frozenset(flag for flag, value in named if value is True or _is_true(value))
+
+
+def _is_true(value: bool | str) -> bool:
+    return isinstance(value, str) and value.lower() == "true"
 
 
 @dataclass(frozen=True)
 class _Model:
-    """A model's files, either of which may be missing."""
+    """A model's files, either of which may be missing; they are looked for when they are read."""
 
-    mesh_path: Path | None
+    mesh_path: Path
     keypoints_path: Path | None
 
     def load_mesh(self) -> Mesh | None:
-        return None if self.mesh_path is None else load_mesh(self.mesh_path)
+        return load_mesh(self.mesh_path) if self.mesh_path.is_file() else None
 
     def load_keypoints(self) -> NamedPoints | None:
-        if self.keypoints_path is None:
+        if self.keypoints_path is None or not self.keypoints_path.is_file():
             return None
         with reading(self.keypoints_path):
             rows = self.keypoints_path.read_text(encoding="utf-8").split("\n")
@@ -122,19 +130,9 @@ class Pix3D(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         path, where = self.root / ANNOTATIONS, f"[{index}]"
-        # Names that begin with a digit are no fields.
-        fields = parse(self._entries[index], dict[str, Any], path=path, where=where)
-        for name in ("2d_keypoints", "3d_keypoints"):
-            if name in fields:
-                fields[f"keypoints_{name[:2]}"] = fields[name]
-        for name in _FLAGS:  # some entries have texts
-            fields[name] = str(fields.get(name, False)).lower() == "true"
-        with in_file(path):
-            entry: _Entry = convert(fields, _Entry, where)
+        entry: _Entry = parse(self._entries[index], _Entry, path=path, where=where)
         width, height = map(int, entry.img_size)
-        camera = Camera.without_focal(width, height)
-        if entry.focal_length is not None:
-            camera = camera.with_focal(entry.focal_length / _SENSOR * width)
+        camera = _camera(width, height, entry.focal_length)
         shown = PhotoObject(
             object_id="0",
             category=entry.category,
@@ -143,7 +141,7 @@ class Pix3D(PhotoDataset):
             model=self._model(entry),
             mask_path=None if entry.mask is None else existing(self.root / entry.mask),
             bbox=None if entry.bbox is None else np.array(entry.bbox) - PIXEL_CENTRE,
-            flags=frozenset(flag for name, flag in _FLAGS.items() if getattr(entry, name)),
+            flags=entry.flags(),
         )
         return Photo(self.names[index], existing(self.root / entry.img), camera, (shown,))
 
@@ -151,17 +149,22 @@ class Pix3D(PhotoDataset):
         if entry.model is None:
             return None
         keypoints = None if entry.keypoints_3d is None else self.root / entry.keypoints_3d
-        files = _Model(
-            existing(self.root / entry.model), None if keypoints is None else existing(keypoints)
-        )
-        return CadModel(entry.model, files)
+        return CadModel(entry.model, _Model(self.root / entry.model, keypoints))
+
+
+@lru_cache(maxsize=64)
+def _camera(width: int, height: int, focal_length: float | None) -> Camera:
+    """The camera of an image of this size, and of a focal length [mm] where it is known."""
+    camera = Camera.without_focal(width, height)
+    return camera if focal_length is None else camera.with_focal(focal_length / _SENSOR * width)
 
 
 def _truth(entry: _Entry) -> Truth:
     if entry.rot_mat is None or entry.trans_mat is None:
         return Truth()
     rotation = _PIX3D_AXES[:, None] * nearest_rotation(np.array(entry.rot_mat))
-    return Truth(Alignment(rotation, _PIX3D_AXES * entry.trans_mat, np.ones(3)))
+    shift = _PIX3D_AXES * entry.trans_mat
+    return Truth(Alignment(rotation, shift, np.ones(3), is_valid=True))
 
 
 def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
@@ -175,6 +178,7 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     rows = np.flatnonzero(is_marked.any(axis=0))
     if not len(rows):
         return None
-    mean = [given[is_marked[:, row], row].mean(axis=0) - PIXEL_CENTRE for row in rows]
+    marked = np.where(is_marked[:, :, None], given, 0.0)[:, rows]
+    mean = marked.sum(axis=0) / is_marked[:, rows].sum(axis=0)[:, None] - PIXEL_CENTRE
     names = tuple(str(row) for row in rows)
-    return PhotoKeypoints(np.array(mean), names, np.ones(len(rows), dtype=bool))
+    return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,7 +35,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
-from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
 
 FULL = "full_annotations.json"
@@ -43,12 +44,6 @@ _SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
 _FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
 _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
 _MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
-_FOLDS: dict[str, int | None] = {
-    "__SYM_NONE": 1,
-    "__SYM_ROTATE_UP_2": 2,
-    "__SYM_ROTATE_UP_4": 4,
-    "__SYM_ROTATE_UP_INF": None,
-}
 _UP = (0.0, 1.0, 0.0)
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
@@ -145,6 +140,7 @@ class Scan2CAD(PhotoDataset):
         folder, self.annotations = _annotation_file(Path(root))
         self._entries = read_list(self.annotations)
         frames = [folder / name for name in _FRAME_FOLDERS] if scannet is None else [Path(scannet)]
+        self._frame_folders = frames
         models = [folder / name for name in _MODEL_FOLDERS]
         self._models = models if shapenet is None else [Path(shapenet)]
         self._records: list[_Record] = []
@@ -167,12 +163,27 @@ class Scan2CAD(PhotoDataset):
                 fix="give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)",
             )
 
+    def with_annotations(self, path: str | os.PathLike[str]) -> Scan2CAD:
+        """Open a file of annotations, such as an estimate's, on the frames of this data set.
+
+        Raises
+        ------
+        DataError
+            If it cannot be read, or there is no frame of its scans.
+        """
+        *others, last = self._frame_folders
+        for folder in others:
+            with suppress(DataError):
+                return Scan2CAD(path, scannet=folder)
+        return Scan2CAD(path, scannet=last)
+
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         record = self._records[index]
         scan = self._parse(record.entry, self._entries[record.entry], _Scan)
         camera = record.frame.camera()
-        cam_from_world = record.frame.cam_from_scan() @ _inverse(scan.trs.alignment())
+        cam_from_scan = record.frame.cam_from_scan()
+        cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
@@ -182,7 +193,9 @@ class Scan2CAD(PhotoDataset):
             scan.aligned_models, read_object, where=f"{self.annotations}, {self.names[index]}"
         )
         image = record.frame.image_path
-        return Photo(self.names[index], image, camera, objects, problems=problems)
+        # Scans are upright: z points up.
+        up = cam_from_scan.rotation[:, 2]
+        return Photo(self.names[index], image, camera, objects, up=up, problems=problems)
 
     def _parse(self, number: int, entry: Raw, kind: Any) -> Any:
         return parse(entry, kind, path=self.annotations, where=f"[{number}]")
@@ -198,8 +211,8 @@ def _object(
     """An object of the scan as a photo shows it; None where its box is not in the image."""
     world_from_model = found.trs.alignment()
     cam_from_model = cam_from_world @ world_from_model
-    if found.sym not in _FOLDS:
-        known = ", ".join(_FOLDS)
+    if found.sym not in SCAN2CAD_FOLDS:
+        known = ", ".join(SCAN2CAD_FOLDS)
         raise InputError(f"{quote(found.sym)} is no symmetry", where="sym", fix=f"known: {known}")
     center = np.array(found.center or (0.0, 0.0, 0.0))
     bounds = box = bbox = None
@@ -218,7 +231,7 @@ def _object(
         truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
         keypoints=keypoints,
         model=CadModel(found.id_cad, ModelFiles(mesh, points), bounds=bounds),
-        symmetry=Symmetry.around(_UP, fold=_FOLDS[found.sym], offset=center),
+        symmetry=Symmetry.around(_UP, fold=SCAN2CAD_FOLDS[found.sym], offset=center),
         bbox=bbox,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import hashlib
 import json
 import os
 import tempfile
@@ -79,6 +80,7 @@ def write_sample_dataset(
     per_category: int = 12,
     categories: Sequence[str] | None = None,
     seed: int = 0,
+    keep: bool = False,
 ) -> Path:
     """Write the sample data set in KeypointNet's layout.
 
@@ -93,6 +95,9 @@ def write_sample_dataset(
         nothing else: that is replaced.
     per_category, categories, seed
         As of `sample_models`.
+    keep : bool
+        Leave the data set as it is where this version has written it with the same arguments, and
+        none of its files has gone or changed its size.
 
     Returns
     -------
@@ -109,6 +114,9 @@ def write_sample_dataset(
     target = Path(root)
     names = _check_arguments(per_category, categories, seed)
     _check_replaceable(target)
+    marker = _marker(names, per_category, seed)
+    if keep and _is_whole(target, marker):
+        return target
     with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         # Not a plain folder name beside it: two runs at once must not share one.
@@ -118,6 +126,8 @@ def write_sample_dataset(
             data = Path(folder, "data")
             data.mkdir()
             _write(data, names, per_category, seed)
+            text = json.dumps({**marker, "bytes": _size(data)})
+            (data / _MARKER).write_text(f"{text}\n", encoding="utf-8")
             if target.exists():
                 target.rename(Path(folder, "replaced"))
             data.rename(target)
@@ -173,9 +183,35 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
     for split, lines in splits.items():
         path = root / "splits" / f"{split}.txt"
         path.write_text("".join(lines), encoding="utf-8", newline="\n")
-    arguments = {"categories": list(names), "per_category": int(per_category), "seed": int(seed)}
-    marker = {"made_by": "cadalign.datasets.sample", **arguments}
-    (root / _MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
+
+
+def _marker(names: Sequence[str], per_category: int, seed: int) -> dict[str, Any]:
+    """Origin of the files of a data set: the arguments, and the code that makes them."""
+    code = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        code.update(path.read_bytes())
+    return {
+        "made_by": "cadalign.datasets.sample",
+        "categories": list(names),
+        "per_category": int(per_category),
+        "seed": int(seed),
+        "code": code.hexdigest(),
+    }
+
+
+def _is_whole(root: Path, marker: dict[str, Any]) -> bool:
+    """True for a data set that was written with this marker, and whose files have their size."""
+    try:
+        found = json.loads((root / _MARKER).read_text(encoding="utf-8"))
+        return bool(found == {**marker, "bytes": _size(root)})
+    except (OSError, ValueError):
+        return False
+
+
+def _size(root: Path) -> int:
+    """Bytes of all files of a data set but its marker."""
+    files = (path for path in root.rglob("*") if path.is_file() and path.name != _MARKER)
+    return sum(path.stat().st_size for path in files)
 
 
 def _annotation(model: SampleModel) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, brief, quote
-from cadalign.geometry.camera import COLMAP_PARAMS
+from cadalign.geometry.camera_form import COLMAP_PARAMS
 from cadalign.io.files import damaged, reading
 
 INVALID_POINT = -1

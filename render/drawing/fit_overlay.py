@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets import load_mesh
+from cadalign.datasets.meshes.load import load_mesh
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
-from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.frame import LIGHT_GREY, check_image_size
 
 
@@ -26,9 +26,9 @@ def draw_observation(observation: Observation, result: FitResult) -> ByteImage:
     return draw_overlay(
         photo_of(observation, camera),
         camera,
-        est_box=Box.from_model(_bounds(observation), result.alignment),
+        est_box=Box.from_model(_bounds(observation, result), result.alignment),
         observed=observation.points_2d,
-        reprojected=camera.project_where_ahead(result.alignment.apply(observation.points_3d)),
+        reprojected=camera.project_where_ahead(result.alignment.apply(result.points_3d)),
     )
 
 
@@ -40,8 +40,8 @@ def photo_of(observation: ObservedImage, camera: Camera) -> ByteImage:
     return read_image(observation.image, camera)
 
 
-def _bounds(observation: Observation) -> FloatArray:
+def _bounds(observation: Observation, result: FitResult) -> FloatArray:
     if observation.model is not None:
         return load_mesh(observation.model).bounds
-    points = observation.points_3d
+    points = result.points_3d
     return np.array([points.min(axis=0), points.max(axis=0)])

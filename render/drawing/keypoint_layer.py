@@ -140,4 +140,4 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
 
 def _finite(points: FloatArray) -> FloatArray:
     """The rows that are finite, those behind the camera left out."""
-    return np.asarray(points[np.isfinite(points).reshape(len(points), -1).all(axis=1)])
+    return np.asarray(points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))])

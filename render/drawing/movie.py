@@ -1,14 +1,16 @@
-"""Contact sheets, and movies that need no program beside OpenCV."""
+"""Contact sheets, and movies: H.264, VP9 or GIF."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -16,8 +18,12 @@ from cadalign.errors import InputError, RenderError
 from cadalign.io.files import write_whole
 from cadalign.render.drawing.color import ByteImage
 
-# Browsers play VP9; MPEG-4 part 2 is what every build of OpenCV can write.
-_CODECS = ("vp09", "mp4v")
+if TYPE_CHECKING:
+    from av import VideoStream
+
+MOVIES = (".mp4", ".webm", ".gif")
+"""Endings of the movies that `write_movie` writes."""
+_CODECS = ((".mp4", "libx264"), (".webm", "libvpx-vp9"))
 _TEXT = (70, 76, 84)
 
 
@@ -70,15 +76,15 @@ def contact_sheet(
 
 
 def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fps: float) -> int:
-    """Write an MP4 file.
+    """Write a movie: H.264 as ``.mp4``, VP9 as ``.webm``, or an animated ``.gif``.
 
     Parameters
     ----------
     path : str or path-like
     frames : iterable of (h, w, 3) uint8
-        All of one size; an odd row or column is doubled, since video has none.
+        All of one size; in a video an odd row or column is doubled, since it has none.
     fps : float
-        Frames a second.
+        Frames a second; a GIF rounds their duration to 10 ms.
 
     Returns
     -------
@@ -90,45 +96,80 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
     DataError
         If the file cannot be written.
     InputError
-        If there are no frames or they differ in size.
+        If there are no frames, they differ in size, or the ending is another.
     RenderError
-        If this build of OpenCV has no encoder.
+        If this build of PyAV has no encoder.
     """
     path = Path(path)
-    writer, count, shape = None, 0, None
-    # The encoder reports nothing about what it cannot write, so the file is moved when it is done.
+    ending = path.suffix.lower()
+    if ending not in MOVIES:
+        fix = f"give a name that ends in {', '.join(MOVIES)}"
+        raise InputError(f"{path.name} is no movie", where="path", fix=fix)
+    write = _write_gif if ending == ".gif" else _write_video
+    # Encoders report little about what they cannot write, so the file is moved when it is done.
     with tempfile.TemporaryDirectory() as folder:
-        draft = Path(folder) / "movie.mp4"
-        try:
-            for image in frames:
-                if writer is None:
-                    shape = image.shape
-                    writer = _open_writer(draft, image, fps)
-                if image.shape != shape:
-                    raise InputError(f"frame {count} is {image.shape}, not {shape}", where="frames")
-                writer.write(_even(image)[:, :, ::-1].copy())
-                count += 1
-        finally:
-            if writer is not None:
-                writer.release()
+        draft = Path(folder) / f"movie{ending}"
+        count = write(draft, _checked(frames), fps)
         if not count:
             raise InputError("no frames are given", where="frames")
         write_whole(path, lambda unfinished: shutil.copyfile(draft, unfinished))
     return count
 
 
-def _open_writer(path: Path, image: ByteImage, fps: float) -> cv2.VideoWriter:
-    height, width = _even(image).shape[:2]
-    for codec in _CODECS:
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, (width, height))
-        if writer.isOpened():
-            return writer
-        writer.release()
-    raise RenderError(
-        "OpenCV cannot encode video here",
-        where=str(path),
-        fix="install opencv-python-headless from PyPI, or write a PNG",
+def _checked(frames: Iterable[ByteImage]) -> Iterator[ByteImage]:
+    """The frames, all of the first one's shape."""
+    shape = None
+    for number, image in enumerate(frames):
+        shape = image.shape if shape is None else shape
+        if image.shape != shape:
+            raise InputError(f"frame {number} is {image.shape}, not {shape}", where="frames")
+        yield image
+
+
+def _write_gif(path: Path, frames: Iterator[ByteImage], fps: float) -> int:
+    """Write an endless GIF; returns the number of frames."""
+    first = next(frames, None)
+    if first is None:
+        return 0
+    rest = [Image.fromarray(image).quantize(256) for image in frames]
+    Image.fromarray(first).quantize(256).save(
+        path,
+        save_all=True,
+        append_images=rest,
+        duration=max(20, 10 * round(100 / fps)),  # browsers slow down what is faster
+        loop=0,
     )
+    return 1 + len(rest)
+
+
+def _write_video(path: Path, frames: Iterator[ByteImage], fps: float) -> int:
+    """Write a video that browsers play; returns the number of frames."""
+    first = next(frames, None)
+    if first is None:
+        return 0
+    import av  # on first use: it brings FFmpeg with it
+
+    height, width = _even(first).shape[:2]
+    codec = next((name for ending, name in _CODECS if ending == path.suffix), None)
+    if codec is None or codec not in av.codecs_available:
+        raise RenderError(
+            "PyAV cannot encode video here",
+            where=str(path),
+            fix="install av from PyPI, or write a GIF or PNG",
+        )
+    count = 0
+    options = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
+    with av.open(str(path), "w", options=options) as container:
+        rate = Fraction(fps).limit_denominator(1001)
+        stream = cast("VideoStream", container.add_stream(codec, rate=rate))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": "20" if path.suffix == ".mp4" else "30", "b": "0"}
+        for image in chain([first], frames):
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(_even(image)), format="rgb24")
+            container.mux(stream.encode(picture))
+            count += 1
+        container.mux(stream.encode())
+    return count
 
 
 def _even(image: ByteImage) -> ByteImage:

@@ -16,7 +16,15 @@ from cadalign.geometry.projection import perspective
 from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.keypoint_layer import KeypointMarks
-from cadalign.render.drawing.model_layer import TRANSLUCENT, check_model_style, draw_lines, veil
+from cadalign.render.drawing.model_layer import (
+    SHADED,
+    TRANSLUCENT,
+    VEIL_OPACITY,
+    check_model_style,
+    draw_lines,
+    shade,
+    veil,
+)
 from cadalign.render.frame import LIGHT_GREY, Geometry, check_image_size
 from cadalign.render.views.lens_field import within_lens_field
 
@@ -53,12 +61,14 @@ def draw_overlay(
     gt_box: Box | None = None,
     est_box: Box | None = None,
     est_frame: Geometry | None = None,
-    model_style: str = "translucent",
+    model_style: str = TRANSLUCENT,
+    model_opacity: float = VEIL_OPACITY,
+    model_lines: bool = True,
     observed: npt.ArrayLike | None = None,
     reprojected: npt.ArrayLike | None = None,
     unseen: npt.ArrayLike | None = None,
     regions: npt.ArrayLike | None = None,
-    axes: bool = True,
+    axes: bool | Box = True,
     legend: bool = True,
 ) -> ByteImage:
     """Draw an alignment over its image.
@@ -81,7 +91,12 @@ def draw_overlay(
     est_frame : Geometry, optional
         The predicted model as a renderer or `cast_geometry` gives it for this camera.
     model_style : str
-        How to show it: ``translucent``, with its edges, or ``lines`` for the edges alone.
+        How to show it: ``shaded``, in its own colours, ``translucent``, as a red veil, or
+        ``lines`` for outline and edges alone.
+    model_opacity : float
+        Of the model where it is no mere lines, 0 to 1.
+    model_lines : bool
+        Whether to draw its outline and edges.
     observed, reprojected : (k, 2) float, optional
         Keypoints [px]; if both are given they belong together, row by row. Reprojected ones that
         are not finite, behind the camera, are left out.
@@ -90,8 +105,10 @@ def draw_overlay(
     regions : (r, j, 2) float, optional
         Outlines of regions that hold keypoints [px]; see
         `cadalign.render.drawing.keypoint_layer.confidence_regions`.
-    axes, legend : bool
-        Whether to draw these.
+    axes : bool or Box
+        Whether to draw the axes, or the box to draw them in.
+    legend : bool
+        Whether to draw it.
 
     Returns
     -------
@@ -115,18 +132,21 @@ def draw_overlay(
     check_image_size(camera)
     pixels = _as_rgb(image, camera)
     if est_frame is not None:
-        check_model_style(est_frame, pixels, model_style)
-        if model_style == TRANSLUCENT:
-            pixels = veil(pixels, est_frame, EST_COLOR)
+        check_model_style(est_frame, pixels, model_style, model_opacity)
+        if model_style == SHADED:
+            pixels = shade(pixels, est_frame, model_opacity)
+        elif model_style == TRANSLUCENT:
+            pixels = veil(pixels, est_frame, EST_COLOR, model_opacity)
     canvas = Canvas(pixels)
-    if est_frame is not None:
+    if est_frame is not None and model_lines:
         draw_lines(canvas, est_frame, EST_COLOR)
     marks = KeypointMarks.checked(observed, reprojected, unseen, regions)
     strokes: list[_Stroke] = []
     for box, color in ((gt_box, GT_COLOR), (est_box, EST_COLOR)):
         if box is not None:
             strokes += _edge_strokes(box, color, camera)
-    main_box = est_box if est_box is not None else gt_box
+    main_box = axes if isinstance(axes, Box) else est_box if est_box is not None else gt_box
+    has_axes = bool(axes) and main_box is not None
     if axes and main_box is not None:
         strokes += _axis_strokes(main_box, camera)
     strokes = [replace(stroke, points=canvas.place(stroke.points)) for stroke in strokes]
@@ -134,7 +154,7 @@ def draw_overlay(
     _draw_strokes(canvas, strokes)
     marks.draw(canvas)
     predicted = est_box is not None or est_frame is not None
-    entries = _legend_entries(gt_box, predicted, axes=axes and main_box is not None)
+    entries = _legend_entries(gt_box, predicted, axes=has_axes)
     entries += marks.legend
     if legend and entries:
         canvas.legend(entries, keep_clear=np.concatenate([_drawn_pixels(strokes), marks.pixels]))

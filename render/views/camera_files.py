@@ -1,21 +1,12 @@
-"""Reading and writing cameras as other programs do: Open3D, COLMAP, and NeRF's transforms.json.
+"""Cameras of other programs read: Open3D, COLMAP, and NeRF's transforms.json.
 
-Each program has its own axes, pixel origin and direction of transforms; none of that gets past this
-module.
-
-- Open3D's `PinholeCameraParameters` (and `PinholeCameraTrajectory`): OpenCV's axes, ``extrinsic``
-  is camera from world, matrices are written column by column, the top-left pixel's centre is
-  (0, 0): the viewer's principal point is ``(width - 1) / 2``. No lens distortion.
-- COLMAP: OpenCV's axes, camera from world, that centre is (0.5, 0.5), quaternions are wxyz.
-- ``transforms.json`` (instant-ngp, nerfstudio): OpenGL's axes, world from camera, the centre is
-  (0.5, 0.5) as in COLMAP, from which these files mostly come.
+The axes, pixel origins and directions of transforms are those of `cadalign.export.camera_files`,
+whose writers are found here, too.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,17 +15,21 @@ from msgspec import Meta
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, InputError
+from cadalign.export.camera_files import (
+    OPEN3D_TRAJECTORY,
+    OPEN3D_VIEW,
+    CameraView,
+    write_colmap,
+    write_nerf,
+    write_open3d,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
-from cadalign.geometry.rotations import quat_wxyz_from_rotation
+from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
-from cadalign.io.files import write_json, write_text, writing
 
-_OPEN3D_VIEW = "PinholeCameraParameters"
-_OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
-_VERSION = {"version_major": 1, "version_minor": 0}
-_NERF_DISTORTION = ("k1", "k2", "p1", "p2")
+__all__ = ["CameraView", "read_camera_views", "write_colmap", "write_nerf", "write_open3d"]
+
 _Angle = Annotated[float, Meta(gt=0, lt=np.pi)]
 
 
@@ -80,24 +75,6 @@ class _NerfFile(ForeignDocument):
     frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
 
 
-@dataclass(frozen=True, eq=False)
-class CameraView:
-    """A camera and where it stands.
-
-    Parameters
-    ----------
-    camera : Camera
-    cam_from_world : Alignment
-        Its pose, with all scales 1.
-    name : str
-        The image's name; empty where the file has none.
-    """
-
-    camera: Camera
-    cam_from_world: Alignment
-    name: str = ""
-
-
 def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     """Read cameras and poses from an Open3D or NeRF JSON file, or the folder of a COLMAP model."""
     path = Path(path)
@@ -113,75 +90,15 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
         return _views_of(data)
 
 
-def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
-    """Write one view as `PinholeCameraParameters`, several as a `PinholeCameraTrajectory`.
-
-    Refused are lens distortion, which these files have no place for, and poses with a scale.
-    """
-    _require_views(views)
-    entries = [_open3d_entry(view, number) for number, view in enumerate(views)]
-    data: dict[str, Any] = entries[0]
-    if len(entries) > 1:
-        data = {"class_name": _OPEN3D_TRAJECTORY, "parameters": entries, **_VERSION}
-    write_json(Path(path), data)
-
-
-def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
-    """Write ``transforms.json``; what all cameras share stands at the top.
-
-    Refused are lenses of more coefficients than k1, k2, p1, p2, and poses with a scale.
-    """
-    _require_views(views)
-    cameras = [_nerf_camera(view.camera, number) for number, view in enumerate(views)]
-    shared = {k: v for k, v in cameras[0].items() if all(camera[k] == v for camera in cameras)}
-    frames = []
-    for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
-        own = {key: value for key, value in camera.items() if key not in shared}
-        pose = np.linalg.inv(opengl_from_model(_rigid(view, number)))
-        frames.append({"file_path": view.name, **own, "transform_matrix": pose.tolist()})
-    write_json(Path(path), {**shared, "frames": frames})
-
-
-def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
-
-    Cameras that are equal are written once. Refused are poses with a scale, and names that are
-    missing, hold a line break or occur twice.
-    """
-    _require_views(views)
-    names = [view.name for view in views]
-    if len(set(names)) < len(names) or any(not n or "\n" in n or n != n.strip() for n in names):
-        raise InputError("every view needs an image name of its own", where="views")
-    numbers: dict[Camera, int] = {}
-    images = []
-    for number, view in enumerate(views, start=1):
-        camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
-        pose = _rigid(view, number - 1)
-        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
-        text = " ".join(f"{value:.17g}" for value in values)
-        images.append(f"{number} {text} {camera_id} {view.name}\n\n")
-    cameras = []
-    for camera, camera_id in numbers.items():
-        entry = camera.to_dict()
-        params = " ".join(f"{value:.17g}" for value in entry["params"])
-        cameras.append(f"{camera_id} {entry['model']} {camera.width} {camera.height} {params}\n")
-    folder = Path(folder)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "cameras.txt", "".join(cameras))
-    write_text(folder / "images.txt", "".join(images))
-    write_text(folder / "points3D.txt", "")
-
-
 def _views_of(data: Any) -> list[CameraView]:
     """The cameras of a parsed Open3D or NeRF file."""
     fields = data if isinstance(data, dict) else {}
     if "frames" in fields:
         return _nerf_views(fields)
-    if fields.get("class_name") == _OPEN3D_TRAJECTORY:
+    if fields.get("class_name") == OPEN3D_TRAJECTORY:
         views = convert(fields, _Open3dTrajectory).parameters
         return [_open3d_view(view, f"parameters[{n}]") for n, view in enumerate(views)]
-    if fields.get("class_name") == _OPEN3D_VIEW or {"extrinsic", "intrinsic"} <= fields.keys():
+    if fields.get("class_name") == OPEN3D_VIEW or {"extrinsic", "intrinsic"} <= fields.keys():
         return [_open3d_view(convert(fields, _Open3dView), "")]
     raise DataError(
         "not a camera file that is known",
@@ -200,26 +117,6 @@ def _open3d_view(view: _Open3dView, where: str) -> CameraView:
         size, focal = (view.intrinsic.width, view.intrinsic.height), (matrix[0, 0], matrix[1, 1])
         camera = Camera(*size, *focal, matrix[0, 2], matrix[1, 2])
         return CameraView(camera, Alignment(extrinsic[:3, :3], extrinsic[:3, 3], np.ones(3)))
-
-
-def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
-    camera = view.camera
-    if camera.distortion:
-        raise InputError(
-            "Open3D's camera files have no place for lens distortion",
-            where=f"views[{number}]",
-            fix="undistort the image and give its camera, or write another format",
-        )
-    return {
-        "class_name": _OPEN3D_VIEW,
-        "extrinsic": _rigid(view, number).cam_from_model.T.ravel().tolist(),
-        "intrinsic": {
-            "height": camera.height,
-            "intrinsic_matrix": camera.matrix.T.ravel().tolist(),
-            "width": camera.width,
-        },
-        **_VERSION,
-    }
 
 
 # NeRF
@@ -265,40 +162,6 @@ def _camera_from_nerf(frame: _NerfFrame) -> Camera:
         cy=(height / 2 if frame.cy is None else frame.cy) - PIXEL_CENTRE,
         distortion=(frame.k1 or 0.0, frame.k2 or 0.0, frame.p1 or 0.0, frame.p2 or 0.0),
     )
-
-
-def _nerf_camera(camera: Camera, number: int) -> dict[str, Any]:
-    if any(camera.distortion[4:]):
-        what = "transforms.json has no place for more than k1, k2, p1, p2"
-        raise InputError(what, where=f"views[{number}]")
-    coefficients = camera.distortion[:4] or (0.0,) * 4
-    return {
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx + PIXEL_CENTRE,
-        "cy": camera.cy + PIXEL_CENTRE,
-        **dict(zip(_NERF_DISTORTION, coefficients, strict=True)),
-    }
-
-
-# All of them
-
-
-def _require_views(views: Sequence[CameraView]) -> None:
-    if not views:
-        raise InputError("give at least one view", where="views")
-
-
-def _rigid(view: CameraView, number: int) -> Alignment:
-    if (view.cam_from_world.scale != 1).any():
-        raise InputError(
-            f"the pose has the scale {view.cam_from_world.scale.tolist()}",
-            where=f"views[{number}]",
-            fix="camera files hold rigid poses: stretch the model and give the pose with scale 1",
-        )
-    return view.cam_from_world
 
 
 def _matrix(value: list[Any], size: int, where: str) -> FloatArray:

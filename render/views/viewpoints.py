@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points
-from cadalign.errors import InputError, RenderError
+from cadalign.errors import InputError, RenderError, TooFewVisibleError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -137,8 +137,8 @@ def sample_view(
 
     Raises
     ------
-    RenderError
-        If no view shows enough keypoints; it says how many the best one showed.
+    TooFewVisibleError
+        A RenderError, if no view shows enough keypoints; it says how many the best one showed.
     InputError
         If an argument is out of its range.
     """
@@ -162,7 +162,7 @@ def sample_view(
             return Viewpoint(cam_from_model=pose, visible=visible)
         best = max(best, int(visible.sum()))
     found = f"the best of {attempts} views shows {best}" if attempts else "there are no more"
-    raise RenderError(
+    raise TooFewVisibleError(
         f"{min_visible} of {len(points)} keypoints should be visible, but {found}",
         where=scene.mesh.source,
         fix="lower min_visible, widen the range of elevations, or leave this model out",

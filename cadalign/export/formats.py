@@ -1,0 +1,288 @@
+"""The export formats, by name and by the endings of their files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cadalign.errors import DataError, InputError, quote
+from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame
+from cadalign.geometry.alignment import Alignment
+from cadalign.io.documents import written_path
+from cadalign.io.files import printable, refuse_nul
+
+if TYPE_CHECKING:
+    from cadalign.export.camera_files import CameraView
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Options of an export; each format takes those that it has a place for.
+
+    Parameters
+    ----------
+    frame : {"camera", "rig", "world", "model"}
+        Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
+        motion share, the world, or the stretched model's own.
+    scene_id : int
+        The scene's number, of BOP's files.
+    object_id : int
+        The model's number, of BOP's files.
+    image_id : int, optional
+        The first photo's number, of BOP's files; by default that of its file's name, or else 0.
+    scan_id : str
+        The scan, of Scan2CAD's files.
+    category_id : str
+        The model's synset, of Scan2CAD's files.
+    """
+
+    frame: Frame = "camera"
+    scene_id: int = 1
+    image_id: int | None = None
+    object_id: int = 1
+    scan_id: str = "scene0000_00"
+    category_id: str = "00000000"
+
+    def __post_init__(self) -> None:
+        if self.frame not in FRAMES:
+            fix = f"known are {', '.join(FRAMES)}"
+            raise InputError(f"unknown frame {quote(self.frame)}", where="frame", fix=fix)
+        for name in ("scene_id", "image_id", "object_id"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, int) and value >= 0):
+                raise InputError(f"{quote(value)} is not a whole number from 0", where=name)
+
+
+Writer = Callable[[Path, AlignedObject, ExportOptions], object]
+
+
+@dataclass(frozen=True)
+class Format:
+    """An export format.
+
+    Parameters
+    ----------
+    about : str
+        What is written.
+    write : callable
+        Writes a path, an object and the options.
+    endings : tuple of str
+        Endings of file names that mean this format; a whole name where it has no dot in front.
+    is_folder : bool
+        The path is a folder.
+    """
+
+    about: str
+    write: Writer
+    endings: tuple[str, ...] = ()
+    is_folder: bool = False
+
+
+def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.glb import write_glb
+
+    write_glb(path, exported, frame=options.frame)
+
+
+def _usd(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.usd import write_usd
+
+    write_usd(path, exported, frame=options.frame)
+
+
+def _obj(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.mesh_files import write_obj
+
+    write_obj(path, exported, frame=options.frame)
+
+
+def _ply(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.mesh_files import write_ply
+
+    write_ply(path, exported, frame=options.frame)
+
+
+def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.line_set import write_line_set
+
+    write_line_set(path, exported, frame=options.frame)
+
+
+def _bop_results(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.bop import bop_poses, write_bop_model, write_bop_results
+
+    poses = bop_poses(
+        exported,
+        scene_id=options.scene_id,
+        image_id=options.image_id,
+        object_id=options.object_id,
+    )
+    write_bop_model(path.parent, exported, object_id=options.object_id)
+    write_bop_results(path, poses)
+
+
+def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.bop import TRUTH_FILE, write_bop_scene
+
+    write_bop_scene(
+        path.parent if path.name == TRUTH_FILE else path,
+        exported,
+        scene_id=options.scene_id,
+        image_id=options.image_id,
+        object_id=options.object_id,
+    )
+
+
+def _scan2cad(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.scan2cad import write_scan2cad
+
+    write_scan2cad(
+        path,
+        exported,
+        frame=options.frame,
+        scan_id=options.scan_id,
+        category_id=options.category_id,
+    )
+
+
+def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.camera_files import write_nerf
+
+    placed = _camera_views(exported, options)
+    names = [
+        written_path(each.image, folder=path.parent) if isinstance(each.image, Path) else view.name
+        for each, view in zip(exported.views, placed, strict=True)
+    ]
+    write_nerf(path, [replace(view, name=name) for view, name in zip(placed, names, strict=True)])
+
+
+def _colmap(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.camera_files import write_colmap
+
+    write_colmap(path, _camera_views(exported, options))
+
+
+def _open3d(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.camera_files import write_open3d
+
+    write_open3d(path, _camera_views(exported, options))
+
+
+def _coco(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.coco import write_coco
+
+    write_coco(path, exported)
+
+
+def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[CameraView]:
+    from cadalign.export.camera_files import CameraView
+
+    views = []
+    for number, view in enumerate(exported.views):
+        frame_from_cam = exported.frame_from_cam(options.frame, number)
+        pose = np.asarray(np.linalg.inv(frame_from_cam), dtype=np.float64)
+        pose[:3, 3] *= exported.metres
+        placed = Alignment(pose[:3, :3], pose[:3, 3], np.ones(3))
+        views.append(CameraView(view.camera, placed, view.image_name or f"{number}.png"))
+    return views
+
+
+FORMATS: dict[str, Format] = {
+    "glb": Format("textured model, cameras and photos, for viewers", _glb, (".glb",)),
+    "usd": Format("the same as USD", _usd, (".usdz", ".usda", ".usdc", ".usd")),
+    "obj": Format("the mesh, with materials and textures", _obj, (".obj",)),
+    "ply": Format("the mesh, with vertex colours", _ply, (".ply",)),
+    "lines": Format("box and cameras as Open3D's line set (PLY)", _lines, (".lines.ply",)),
+    "bop-results": Format(
+        "BOP's result CSV, the stretched mesh beside it", _bop_results, (".csv",)
+    ),
+    "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",), is_folder=True),
+    "scan2cad": Format("Scan2CAD's JSON, the stretch as scale", _scan2cad, ("annotations.json",)),
+    "nerfstudio": Format("cameras as transforms.json", _nerf, ("transforms.json",)),
+    "colmap": Format("cameras as COLMAP's text files", _colmap, is_folder=True),
+    "open3d-camera": Format("cameras as Open3D's JSON", _open3d, ("camera.json",)),
+    "coco": Format("keypoints in the photos", _coco, (".coco.json", "keypoints.json")),
+}
+"""The formats by name."""
+
+
+def format_of(path: str | os.PathLike[str]) -> str:
+    """Name of the format that a path's ending means; the longest ending counts.
+
+    Raises
+    ------
+    InputError
+        If none has this ending, as a plain ``.json``.
+
+    Examples
+    --------
+    >>> format_of("chair.glb"), format_of("out/transforms.json"), format_of("chair.lines.ply")
+    ('glb', 'nerfstudio', 'lines')
+    """
+    name = Path(path).name.lower()
+    found = [
+        (len(ending), key)
+        for key, each in FORMATS.items()
+        for ending in each.endings
+        if name.endswith(ending)
+    ]
+    if found:
+        return max(found)[1]
+    known = "; ".join(
+        f"{key} ({', '.join(each.endings) or 'folder'})" for key, each in FORMATS.items()
+    )
+    raise InputError(
+        "the name does not tell the format",
+        where=printable(Path(path)),
+        fix=f"give the format: {known}",
+    )
+
+
+def export_object(
+    path: str | os.PathLike[str],
+    exported: AlignedObject,
+    *,
+    format: str | None = None,
+    options: ExportOptions | None = None,
+) -> Path:
+    """Write an aligned object for another tool.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, or for a format of several files their folder; folders above it are made.
+    exported : AlignedObject
+    format : str, optional
+        One of `FORMATS`; by default what the path's ending means.
+    options : ExportOptions, optional
+
+    Returns
+    -------
+    Path
+        What was written.
+
+    Raises
+    ------
+    InputError
+        If the format or frame is not known, or the object lacks what the format needs.
+    DataError
+        If a photo cannot be read, or the file cannot be written.
+    """
+    path = Path(path)
+    refuse_nul(path)
+    name = format_of(path) if format is None else format
+    if name not in FORMATS:
+        fix = f"known are {', '.join(FORMATS)}"
+        raise InputError(f"unknown format {quote(name)}", where="format", fix=fix)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"the folder cannot be made ({reason})", where=str(path.parent)) from None
+    FORMATS[name].write(path, exported, options or ExportOptions())
+    return path

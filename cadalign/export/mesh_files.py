@@ -1,0 +1,120 @@
+"""The aligned mesh as OBJ, with materials and textures, or PLY."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.export.aligned_object import AlignedObject, Frame
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import write_text, write_whole
+from cadalign.io.images import write_image
+
+
+def write_obj(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
+    """Write the mesh, stretched and placed, as OBJ, with its materials as MTL and PNG beside it.
+
+    Faces keep their order and polygons their corners' texture coordinates; vertex colours follow
+    the coordinates, as MeshLab reads them. Lengths are metres by `AlignedObject.metres`.
+
+    Raises
+    ------
+    InputError
+        If there is no mesh, or the frame is not known.
+    """
+    mesh = mesh_in_metres(exported, frame)
+    library = path.with_suffix(".mtl")
+    names = [f"material_{number}" for number in range(len(mesh.materials))]
+    lines = [f"mtllib {library.name}", *_vertex_lines(mesh)]
+    uv_rows = None
+    if mesh.corner_uv is not None and any(each.texture is not None for each in mesh.materials):
+        distinct, rows = np.unique(mesh.corner_uv.reshape(-1, 2), axis=0, return_inverse=True)
+        uv_rows = rows.reshape(-1, 3) + 1
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in distinct.tolist()]
+    lines += _face_lines(mesh, names, uv_rows)
+    write_text(library, "\n".join(_material_lines(mesh, names, path)) + "\n")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_ply(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
+    """Write the mesh, stretched and placed, as binary PLY with colours of its vertices.
+
+    A surface without vertex colours has its materials'; PLY has no textures.
+
+    Raises
+    ------
+    InputError
+        If there is no mesh, or the frame is not known.
+    """
+    write_mesh_as_ply(path, mesh_in_metres(exported, frame))
+
+
+def write_mesh_as_ply(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as binary PLY, its faces in their order."""
+    colors = np.round(255 * _vertex_colors(mesh)).astype(np.uint8)
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+    data = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+
+
+def mesh_in_metres(exported: AlignedObject, frame: Frame) -> Mesh:
+    """The mesh, stretched and placed in a frame [m]."""
+    placed = exported.placed_mesh(frame)
+    return replace(placed, vertices=placed.vertices * exported.metres)
+
+
+def _vertex_colors(mesh: Mesh) -> FloatArray:
+    if mesh.vertex_colors is not None:
+        return np.asarray(mesh.vertex_colors)
+    palette = np.array(
+        [
+            each.color if each.texture is None else (*_mean_color(each.texture), each.color[3])
+            for each in mesh.materials
+        ]
+    )
+    colors = np.ones((len(mesh.vertices), 4))
+    colors[mesh.faces] = palette[mesh.face_material][:, None]
+    return colors
+
+
+def _mean_color(texture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> tuple[float, ...]:
+    return tuple((texture[..., :3].reshape(-1, 3).mean(axis=0) / 255).tolist())
+
+
+def _vertex_lines(mesh: Mesh) -> list[str]:
+    if mesh.vertex_colors is None:
+        return [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    rows = np.column_stack([mesh.vertices, mesh.vertex_colors[:, :3]]).tolist()
+    return ["v " + " ".join(f"{value:.9g}" for value in row) for row in rows]
+
+
+def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:
+    """Faces in file order, with the material's name where it changes."""
+    lines, current = [], -1
+    for row, face in enumerate((mesh.faces + 1).tolist()):
+        material = int(mesh.face_material[row])
+        if material != current:
+            lines.append(f"usemtl {names[material]}")
+            current = material
+        corners = [str(vertex) for vertex in face]
+        if uv_rows is not None:
+            corners = [f"{a}/{b}" for a, b in zip(face, uv_rows[row], strict=True)]
+        lines.append(f"f {' '.join(corners)}")
+    return lines
+
+
+def _material_lines(mesh: Mesh, names: list[str], path: Path) -> list[str]:
+    """The material library; writes the textures beside the OBJ file."""
+    lines = []
+    for name, material in zip(names, mesh.materials, strict=True):
+        red, green, blue, alpha = material.color
+        lines += [f"newmtl {name}", f"Kd {red:.6g} {green:.6g} {blue:.6g}", f"d {alpha:.6g}"]
+        if material.texture is not None:
+            image = path.with_name(f"{path.stem}_{name}.png")
+            write_image(image, material.texture)
+            lines.append(f"map_Kd {image.name}")
+    return lines

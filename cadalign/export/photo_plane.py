@@ -1,0 +1,123 @@
+"""A photo as a rectangle that stands before a camera without distortion and off-centre shift.
+
+glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
+becomes a textured rectangle at the place where the camera sees it, and the camera's field of view
+is the least one about the principal point that holds all of it: the image of that camera is the
+photo with a margin at one side. A distorted photo is resampled to a pinhole camera's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.export.aligned_object import AlignedObject
+from cadalign.geometry.camera import Camera
+from cadalign.io.images import ByteImage
+
+_BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
+_GROWTH = 2.0  # how much larger than the photo an undistorted one may become, each way
+_AGREES = 1e-6
+_RIM = 1.5  # how far the border's colours go on beyond the photo [px]
+_BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoPlane:
+    """The rectangle of a photo at depth 1, in the camera's axes (x right, y down).
+
+    Parameters
+    ----------
+    image : (h, w, 3) uint8 or None
+        The photo, without lens distortion.
+    low, high : (2,) float
+        Its top left and bottom right corner in normalised image coordinates.
+    """
+
+    image: ByteImage | None
+    low: FloatArray
+    high: FloatArray
+
+    @property
+    def half_field(self) -> FloatArray:
+        """Tangents (2,) of half the horizontal and vertical field of view that hold the photo."""
+        return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
+
+    @property
+    def yfov(self) -> float:
+        """Vertical field of view [rad]."""
+        return 2 * float(np.arctan(self.half_field[1]))
+
+    @property
+    def aspect(self) -> float:
+        """Width over height of the field of view."""
+        return float(self.half_field[0] / self.half_field[1])
+
+    @property
+    def corners(self) -> FloatArray:
+        """Corners at depth 1: top left, bottom left, bottom right, top right; (4, 3) float."""
+        (left, top), (right, bottom) = self.low, self.high
+        return np.array([[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]])
+
+
+def photo_plane(camera: Camera, image: ByteImage | None) -> PhotoPlane:
+    """Make the rectangle of a camera's photo."""
+    if camera.distortion:
+        pinhole = _pinhole_of(camera)
+        image = None if image is None else _undistorted(image, camera, pinhole)
+        camera = pinhole
+    centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    size = np.array([camera.width, camera.height])
+    return PhotoPlane(image, (-_BORDER - centre) / focal, (size - _BORDER - centre) / focal)
+
+
+def photo_depth(exported: AlignedObject, number: int) -> float:
+    """Depth at which a view's photo stands, behind the object [units of the camera frame]."""
+    low, high = exported.bounds
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    depths = exported.views[number].cam_from_model.apply(low + corners * (high - low))[:, 2]
+    return _BEHIND * float(np.abs(depths).max())
+
+
+def _pinhole_of(camera: Camera) -> Camera:
+    """A camera without distortion, of the same focal length, that holds all pixels it can."""
+    width, height = camera.width, camera.height
+    across, down = np.arange(width + 1) - _BORDER, np.arange(height + 1) - _BORDER
+    sides = [np.stack([across, np.full(width + 1, y)], axis=1) for y in (down[0], down[-1])]
+    sides += [np.stack([np.full(height + 1, x), down], axis=1) for x in (across[0], across[-1])]
+    normalized, valid = camera.normalize_where_valid(np.concatenate(sides))
+    pixels = normalized[valid] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    whole = np.array([[-_BORDER] * 2, [width - _BORDER, height - _BORDER]])
+    pixels = pixels if len(pixels) else whole
+    slack = (_GROWTH - 1) * np.array([width, height])
+    low = np.maximum(np.floor(pixels.min(axis=0) + _BORDER), -slack)
+    high = np.minimum(np.ceil(pixels.max(axis=0) + _BORDER), [width, height] + slack)
+    columns, rows = (int(n) for n in np.maximum(high - low, 1))
+    centre = camera.cx - float(low[0]), camera.cy - float(low[1])
+    return replace(camera, width=columns, height=rows, cx=centre[0], cy=centre[1], distortion=())
+
+
+def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage:
+    """The photo as the pinhole camera would have taken it, black where it shows nothing."""
+    import cv2
+
+    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
+    targets = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    normalized = pinhole.normalize(targets)
+    sources = camera.pixels_from_normalized(normalized)
+    # Past the fold of the lens model a far place would be given a pixel of the photo.
+    inside: BoolArray = np.asarray(np.isfinite(sources).all(axis=1))
+    inside[inside] = camera.contains(sources[inside], margin=-_RIM)
+    back, valid = camera.normalize_where_valid(sources[inside])
+    gap = np.abs(back - normalized[inside]).max(axis=1, initial=0.0)
+    inside[inside] = valid & (gap < _AGREES)
+    sources[~inside] = -10.0
+    maps = sources.reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
+    # The rim has its colour, or viewers would mix black into the photo's borders.
+    drawn = cv2.remap(
+        image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    drawn[~inside.reshape(drawn.shape[:2])] = 0
+    return np.asarray(drawn, dtype=np.uint8)

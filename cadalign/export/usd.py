@@ -1,0 +1,206 @@
+"""USD: the textured model, the cameras, and behind it the photos.
+
+The scene is as `cadalign.export.glb` lays it out. A camera has the field of view that holds its
+photo, about the principal point. Pixar's library is an extra: ``pip install 'cadalign[usd]'``.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
+from cadalign.export.aligned_object import AlignedObject, Frame
+from cadalign.export.mesh_parts import parts_of
+from cadalign.export.photo_plane import PhotoPlane, photo_depth, photo_plane
+from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.io.files import write_whole
+from cadalign.io.images import ByteImage, write_image
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+INSTALL = "pip install 'cadalign[usd]'   (or: pip install usd-core)"
+_FLIP = np.diag([*OPENGL_AXES, 1.0])
+_APERTURE = 36.0  # width of the film; USD counts it in tenths of the scene's unit
+_NEAR, _FAR = 1e-3, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A mesh with its look; ``texture`` is the name of an image file beside the scene's."""
+
+    name: str
+    vertices: FloatArray
+    faces: IntArray
+    uv: FloatArray | None
+    color: tuple[float, ...]
+    texture: str | None
+    is_photo: bool = False
+
+
+def write_usd(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
+    """Write an aligned object as ``.usdz`` (one file), or ``.usda``, ``.usdc``, ``.usd``.
+
+    Textures of the latter are PNG files beside the file.
+
+    Raises
+    ------
+    InputError
+        If there is no mesh, the frame is not known, or USD's library is missing.
+    DataError
+        If a photo cannot be read.
+    """
+    _require_library()
+    if path.suffix != ".usdz":
+        _write_stage(path, exported, frame)
+        return
+    from pxr import UsdUtils
+
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder, f"{path.stem}.usdc")
+        _write_stage(scene, exported, frame)
+        package = Path(folder, "package.usdz")
+        UsdUtils.CreateNewUsdzPackage(str(scene), str(package))
+        data = package.read_bytes()
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+
+
+def _require_library() -> None:
+    try:
+        import pxr  # noqa: F401
+    except ImportError:
+        what = "USD's library is not installed"
+        raise InputError(what, where="format", fix=INSTALL) from None
+
+
+def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
+    from pxr import Usd, UsdGeom
+
+    root = _FLIP if frame == "camera" else np.eye(4)
+    mesh = exported.require_mesh()
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
+    placing = root @ exported.frame_from_model(frame).cam_from_model
+    placing[:3] *= exported.metres
+    _place(UsdGeom.Xform.Define(stage, "/scene/model"), placing)
+    for number, part in enumerate(parts_of(mesh)):
+        texture = None
+        if part.uv is not None and part.material.texture is not None:
+            texture = _write_texture(path, f"texture_{number}", part.material.texture)
+        color = part.material.color if part.colors is None else part.colors.mean(axis=0).tolist()
+        surface = _Surface(
+            f"model/part_{number}", part.vertices, part.faces, part.uv, tuple(color), texture
+        )
+        _add_surface(stage, surface)
+    for number, view in enumerate(exported.views):
+        plane = photo_plane(view.camera, view.read_image())
+        pose = root @ exported.frame_from_cam(frame, number) @ _FLIP
+        pose[:3, 3] *= exported.metres
+        depth = photo_depth(exported, number) * exported.metres
+        _place(UsdGeom.Xform.Define(stage, f"/scene/view_{number}"), pose)
+        _add_camera(stage, f"/scene/view_{number}/camera", plane, depth)
+        if plane.image is not None:
+            texture = _write_texture(path, f"photo_{number}", plane.image)
+            _add_photo(stage, f"view_{number}/photo", plane, depth, texture)
+    write_whole(path, lambda unfinished: stage.GetRootLayer().Export(str(unfinished)))
+
+
+def _write_texture(path: Path, name: str, image: ByteImage) -> str:
+    target = path.with_name(f"{path.stem}_{name}.png")
+    write_image(target, image)
+    return target.name
+
+
+def _place(xform: Any, matrix: FloatArray) -> None:
+    from pxr import Gf
+
+    xform.AddTransformOp().Set(Gf.Matrix4d(matrix.T.tolist()))  # rows are columns in USD
+
+
+def _add_camera(stage: Usd.Stage, place: str, plane: PhotoPlane, depth: float) -> None:
+    from pxr import Gf, UsdGeom
+
+    camera = UsdGeom.Camera.Define(stage, place)
+    across, down = plane.half_field.tolist()
+    camera.GetFocalLengthAttr().Set(_APERTURE / (2 * across))
+    camera.GetHorizontalApertureAttr().Set(_APERTURE)
+    camera.GetVerticalApertureAttr().Set(_APERTURE * down / across)
+    camera.GetClippingRangeAttr().Set(Gf.Vec2f(_NEAR * depth, _FAR * depth))
+
+
+def _add_photo(stage: Usd.Stage, name: str, plane: PhotoPlane, depth: float, texture: str) -> None:
+    vertices = plane.corners * depth * OPENGL_AXES
+    uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    _add_surface(stage, _Surface(name, vertices, faces, uv, (0, 0, 0, 1), texture, is_photo=True))
+
+
+def _add_surface(stage: Usd.Stage, surface: _Surface) -> None:
+    from pxr import Sdf, UsdGeom, UsdShade, Vt
+
+    place = f"/scene/{surface.name}"
+    mesh = UsdGeom.Mesh.Define(stage, place)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(surface.vertices.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(surface.faces), 3, np.int32)))
+    corners = surface.faces.ravel().astype(np.int32)
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(not surface.is_photo)
+    extent = np.array([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])
+    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+    if surface.uv is not None:
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+        )
+        primvar.Set(Vt.Vec2fArray.FromNumpy(surface.uv.astype(np.float32)))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_add_material(stage, place, surface))
+
+
+def _add_material(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
+    from pxr import Gf, Sdf, UsdShade
+
+    types = Sdf.ValueTypeNames
+    material = UsdShade.Material.Define(stage, f"{place}/material")
+    shader = UsdShade.Shader.Define(stage, f"{place}/material/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("roughness", types.Float).Set(1.0)
+    shader.CreateInput("opacity", types.Float).Set(float(surface.color[3]))
+    color = shader.CreateInput("diffuseColor", types.Color3f)
+    # USD's colours are linear light; a photo shines by itself.
+    linear = Gf.ConvertDisplayToLinear(Gf.Vec3f(*(float(value) for value in surface.color[:3])))
+    color.Set(linear)
+    if surface.texture is not None:
+        wrap = "clamp" if surface.is_photo else "repeat"
+        picture = _add_texture(stage, f"{place}/material", surface.texture, wrap)
+        target = color
+        if surface.is_photo:
+            target = shader.CreateInput("emissiveColor", types.Color3f)
+        target.ConnectToSource(picture, "rgb")
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return material
+
+
+def _add_texture(stage: Usd.Stage, place: str, file_name: str, wrap: str) -> Any:
+    from pxr import Sdf, UsdShade
+
+    types = Sdf.ValueTypeNames
+    reader = UsdShade.Shader.Define(stage, f"{place}/uv")
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", types.String).Set("st")
+    picture = UsdShade.Shader.Define(stage, f"{place}/texture")
+    picture.CreateIdAttr("UsdUVTexture")
+    picture.CreateInput("file", types.Asset).Set(f"./{file_name}")
+    picture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
+    for axis in ("wrapS", "wrapT"):
+        picture.CreateInput(axis, types.Token).Set(wrap)
+    picture.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    picture.CreateOutput("rgb", types.Float3)
+    return picture.ConnectableAPI()

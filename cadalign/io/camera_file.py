@@ -1,0 +1,112 @@
+"""Files of one camera: a calibration matrix as text, NumPy array or JSON, or COLMAP's form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.errors import DataError, brief
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera_form import PixelOrigin
+from cadalign.io.documents import in_file, read_json
+from cadalign.io.files import reading
+
+_ARRAY = ".npy"
+_MATRIX_NAMES = ("matrix", "K", "camera_matrix", "cam_K")
+_FIX = "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
+
+
+def read_camera(
+    path: Path, *, size: tuple[int, int] | None = None, pixel_origin: PixelOrigin | None = None
+) -> Camera:
+    """Read a camera from a file.
+
+    Parameters
+    ----------
+    path : Path
+        A calibration matrix K: text of 3 x 3 numbers, a ``.npy`` array, or JSON, bare or as
+        ``matrix`` (also ``K``, ``camera_matrix``, ``cam_K``), by rows; or a camera in the form of
+        `Camera.from_dict` as JSON.
+    size : tuple of 2 int, optional
+        Width and height of the photo [px], for a matrix whose file does not tell.
+    pixel_origin : {"center", "corner"}, optional
+        Where (0, 0) lies for the principal point; by default what the file states, or else the
+        centre for a matrix and the corner for COLMAP's form.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, holds no camera, or lacks the image's size.
+    """
+    form = _read_form(path)
+    if pixel_origin is not None:
+        form["pixel_origin"] = pixel_origin
+    if "matrix" in form and not {"width", "height"} <= set(form):
+        if size is None:
+            what = "the file has a matrix alone, and the size of the image is unknown"
+            raise DataError(what, where=str(path), fix="give the photo, or width and height in it")
+        form |= {"width": size[0], "height": size[1]}
+    with in_file(path):
+        return Camera.from_dict(form)
+
+
+def is_camera_file(path: Path) -> bool:
+    """True for a file of a form that `read_camera` reads, other than those of other programs."""
+    if path.suffix.lower() == _ARRAY or not _is_json(path):
+        return True
+    data = read_json(path)
+    return isinstance(data, list) or (
+        isinstance(data, dict) and not {"params", *_MATRIX_NAMES}.isdisjoint(data)
+    )
+
+
+def _read_form(path: Path) -> dict[str, Any]:
+    """The parsed form of a camera in a file."""
+    if path.suffix.lower() == _ARRAY:
+        return {"matrix": _read_array(path)}
+    if not _is_json(path):
+        return {"matrix": _read_numbers(path)}
+    data = read_json(path)
+    if isinstance(data, list) and len(data) in (3, 9):
+        return {"matrix": _square(data, path)}
+    if not isinstance(data, dict):
+        what = f"camera: expected an object, got {type(data).__name__}"
+        raise DataError(what, where=str(path), fix=_FIX)
+    for name in _MATRIX_NAMES:
+        if name in data and "params" not in data:
+            rest = {key: value for key, value in data.items() if key != name}
+            return {**rest, "matrix": _square(data[name], path)}
+    return dict(data)
+
+
+def _is_json(path: Path) -> bool:
+    with reading(path):
+        text = path.read_text(encoding="utf-8")
+    return path.suffix.lower() == ".json" or text.lstrip()[:1] in ("{", "[")
+
+
+def _read_array(path: Path) -> Any:
+    try:
+        with reading(path):
+            values = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        what = f"not a NumPy array that can be read ({brief(error)})"
+        raise DataError(what, where=str(path)) from None
+    return _square(values, path)
+
+
+def _read_numbers(path: Path) -> Any:
+    """Numbers of a text file, separated by blanks, commas or semicolons."""
+    with reading(path):
+        text = path.read_text(encoding="utf-8")
+    return _square(text.replace(",", " ").replace(";", " ").split(), path)
+
+
+def _square(values: Any, path: Path) -> Any:
+    """A matrix (3, 3) of nine numbers by rows, however they are nested."""
+    try:
+        return np.asarray(values, dtype=float).reshape(3, 3)
+    except (TypeError, ValueError):
+        raise DataError("not a calibration matrix", where=str(path), fix=_FIX) from None

@@ -1,0 +1,1 @@
+"""HTML of values in notebooks: a small picture beside a table."""

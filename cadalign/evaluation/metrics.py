@@ -5,6 +5,7 @@ Result tables, figures, pages, Markdown, CSV, LaTeX and the console all read it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,8 +87,16 @@ class Metric:
         return {"key": self.key, "label": self.head, **rest}
 
 
+def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
+    """Say whether a column of these numbers, None where there is none, tells anything."""
+    known = [number for number in numbers if number is not None]
+    return any(known) if metric == SKIPPED else bool(known)
+
+
 INSTANCES = Metric("instances", "instances", digits=0, better=None, symbol="n")
 FAILED = Metric("failed", "failed", digits=0, better=None)
+SKIPPED = Metric("skipped", "skipped", digits=0, better=None, symbol="skip")
+"""Shown only where something was skipped."""
 KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
 
 ROTATION = Metric(
@@ -177,6 +186,10 @@ RECIPROCAL_RANK = Metric(
     "reciprocal_rank", "mean reciprocal rank", digits=3, better=HIGH, symbol="MRR", log=False
 )
 SCORE = replace(_RATE, key="score", label="score", head="score", symbol="score%", better=None)
+NONE = replace(
+    _RATE, key="none", label="none of the models", head="none of these", symbol="none%", better=None
+)
+"""More likely none of the library's models than one: false in one protocol, true in the other."""
 SHAPE_DISTANCE = Metric(
     "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
 )

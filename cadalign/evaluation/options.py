@@ -7,7 +7,7 @@ the text below it. These modules load quickly: `cadalign --help` imports them.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -64,10 +64,18 @@ class ModelOptions(ExperimentOptions):
     """Categories to take; all by default."""
     max_models: int | None = None
     """Largest number of models of each category."""
+    shapenet: Path | None = None
+    """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(max_models=1)
+
+    def as_config(self) -> dict[str, Any]:
+        """The options in a run's configuration: ``shapenet`` only where it is given."""
+        config = asdict(self)
+        shapenet = config.pop("shapenet")
+        return config if shapenet is None else {**config, "shapenet": str(shapenet.absolute())}
 
 
 @dataclass(frozen=True, kw_only=True)

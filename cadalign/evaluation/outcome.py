@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, InputError, TooFewVisibleError
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -19,6 +19,10 @@ from cadalign.geometry.metrics import (
 
 OK = "ok"
 FAILED = "failed"
+LEFT_OUT = "left out"
+"""Of an instance, or a method on it, that lacks what is asked for: no failure, and no result."""
+SKIPPED = "skipped"
+"""Of an instance that no view shows enough keypoints of: no method was run, and none failed."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +30,9 @@ class Outcome:
     """Result of one method on one task.
 
     ``names`` are the columns that name the row, such as category, model id and method; ``values``
-    those of facts and metrics, as far as they are known. ``status`` is ``ok``, ``failed`` or one of
-    the experiment's own, ``reason`` why it is not ok. ``seconds`` are not part of a result table,
-    since no two runs agree on them.
+    those of facts and metrics, as far as they are known. ``status`` is ``ok``, ``failed``,
+    ``left out``, ``skipped`` or one of the experiment's own, ``reason`` why it is not ok.
+    ``seconds`` are not part of a result table, since no two runs agree on them.
     """
 
     names: Row
@@ -41,6 +45,12 @@ class Outcome:
     def failure(cls, reason: str, names: Row, **values: Any) -> Outcome:
         """A failed task; ``values`` are the columns that are known of it all the same."""
         return cls(names, values, FAILED, reason)
+
+    @classmethod
+    def without_instance(cls, error: Exception, names: Row, **values: Any) -> Outcome:
+        """A task whose instance could not be made: skipped where too few keypoints are visible."""
+        status = SKIPPED if isinstance(error, TooFewVisibleError) else FAILED
+        return cls(names, values, status, reason_of(error))
 
     @property
     def is_ok(self) -> bool:

@@ -124,7 +124,8 @@ def draw_plot(path: Path, plots: Sequence[Plot]) -> list[Path]:
     A line ends where there is no value, and a band without an upper end goes to the top.
     """
     x, y = plots[0].x, plots[0].y
-    with new_figure(figsize=(6.4, 4.2)) as figure:
+    rows_below = sum(len(plot.traces) for plot in plots) / 2  # of the legend
+    with new_figure(figsize=(6.4, 4.2 + 0.24 * max(0, rows_below - 3))) as figure:
         axes = figure.add_subplot()
         bands = [
             band

@@ -31,6 +31,8 @@ _FOLDERS = (
     "retrieval",
     "unseen",
     "evidence",
+    "photos",
+    "estimates",
 )
 _REGISTERED: dict[str, Spec] = {}
 

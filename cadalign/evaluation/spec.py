@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.metrics import CATEGORY, Metric
+from cadalign.evaluation.metrics import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import COLUMNS, Run
@@ -31,7 +31,10 @@ class Reference:
 
 def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
     statuses = run.results["status"].to_pylist()
-    return Conclusion(len(statuses), statuses.count(FAILED), {}, "")
+    skipped = statuses.count(SKIPPED)
+    note = f"{skipped} more were skipped" if skipped else ""
+    rows = len(statuses) - skipped
+    return Conclusion(rows, statuses.count(FAILED), {"skipped": skipped}, note)
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ class Spec:
 
     def shown_columns(self, lines: Summaries) -> list[Metric]:
         """The columns that some line has a value of."""
-        return [c for c in self.columns if any(line.number(c.key) is not None for line in lines)]
+        return [c for c in self.columns if told(c, [line.number(c.key) for line in lines])]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""

@@ -174,14 +174,18 @@ def by_category_and_method(
     run: Run, summarize: Callable[[str, str, Cells], Summary]
 ) -> list[Summary]:
     """A summary of each category's cells for every method, and of all where there are several."""
-    cells = run.cells
+    return summaries_of(run.cells, run.methods, summarize)
+
+
+def summaries_of(
+    cells: Cells, methods: Sequence[str], summarize: Callable[[str, str, Cells], Summary]
+) -> list[Summary]:
+    """Summaries of cells for some methods; see `by_category_and_method`."""
     categories = sorted(set(cells["category"].tolist()))
     parts = [(name, where(cells, cells["category"] == name)) for name in categories]
     if len(parts) > 1:
         parts.append((ALL, cells))
-    return [
-        summarize(category, method, found) for category, found in parts for method in run.methods
-    ]
+    return [summarize(category, method, found) for category, found in parts for method in methods]
 
 
 def text_rows(summaries: Sequence[Summary], shown: Sequence[Metric]) -> list[tuple[str, ...]]:

@@ -9,10 +9,10 @@ from typing import Any
 
 from cadalign.evaluation.accuracy.methods import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
-from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
-from cadalign.evaluation.summary import Summary, group_name
+from cadalign.evaluation.summary import ALL, Summary, group_name
 
 _MOST_REASONS = 200
 OTHER_REASONS = "other reasons"
@@ -41,7 +41,7 @@ class HeadlineRow:
 
 @dataclass(frozen=True)
 class Failure:
-    """A reason of failures, and their number."""
+    """A reason of failures or of skipped instances, and their number."""
 
     run: int
     category: str
@@ -58,6 +58,7 @@ class Headline:
     columns: tuple[Metric, ...]
     rows: list[HeadlineRow]
     failures: list[Failure]
+    skipped: list[Failure]
     paper: list[HeadlineRow]
     note: str
 
@@ -68,6 +69,7 @@ class Headline:
             "columns": [column.column() for column in self.columns],
             "rows": [asdict(row) for row in self.rows],
             "failures": [asdict(failure) for failure in self.failures],
+            "skipped": [asdict(reason) for reason in self.skipped],
             "paper": [
                 {"category": row.category, "method": row.method, "cells": row.cells}
                 for row in self.paper
@@ -79,21 +81,28 @@ class Headline:
 def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
     spec, group = spec_of(runs[0]), spec_of(runs[0]).group(runs[0])
-    lines = [list(spec.lines(spec.summarize(run))) for run in runs]
+    lines = [_all_first(spec.lines(spec.summarize(run))) for run in runs]
     columns = spec.shown_columns([line for found in lines for line in found])
-    rows, failures = [], []
+    rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
         rows += _with_best([HeadlineRow.of(index, line, columns) for line in lines[index]], columns)
-        failures += _failures(index, run, group)
+        failures += _reasons(index, run, group, FAILED)
+        skipped += _reasons(index, run, group, SKIPPED)
     stated = spec.reference(runs, {row.category for row in rows})
     return Headline(
         group=group.heading,
         columns=tuple(columns),
         rows=rows,
         failures=failures,
+        skipped=skipped,
         paper=[HeadlineRow.of(0, line, columns) for line in stated.lines],
         note=f"{spec.note} {stated.note}".strip(),
     )
+
+
+def _all_first(lines: Sequence[Summary]) -> list[Summary]:
+    """The lines of all groups together before those of single ones, otherwise in their order."""
+    return sorted(lines, key=lambda line: line.group.split(", ")[0] != ALL)
 
 
 def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
@@ -122,13 +131,13 @@ def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[H
     return [replace(row, best=marked(row)) for row in rows]
 
 
-def _failures(index: int, run: Run, group: Metric) -> list[Failure]:
+def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
     """Reasons with their numbers, the most frequent first; rare ones beyond a number as one."""
     chosen = [run.results[name].to_pylist() for name in (group.key, "method", "status", "reason")]
     counts = Counter(
         (group_name(group, value), method, reason)
         for value, method, status, reason in zip(*chosen, strict=True)
-        if status == FAILED
+        if status == wanted
     )
     listed = counts.most_common(_MOST_REASONS)
     rest: Counter[tuple[str, str, str]] = Counter()

@@ -6,8 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.outcome import LEFT_OUT, OK, SKIPPED
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.runs.opened import Run
 
@@ -102,8 +106,9 @@ def _append(columns: dict[str, list[Any]], **cells: Any) -> None:
 
 
 def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
-    """The columns of a run's results as lists."""
-    table = run.results
+    """The columns of a run's results as lists, without what was left out or skipped."""
+    without = pc.is_in(run.results["status"], value_set=pa.array([LEFT_OUT, SKIPPED]))
+    table = run.results.filter(pc.invert(without))
     wanted = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
     optional = ("visibility", "symmetry")
     numbers = ("stretch_y", "stretch_z", *(metric.key for metric in metrics))
@@ -113,5 +118,9 @@ def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
         cells[name] = table[name].to_pylist() if known else [""] * len(table)
     for name in numbers:
         known = name in table.column_names
-        cells[name] = compact(run.column(name)) if known else [None] * len(table)
+        cells[name] = (
+            compact(np.asarray(table[name].to_numpy(zero_copy_only=False)))
+            if known
+            else [None] * len(table)
+        )
     return cells

@@ -13,6 +13,7 @@
       "headline": {"group", "columns": [{"key", "label", "unit", "digits", "better"}],
                    "rows": [{"run", "category", "method", "cells": {key: number}, "best": [key]}],
                    "failures": [{"run", "category", "method", "reason", "count"}],
+                   "skipped": likewise,
                    "paper": [{"category", "method", "cells"}], "note"},
       "tables": {
         "strings": [...],

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.errors import DegenerateError, InputError
+from cadalign.fitting.likelihood import bent
 from cadalign.fitting.noise import rays_of, whitening_of
 from cadalign.fitting.options import LOSSES, Sigma
 from cadalign.geometry.camera import Camera
@@ -18,7 +20,7 @@ from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_al
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
 from cadalign.retrieval.options import RetrievalOptions
 
-_LINEAR = LOSSES["linear"]
+_PIECE = 1024  # candidates that a thread bounds at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,7 @@ class Observed:
 
     order: IntArray  # (n,), their rows as they were given
     points_2d: FloatArray  # (n, 2) [px]
+    covariances: FloatArray  # (n, 2, 2) [px^2]
     camera: Camera
     query: Query  # semantic ids and rays of the keypoints, for the kernels
     spurious: float  # log-likelihood of the keypoints if all of them are spurious
@@ -58,7 +61,7 @@ def observe(
         max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
-    return Observed(order, pixels, camera, query, float(off) * len(ids))
+    return Observed(order, pixels, covariances, camera, query, float(off) * len(ids))
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
@@ -90,13 +93,18 @@ class CandidateSet:
 
 
 def gather_candidates(
-    table: ModelTable, observed: Observed, options: RetrievalOptions, exclude: Collection[ModelKey]
+    table: ModelTable,
+    observed: Observed,
+    options: RetrievalOptions,
+    exclude: Collection[ModelKey],
+    workers: int = -1,
 ) -> CandidateSet:
     """Gather the candidates of a query, without the models to ``exclude``."""
+    threads = worker_count(workers)
     chosen = _chosen_models(table, options.category, exclude)
     _check_known(table, observed.query.ids, chosen, options.category)
     models, candidates, labelings = _candidates(table, chosen, options.symmetries)
-    bounds, gains, shared = bound_all(observed.query, candidates)
+    bounds, gains, shared = _bound_in_pieces(observed.query, candidates, threads)
     kept = shared >= LEAST_SHARED
     if not kept.any():
         raise DegenerateError(
@@ -104,8 +112,8 @@ def gather_candidates(
             where="semantic_ids",
             fix=f"at least {LEAST_SHARED} are needed to align a model",
         )
-    if observed.query.loss != _LINEAR:
-        bounds[:] = 0.0  # the bound is valid for squared errors only
+    # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
+    bounds = bent(bounds, options.loss, options.loss_scale)
     counts = candidates.spans[:, 1] - candidates.spans[:, 0]
     base = (
         gains
@@ -122,6 +130,21 @@ def gather_candidates(
         base[kept],
         bounds[kept],
     )
+
+
+def _bound_in_pieces(
+    query: Query, candidates: Candidates, threads: int
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Bound the candidates in threads; see `cadalign.retrieval.kernels.bound_all`."""
+
+    def bound(start: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        spans = candidates.spans[start : start + _PIECE]
+        return bound_all(query, candidates._replace(spans=spans))
+
+    with ThreadPoolExecutor(threads) as pool:
+        parts = list(pool.map(bound, range(0, len(candidates.spans), _PIECE)))
+    bounds, gains, shared = zip(*parts, strict=True)
+    return np.concatenate(bounds), np.concatenate(gains), np.concatenate(shared)
 
 
 def _chosen_models(

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import rank_by_shape, shapes_by_category
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
@@ -206,12 +207,13 @@ class Library:
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
             category, method, sigma, shape_sigma, loss, loss_scale, stretch, scale_prior_sigma,
-            max_stretch, symmetries, missing_prob, spurious, exhaustive.
+            max_stretch, symmetries, missing_prob, spurious, none_prior, exhaustive.
 
         Returns
         -------
         list of Match
-            The most likely first.
+            The most likely first. Each has the ``none_probability`` that the object is none of the
+            library's models.
 
         Raises
         ------
@@ -227,17 +229,22 @@ class Library:
             raise InputError(f"unknown option ({error})", where="options") from None
         if shape is None:
             observed = observe(points_2d, semantic_ids, camera, chosen)
-            candidates = gather_candidates(self._table, observed, chosen, exclude)
+            candidates = gather_candidates(self._table, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
+            absent = none_probability(self._table, candidates, observed, ranking, chosen)
         else:
             shapes = shapes_by_category(shape, chosen, self._table)
             category = next(iter(shapes)) if len(shapes) == 1 else None
             # The deviation of shapes is no noise of the keypoints here.
             plain = replace(chosen, shape_sigma=0.0, category=category)
             observed = observe(points_2d, semantic_ids, camera, plain)
-            candidates = gather_candidates(self._table, observed, plain, exclude)
+            candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-        matches = make_matches(self._table, candidates, observed, ranking, chosen.top)
+            absent = None
+        matches = [
+            replace(match, none_probability=absent)
+            for match in make_matches(self._table, candidates, observed, ranking, chosen.top)
+        ]
         if mask is None and image is None:
             return matches
         from cadalign.retrieval.silhouettes import mask_of, rerank

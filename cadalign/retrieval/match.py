@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +53,12 @@ class Match:
     mesh_path : Path or None
     silhouette_iou : float, optional
         With a mask: intersection over union with the model's silhouette; None without a mesh.
+    none_probability : float, optional
+        Probability that the object is none of the library's models, not even stretched: the same
+        in all matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape,
+        which takes the object for none of them.
+    camera : Camera, optional
+        The camera of the image.
     """
 
     category: str
@@ -65,6 +77,8 @@ class Match:
     mirrored: bool
     mesh_path: Path | None
     silhouette_iou: float | None = None
+    none_probability: float | None = None
+    camera: Camera | None = field(default=None, repr=False)
 
     @property
     def shared(self) -> int:
@@ -77,6 +91,37 @@ class Match:
             f"Match({self.category!r}, {self.model_id!r}, score={self.score:.3g}, "
             f"rms={self.rms:.3g} px, shared={self.shared}, scale=({stretch}))"
         )
+
+    def _repr_html_(self) -> str:
+        from cadalign.geometry.plots import plot_box, plot_keypoints, plot_photo
+        from cadalign.notebook.html import card, draw_picture
+
+        scale = ", ".join(
+            f"{axis} {value:.3g}" for axis, value in zip("xyz", self.alignment.scale, strict=True)
+        )
+        absent = self.none_probability
+        none = [] if absent is None else [("none of these", f"{100 * absent:.3g} %")]
+        rows = [
+            ("category", self.category),
+            ("model", self.model_id),
+            ("score", f"{100 * self.score:.3g} %"),
+            *none,
+            ("keypoints", f"{self.shared} of {self.shared + len(self.missing_ids)}"),
+            ("residuals (rms)", f"{self.rms:.3g} px"),
+            ("stretch", scale),
+        ]
+        camera = self.camera
+        if camera is None:
+            return card("Match", rows)
+
+        def draw(axes: Axes) -> None:
+            plot_photo(camera, axes=axes)
+            plot_box(axes, camera, self.box)
+            every = np.ones(self.shared, dtype=bool)
+            plot_keypoints(axes, self.points_2d, self.residuals, every)
+
+        picture = draw_picture(draw, aspect=camera.height / camera.width)
+        return card("Match", rows, picture=picture)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the match as plain lists and numbers, for JSON."""
@@ -99,4 +144,5 @@ class Match:
             "mirrored": self.mirrored,
             "mesh": None if self.mesh_path is None else str(self.mesh_path),
             "silhouette_iou": self.silhouette_iou,
+            "none_probability": self.none_probability,
         }

@@ -60,6 +60,8 @@ class RetrievalOptions(AlignmentOptions):
     """Probability that a keypoint of the object is not marked in the image."""
     spurious: float = 0.01
     """Average number of keypoints in an image that the object does not have."""
+    none_prior: float = 0.5
+    """Probability, before an image is seen, that the object is none of the library's models."""
     exhaustive: bool = False
     """Search all models, also those that the bound on their likelihood excludes."""
 
@@ -86,6 +88,7 @@ class RetrievalOptions(AlignmentOptions):
                 "between 0 and 1, both excluded",
             ),
             ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
+            ("none_prior", 0 <= self.none_prior < 1, "between 0 and 1, the latter excluded"),
             ("max_stretch", 1 <= self.max_stretch <= 1000, "between 1 and 1000"),
         ):
             if not is_valid:

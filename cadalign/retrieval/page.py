@@ -44,6 +44,7 @@ def write_retrieval(
         style=asset("retrieval.css"),
         count=len(matches),
         library=escape(library),
+        none=_none_line(matches),
         matches="".join(_card(rank, match) for rank, match in enumerate(matches, start=1)),
     )
     page = folder / "index.html"
@@ -75,6 +76,17 @@ def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
         observed=match.points_2d,
         reprojected=match.points_2d + match.residuals,
     )
+
+
+def none_text(matches: Sequence[Match]) -> str | None:
+    """Sentence of a table or page on the probability that the object is none of the models."""
+    probability = matches[0].none_probability if matches else None
+    return None if probability is None else f"None of these: {score_text(probability)}"
+
+
+def _none_line(matches: Sequence[Match]) -> str:
+    text = none_text(matches)
+    return "" if text is None else f'<p class="lead"><strong>{escape(text)}</strong></p>'
 
 
 def _card(rank: int, match: Match) -> str:

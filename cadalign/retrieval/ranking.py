@@ -4,7 +4,8 @@ The lower bound of a candidate's errors (`kernels.bound_all`) gives an upper bou
 log-likelihood. Candidates are searched in growing batches, in the order of their bounds, until the
 bounds of all others lie 20 below the best log-likelihood found. So every match with a score above
 1e-8 has the rank of an exhaustive search. If these do not fill the top list, up to 768 more
-candidates are searched, so that in a library of that size the whole list is exact.
+candidates are searched, so that in a library of that size the whole list is exact. A candidate's
+search ends early once its pose is out of reach of a log-likelihood that would count.
 
 Candidates are searched independently: the result does not depend on the order of the library or on
 the number of threads.
@@ -41,7 +42,7 @@ _NEGLIGIBLE = 20.0
 # Largest number of candidates that are searched to fill the rest of the top list.
 _TO_FILL = 768
 _FILL_BATCH = 256
-_GUESS = 3.0  # errors are some 6 times their bound
+_GUESS = 0.7  # errors are some 1.4 times their bound, or more
 # 4-subsets for the minimal solver, refined starts, iterations. 1 to 3 % of all candidates miss
 # their optimum, less than 1 % of the best 30 of a query.
 _EFFORT = (5, 4, 20)
@@ -50,8 +51,9 @@ _ROBUST_EFFORT = (30, 10, 50)
 # For the top list and as many behind it, searched again so that the result is the optimum.
 _FINAL_EFFORT = (35, 12, 200)
 
-Search = Callable[[IntArray], tuple[FloatArray, FloatArray]]
-"""Function from candidates (m,) to their packed poses (m, 15) and costs (m,)."""
+Search = Callable[[IntArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Function from candidates (m,) and the costs (m,) above which poses are of no interest, to their
+packed poses (m, 15) and costs (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,8 @@ def rank(
         search = partial(_search_in_pieces, pool, observed.query, candidates.keypoints)
         effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
         _search_in_order(found, options, partial(search, effort))
-        found.search(found.ranking().candidates[: 2 * options.top], partial(search, _FINAL_EFFORT))
+        last = found.ranking().candidates[: 2 * options.top]
+        found.search(last, partial(search, _FINAL_EFFORT), floor=-np.inf)
     return found.ranking()
 
 
@@ -88,10 +91,15 @@ def _search_in_pieces(
     keypoints: Candidates,
     effort: tuple[int, int, int],
     chosen: IntArray,
+    ceilings: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Search the chosen candidates in the threads of a pool; see `Search`."""
-    pieces = [chosen[k : k + _PIECE] for k in range(0, len(chosen), _PIECE)]
-    parts = list(pool.map(lambda piece: search_all(query, keypoints, piece, *effort), pieces))
+
+    def search(start: int) -> tuple[FloatArray, FloatArray]:
+        piece = slice(start, start + _PIECE)
+        return search_all(query, keypoints, chosen[piece], ceilings[piece], *effort)
+
+    parts = list(pool.map(search, range(0, len(chosen), _PIECE)))
     poses, costs = zip(*parts, strict=True)
     return np.concatenate(poses), np.concatenate(costs)
 
@@ -108,11 +116,11 @@ class _SearchState:
         self._reached = np.full(len(self.limits), -np.inf)
         self._searched = np.zeros(len(self.limits), dtype=bool)
 
-    def search(self, chosen: IntArray, search: Search) -> None:
-        """Search candidates; of a repeated search the better pose is kept."""
+    def search(self, chosen: IntArray, search: Search, *, floor: float) -> None:
+        """Search candidates for poses above a log-likelihood; a known better pose is kept."""
         if not len(chosen):
             return
-        poses, costs = search(chosen)
+        poses, costs = search(chosen, 2.0 * (self._candidates.base[chosen] - floor))
         reached = self._candidates.base[chosen] - 0.5 * costs
         better = reached > self._reached[chosen]
         self._poses[chosen[better]] = poses[better]
@@ -157,18 +165,20 @@ def _search_in_order(found: _SearchState, options: RetrievalOptions, search: Sea
             batch = batch[found.limits[batch] >= found.best - _NEGLIGIBLE]
         if not len(batch):
             break
-        found.search(batch, search)
+        wanted = min(found.best - _NEGLIGIBLE, found.last_of(options.top))
+        found.search(batch, search, floor=-np.inf if options.exhaustive else wanted)
         done += len(batch)
         size = min(2 * size, _LARGEST_BATCH)
     rest = order[done:]
     rest = rest[np.argsort(-found.guesses[rest], kind="stable")]
     for start in range(0, min(_TO_FILL, len(rest)), _FILL_BATCH):
         batch = rest[start : start + _FILL_BATCH]
-        found.search(batch[found.limits[batch] >= found.last_of(options.top)], search)
+        last = found.last_of(options.top)
+        found.search(batch[found.limits[batch] >= last], search, floor=last)
 
 
 def _search_unstretched(
-    candidates: CandidateSet, observed: Observed, chosen: IntArray
+    candidates: CandidateSet, observed: Observed, chosen: IntArray, _ceilings: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Compute poses and costs by OpenCV's EPnP."""
     points, seen = [], []
@@ -232,6 +242,7 @@ def make_matches(
                 missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
                 mirrored=bool(candidates.mirrored[candidate]),
                 mesh_path=model.mesh_path,
+                camera=observed.camera,
             )
         )
     return matches

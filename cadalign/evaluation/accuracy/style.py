@@ -74,6 +74,18 @@ _LABELS = {
     "mask+depth": "+ mask, depth",
     "mask+views-2": "+ mask, 2 known views",
     "all": "all of one kind each",
+    "rigid": "the given model, rigid",
+    "stretched": "stretched",
+    "prior": "stretched, with a prior",
+    "similar": "stretched, similar keypoints",
+    "rigid+mask": "rigid + mask",
+    "rigid+depth": "rigid + depth",
+    "rigid+gravity": "rigid + gravity",
+    "rigid+mask+depth": "rigid + mask, depth",
+    "similar+gravity": "similar + gravity",
+    "stretched+gravity": "stretched + gravity",
+    "shape+gravity": "shape model + gravity",
+    "truth": "the truth itself",
     LIMIT: "Cramer-Rao bound",
 }
 

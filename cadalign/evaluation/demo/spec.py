@@ -35,7 +35,8 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     if root is None:
         folder.make()
         least = max(options.per_category, _LEAST_SAMPLE)
-        root = write_sample_dataset(folder.path / "sample_dataset", per_category=least)
+        place = folder.path / "sample_dataset"
+        root = write_sample_dataset(place, per_category=least, keep=True)
     dataset = KeypointNet(root)
     meshed = dataset.subset(categories=options.categories, with_mesh=True)
     keys = [

@@ -95,8 +95,8 @@ class EvidenceExperiment:
             assert task.model is not None
             scene = make_scene(task.model, task.view, self.options)
         except Exception as error:
-            reason = reason_of(error)
-            return [Outcome.failure(reason, task.names(name)) for name in self.options.methods]
+            methods = self.options.methods
+            return [Outcome.without_instance(error, task.names(name)) for name in methods]
         return [self._outcome(task, scene, method) for method in self.options.methods]
 
     def _outcome(self, task: KeypointTask, scene: ObjectScene, method: str) -> Outcome:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 
 from cadalign.datasets import KeypointNet
@@ -21,12 +20,12 @@ _CHUNK = 2
 
 def plan(options: EvidenceOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models that have meshes."""
-    dataset = KeypointNet(options.root).subset(
+    dataset = KeypointNet(options.root, shapenet_root=options.shapenet).subset(
         categories=options.categories, split=options.split, with_mesh=True
     )
     tasks = KeypointTasks(dataset, options)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from cadalign.evaluation import metrics
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (
     ConsoleTable,
@@ -38,7 +38,7 @@ _MEDIANS = (
     *(ROTATION_BOUND, metrics.OVER_BOUND),
 )
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS, *_MEDIANS),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED, metrics.KEYPOINTS, *_MEDIANS),
     metrics.QUERY_MILLISECONDS,
 )
 
@@ -70,7 +70,8 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 def _summarize(category: str, method: str, cells: Cells) -> Summary:
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
-    count = int(chosen.sum())
+    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
+    count = int(chosen.sum()) - skipped
     seconds = np.asarray(solved["seconds"], dtype=float)
     values = {
         "instances": count,
@@ -78,5 +79,6 @@ def _summarize(category: str, method: str, cells: Cells) -> Summary:
         "keypoints": mean_of(solved["keypoints"]),
         **{metric.key: median_of(solved[metric.key]) for metric in _MEDIANS},
         "milliseconds": median_of(1e3 * seconds),
+        "skipped": skipped,
     }
     return Summary(category, {"category": category, "method": method}, values)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import Instance
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.result import AlignAlternative, AlignResult
-from cadalign.fitting.joint.view import View
 from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
-from cadalign.shapes.model import ShapeModel
+
+if TYPE_CHECKING:
+    from cadalign.fitting.joint.result import AlignAlternative, AlignResult
+    from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCALE = 1e-6
 
@@ -96,6 +97,10 @@ def align_instance(
     DegenerateError
         As `cadalign.align`.
     """
+    # Only here: their kernels take time to import, and most experiments do without.
+    from cadalign.fitting.joint.align import align
+    from cadalign.fitting.joint.view import View
+
     known = np.isin(instance.semantic_ids, shape.ids)
     view = View(
         instance.camera,

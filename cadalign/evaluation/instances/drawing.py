@@ -24,7 +24,7 @@ from cadalign.render.drawing.color import ByteImage
 
 _THUMB_WIDTH = 320
 _QUALITY, _THUMB_QUALITY = 85, 75
-_EFFORT = 4
+_EFFORT = 2  # of WebP's 6: half the time of 4, files 3 % larger
 
 
 def draw_instance(
@@ -60,8 +60,8 @@ def draw_instance(
     thumb = draw_overlay(
         small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
     )
-    _write_webp(folder.pictures / f"{stem}.webp", plain, quality=_QUALITY)
-    _write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
+    write_webp(folder.pictures / f"{stem}.webp", plain)
+    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
     preview = folder.previews / f"{record_stem(category, model_id)}.json"
     if view == 0 or not preview.exists():
         write_preview(preview, instance.scene.mesh)
@@ -77,7 +77,8 @@ def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage,
     return small, resized_camera(camera, width, height)
 
 
-def _write_webp(path: Path, image: ByteImage, *, quality: int) -> None:
+def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:
+    """Write a picture for a page, whole or not at all."""
     from PIL import Image
 
     picture = Image.fromarray(image)

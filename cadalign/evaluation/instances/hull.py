@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError
+from cadalign.errors import TooFewVisibleError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -74,7 +74,7 @@ def sample_hull_view(
 ) -> tuple[Alignment, npt.NDArray[np.bool_]]:
     """Draw a view, as `cadalign.render.sample_view` does, in which enough keypoints count as seen.
 
-    Returns the pose and a mask (k,) of the visible keypoints; raises DegenerateError if no view
+    Returns the pose and a mask (k,) of the visible keypoints; raises TooFewVisibleError if no view
     shows enough of them. The camera has no lens distortion.
     """
     count = len(hull.xyz)
@@ -92,7 +92,7 @@ def sample_hull_view(
                 return Alignment(rotation, translation, np.ones(3), is_valid=True), visible
             best = max(best, int(visible.sum()))
     found = f"the best of {_ATTEMPTS} views shows {best}" if best else f"there are only {count}"
-    raise DegenerateError(
+    raise TooFewVisibleError(
         f"{min_visible} keypoints should be visible, but {found}",
         where="keypoints",
         fix="lower min_visible, or leave this model out",

@@ -14,6 +14,7 @@ from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
 from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
@@ -162,7 +163,8 @@ def _stretched(
     """The instance of a view, with a stretch and noise drawn for it."""
     stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
     seen = xyz[visible]
-    projected = KEYPOINT_CAMERA.project(cam_from_model.apply(seen))
+    in_camera = seen @ cam_from_model.linear.T + cam_from_model.translation
+    projected = KEYPOINT_CAMERA.pixels_from_normalized(perspective(in_camera))
     return Instance(
         camera=KEYPOINT_CAMERA,
         cam_from_model=cam_from_model,

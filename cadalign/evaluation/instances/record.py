@@ -19,9 +19,9 @@ A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON 
     }
 
 ``bounds`` and ``points_3d`` are those of the model that the methods were given, which is the
-dataset's times ``stretch``. Estimates of the object's own shape take the model's box to the
-estimated one; their ``std`` is that of lengths relative to the mean shape, or the model that was
-stretched. They and their alternatives have, besides,
+dataset's times ``stretch``. ``gt`` is null where the truth is not known. Estimates of the object's
+own shape take the model's box to the estimated one; their ``std`` is that of lengths relative to
+the mean shape, or the model that was stretched. They and their alternatives have, besides,
 ``"warp": {"from": [[3], ...], "to": [[3], ...]}``: keypoints of that model, and their places on the
 estimated object in the coordinates of the model, by which the model is warped before the pose.
 ``std`` and ``sigma`` are null for methods that have none.
@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError
 from cadalign.evaluation.instances.aligned import AlignedAlternative, AlignedShape
 from cadalign.evaluation.instances.instance import Instance
@@ -44,6 +44,7 @@ from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.io.files import dense_json
 
 RECORD_COLUMNS: Columns = (
@@ -74,24 +75,48 @@ def record_row(
     instance: Instance, outcomes: Sequence[Outcome], estimates: Sequence[Estimate]
 ) -> Row:
     """The record of an instance as a table row, from each method's outcome and its estimate."""
-    camera = instance.camera
+    return record_of(
+        camera=instance.camera,
+        gt=instance.gt,
+        stretch=1 / instance.gt.scale,
+        bounds=instance.bounds,
+        points_3d=instance.points_3d,
+        points_2d=instance.points_2d,
+        semantic_ids=instance.semantic_ids,
+        outcomes=outcomes,
+        estimates=estimates,
+    )
+
+
+def record_of(
+    *,
+    camera: Camera,
+    gt: Alignment | None,
+    stretch: FloatArray,
+    bounds: FloatArray,
+    points_3d: FloatArray,
+    points_2d: FloatArray,
+    semantic_ids: IntArray,
+    outcomes: Sequence[Outcome],
+    estimates: Sequence[Estimate],
+) -> Row:
+    """The record of an instance of these parts; see the module's documentation."""
+    names = ("width", "height", "fx", "fy", "cx", "cy")
     record = {
-        "camera": {
-            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
-        },
-        "gt": _pose(instance.gt),
-        "stretch": _rounded(1 / instance.gt.scale),
-        "bounds": _rounded(instance.bounds),
-        "points_3d": _rounded(instance.points_3d),
-        "points_2d": _rounded(instance.points_2d, _PIXEL_DIGITS),
-        "semantic_ids": instance.semantic_ids.tolist(),
+        "camera": {name: getattr(camera, name) for name in names},
+        "gt": None if gt is None else _pose(gt),
+        "stretch": _rounded(stretch),
+        "bounds": _rounded(bounds),
+        "points_3d": _rounded(points_3d),
+        "points_2d": _rounded(points_2d, _PIXEL_DIGITS),
+        "semantic_ids": semantic_ids.tolist(),
         "estimates": [
             _described(outcome, estimate)
             for outcome, estimate in zip(outcomes, estimates, strict=True)
         ],
     }
-    names = {name: outcomes[0].names[name] for name in ("category", "model_id", "view")}
-    return {**names, "exhibit": dense_json(record)}
+    row = {name: outcomes[0].names[name] for name in ("category", "model_id", "view")}
+    return {**row, "exhibit": dense_json(record)}
 
 
 def record_stem(category: str, model_id: str, view: int = 0) -> str:

@@ -30,7 +30,8 @@ sym_rotation_error_deg, sym_translation_error, sym_box_iou
 box_iou_up_to_scale
     Of runs with learned shapes only: after the estimate was scaled about the camera centre.
 
-The metrics of failed rows are empty.
+The metrics of failed rows are empty. Rows of instances that no view shows enough keypoints of have
+the status ``skipped``; they count in no share and no median.
 """
 
 from __future__ import annotations
@@ -133,14 +134,14 @@ class KeypointNetExperiment:
 
     def evaluate(self, tasks: Sequence[KeypointTask]) -> Rows:
         """A row for every task and method, and a record for every instance."""
-        instances: list[Instance | str] = []
+        instances: list[Instance | Exception] = []
         extra = []
         for task in tasks:
             start = time.perf_counter()
             try:
                 instances.append(self._instance(task))
             except Exception as error:
-                instances.append(reason_of(error))
+                instances.append(error)
             extra.append(time.perf_counter() - start)
         answers_of: list[list[tuple[Outcome, Estimate]]] = [[] for _ in tasks]
         for method in (*self.options.methods, SHAPE):
@@ -175,7 +176,7 @@ class KeypointNetExperiment:
         return make_hull_instance(task.hull, task.semantic_ids, names=model, **how)
 
     def _evaluate_method(
-        self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | str]
+        self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | Exception]
     ) -> list[tuple[Outcome, Estimate]]:
         """One method's outcome, and the estimate it is of, for every task."""
         pairs = zip(tasks, instances, strict=True)
@@ -188,9 +189,9 @@ class KeypointNetExperiment:
         share = (time.perf_counter() - start) / max(len(usable), 1)
         answers: list[tuple[Outcome, Estimate]] = []
         for task, instance in zip(tasks, instances, strict=True):
-            if isinstance(instance, str):
-                error = DataError(instance)
-                answers.append((_failure(task, method, instance), error))
+            if isinstance(instance, Exception):
+                outcome = Outcome.without_instance(instance, task.names(method), **_known(task))
+                answers.append((outcome, DataError(outcome.reason)))
                 continue
             start = time.perf_counter()
             estimate = next(estimates)
@@ -312,12 +313,15 @@ def _facts(task: KeypointTask, instance: Instance) -> Row:
     }
 
 
+def _known(task: KeypointTask) -> Row:
+    """The facts where there is no instance."""
+    return {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
+
+
 def _failure(
     task: KeypointTask, method: str, reason: str, instance: Instance | None = None
 ) -> Outcome:
-    known = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-    if instance is not None:
-        known = _facts(task, instance)
+    known = _known(task) if instance is None else _facts(task, instance)
     return Outcome.failure(reason, task.names(method), **known)
 
 

@@ -11,7 +11,7 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import Summary
@@ -68,7 +68,7 @@ def _draw_curves(path: Path, run: Run, metric: Metric) -> None:
     with new_figure(figsize=(6.4, 4.2)) as figure:
         axes = figure.add_subplot()
         for method in run.methods:
-            chosen = cells["method"] == method
+            chosen = (cells["method"] == method) & (cells["status"] != SKIPPED)
             values: FloatArray = np.sort(errors[chosen & (cells["status"] == OK)])
             share = 100 * np.arange(1, len(values) + 1) / max(int(chosen.sum()), 1)
             look = look_of(method)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 from cadalign.datasets import KeypointNet
+from cadalign.errors import InputError
 from cadalign.evaluation.keypointnet.experiment import REQUIRED_COLUMNS, KeypointNetExperiment
 from cadalign.evaluation.keypointnet.figures import draw_figures
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
@@ -26,9 +26,13 @@ _CHUNK, _CHUNK_DRAWN = 64, 8
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models."""
-    dataset = KeypointNet(options.root).subset(categories=options.categories, split=options.split)
+    dataset = KeypointNet(options.root, shapenet_root=options.shapenet).subset(
+        categories=options.categories, split=options.split
+    )
     tasks = KeypointTasks(dataset, options)
     drawn = options.render == "overlay"
+    if drawn:
+        _check_drawable(dataset, options)
     shapes = NO_SHAPES
     of_shapes: dict[str, Any] = {}
     if options.shape is not None:
@@ -36,7 +40,7 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         of_shapes = {"shape": str(options.shape.absolute()), "shapes": shapes.fingerprint()}
     pictures = folder.made_for_pictures() if drawn else None
     experiment = KeypointNetExperiment(options, pictures, shapes)
-    given = {name: value for name, value in asdict(options).items() if name != "shape"}
+    given = {name: value for name, value in options.as_config().items() if name != "shape"}
     config = {
         **given,
         **of_shapes,
@@ -45,6 +49,22 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "annotations": tasks.fingerprint(),
     }
     return Plan(experiment, tasks, config, _CHUNK_DRAWN if drawn else _CHUNK)
+
+
+def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:
+    """Refuse overlays, before the run, where there is no mesh to draw."""
+    if options.visibility == "hull":
+        raise InputError(
+            "visibility hull uses no meshes, so that there is nothing to draw",
+            where="render",
+            fix="choose auto or rays, or draw nothing",
+        )
+    if not dataset.subset(with_mesh=True).ids():
+        raise InputError(
+            "none of the models has a mesh, so that there is nothing to draw",
+            where="render",
+            fix="name ShapeNet's folder by shapenet, or draw nothing",
+        )
 
 
 def describe(run: Run) -> str:
@@ -82,7 +102,8 @@ ON_INSTANCES: dict[str, Any] = {
         "prediction."
     ),
     "note": (
-        "Medians over the instances that did not fail; the rates count failures. The "
+        "Medians over the instances that did not fail; the rates count failures, and not "
+        "the instances that were skipped, since no view shows enough of their keypoints. The "
         "symmetry-aware error (sym.) takes rotations that map a model onto itself for right. A "
         "rate counts instances whose symmetry-aware rotation, translation in diagonals of the "
         "model and both scales are that good."

@@ -1,6 +1,7 @@
 """Medians and success rates of methods on the models of a category.
 
-Cells of a summary: ``instances`` and ``failed``; ``keypoints``, the mean number of those that did
+Cells of a summary: ``instances``, those that were not skipped, ``failed`` and ``skipped``;
+``keypoints``, the mean number of those that did
 not fail; medians of the result table's errors over these, NaN where all failed; those up to scale
 only in runs that have them; ``success_5deg_5pct`` and ``success_10deg_10pct``, the share of all
 instances, failed ones too, with symmetry-aware rotation error, translation error in diagonals of
@@ -16,7 +17,7 @@ import numpy as np
 
 from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.methods import LIMIT
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (
     ALL,
@@ -38,7 +39,8 @@ TABLE = (
 )
 """Columns of the plain medians."""
 HEADLINE = (
-    *(metrics.INSTANCES, metrics.FAILED, *TABLE, *metrics.UP_TO_SCALE, metrics.SYM_ROTATION),
+    *(metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED),
+    *(*TABLE, *metrics.UP_TO_SCALE, metrics.SYM_ROTATION),
     *(metrics.SUCCESS_5, metrics.SUCCESS_10, metrics.OVER_BOUND),
 )
 
@@ -81,7 +83,9 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     rest = (metrics.SYM_ROTATION, metrics.SUCCESS_5)
     if metrics.BOX_IOU_UP_TO_SCALE.key in run.cells:  # the table must not be wider
         rest = metrics.UP_TO_SCALE
-    shown = (metrics.INSTANCES, metrics.FAILED, *TABLE, *rest)
+    counts = (metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED)
+    told = [each for each in counts if metrics.told(each, [s[each.key] for s in summaries])]
+    shown = (*told, *TABLE, *rest)
     return ConsoleTable(
         title="Medians per category and method; success over all instances",
         labels=("category", "method"),
@@ -96,16 +100,18 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 def _summarize_method(category: str, method: str, cells: Cells, bound: float) -> Summary:
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
-    count = int(chosen.sum())
+    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
+    count = int(chosen.sum()) - skipped
     medians = {name: median_of(solved[name]) for name in MEDIANS if name in solved}
     values = {
         "instances": count,
         "failed": count - len(solved["method"]),
         "keypoints": mean_of(solved["keypoints"]),
         **medians,
-        "success_5deg_5pct": _success(solved, 5.0, 0.05) / max(count, 1),
-        "success_10deg_10pct": _success(solved, 10.0, 0.10) / max(count, 1),
+        "success_5deg_5pct": _success(solved, 5.0, 0.05) / count if count else np.nan,
+        "success_10deg_10pct": _success(solved, 10.0, 0.10) / count if count else np.nan,
         "over_limit": medians["rotation_error_deg"] / bound if bound > 0 else np.nan,
+        "skipped": skipped,
     }
     return Summary(category, {"category": category, "method": method}, values)
 

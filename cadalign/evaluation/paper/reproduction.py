@@ -22,7 +22,9 @@ from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.spec import SPEC as SIMULATION
 from cadalign.evaluation.summary import ALL, Summary, csv_text
 from cadalign.io.files import write_text, writing
+from cadalign.web import asset, fill
 
+_TITLE = "The AEPnP paper's tables and figures"
 _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
 
 
@@ -46,18 +48,29 @@ Announce = Callable[[str], Callable[[Progress], object]]
 def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
     """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
 
-    ``announce`` is told the name of the next run, and gives the function to tell its progress to.
+    ``index.html`` is the same as a page. ``announce`` is told the name of the next run, and gives
+    the function to tell its progress to.
     """
     figures = plan.out / "figures"
     with writing(figures):
         figures.mkdir(parents=True, exist_ok=True)
-    sections = ["# The AEPnP paper's tables and figures\n", _settings(plan)]
+    sections = [f"# {_TITLE}\n", _settings(plan)]
     sections += [_table_section(plan, announce)]
     for name in SWEEPS:
         sections.append(_sweep_section(plan, name, announce))
     report = plan.out / "report.md"
-    write_text(report, "\n".join(sections))
+    text = "\n".join(sections)
+    write_text(report, text)
+    write_text(plan.out / "index.html", _page(text))
     return report
+
+
+def _page(text: str) -> str:
+    """The report in Markdown as a page that needs no network."""
+    from markdown_it import MarkdownIt
+
+    body = MarkdownIt("commonmark").enable("table").render(text)
+    return fill("paper.html", title=_TITLE, style=asset("report.css"), body=body)
 
 
 def _settings(plan: PaperPlan) -> str:

@@ -16,6 +16,8 @@ rank
     Of the first of these, 1 for the best match; empty beyond 50, and in the leave-out protocol.
 matched_category, matched_id, score
     The best match and its probability.
+none_probability
+    That the object is none of the library's models.
 shared, rms_px
     Keypoints that it shares with the image, and their residuals [px].
 shape_distance
@@ -76,11 +78,12 @@ _NAMES: Columns = (
 COLUMNS: Columns = (
     *(*_NAMES, ("status", str), ("reason", str), ("alike", int), ("rank", int)),
     *(("matched_category", str), ("matched_id", str), ("score", float), ("shared", int)),
+    ("none_probability", float),
     *(("rms_px", float), ("shape_distance", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("rotation_error_deg", float)),
 )
 REQUIRED_COLUMNS: Columns = tuple(
-    column for column in COLUMNS if column[0] != "box_iou_up_to_scale"
+    column for column in COLUMNS if column[0] not in ("box_iou_up_to_scale", "none_probability")
 )
 """Those that all runs have; earlier ones lack the others."""
 
@@ -196,6 +199,7 @@ def match_values(
         "matched_category": first.category,
         "matched_id": first.model_id,
         "score": first.score,
+        "none_probability": first.none_probability,
         "shared": first.shared,
         "rms_px": first.rms,
         "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,

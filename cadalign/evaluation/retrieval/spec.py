@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 
 from cadalign.evaluation.metrics import QUERIES
@@ -32,7 +31,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
     if claimed is None or claimed.get("library") == name:
         library.save(file)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "library": name,
@@ -47,7 +46,9 @@ def _library_of(options: RetrievalRunOptions) -> Library:
     if options.root.is_file():
         return Library.open(options.root)
     categories = None if options.whole_library else options.categories
-    return Library.from_dataset(KeypointNet(options.root), categories=categories)
+    return Library.from_dataset(
+        KeypointNet(options.root, shapenet_root=options.shapenet), categories=categories
+    )
 
 
 def _describe(run: Run) -> str:
@@ -70,6 +71,7 @@ SPEC = Spec(
     note=(
         "Leave-in: the library holds the true model; models whose keypoints are the same after "
         "stretch count as it. Leave-out: it and these are taken out. Shape distance, box IoU, "
-        "rotation error and time are medians, the first three of the best match."
+        "rotation error and time are medians, the first three of the best match. None of "
+        "these: the share of queries whose object is more likely none of the models than one."
     ),
 )

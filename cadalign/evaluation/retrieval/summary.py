@@ -4,10 +4,12 @@ Cells of a summary: ``queries``, the number made, without models of which no vie
 keypoints; ``failed``, those without a match; ``rank_1`` and ``rank_5``, the share of the queries
 with the true model, or one that counts as it, first or among the first 5; ``reciprocal_rank``, the
 mean of one over the rank, 0 beyond 50 (these three are NaN in the leave-out protocol); ``score``,
-the mean probability of the best match, which is the rank-1 rate where it is calibrated; of the best
-match the medians ``shape_distance``, ``box_iou``, ``box_iou_up_to_scale`` (NaN in runs that have
-none), ``rotation_error_deg`` and the mean ``mean_box_iou``; ``milliseconds``, the median time of a
-query on one core.
+the mean probability of the best match, which is the rank-1 rate where it is calibrated; ``none``,
+the share of the queries whose object is more likely none of the models than one, which is false
+in the leave-in protocol and true in the other (NaN in runs without it); of the best match
+the medians ``shape_distance``, ``box_iou``, ``box_iou_up_to_scale`` (NaN in runs that have none),
+``rotation_error_deg`` and the mean ``mean_box_iou``; ``milliseconds``, the median time of a query
+on one core.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, med
 
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
-    *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
     *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
 )
 _KEYPOINTS = replace(metrics.KEYPOINTS, label="keypoints in the image", log=False)
@@ -68,7 +70,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """Rates and medians over all categories for the console."""
     shown = (
         *(metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK, metrics.SCORE),
-        *(metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+        *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
         *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
     )
     return ConsoleTable(
@@ -144,6 +146,8 @@ def _summarize(
     queries = int(made.sum())
     ranks = cells["rank"][made].astype(float)  # NaN beyond 50
     up_to_scale = cells.get("box_iou_up_to_scale", np.full(len(solved), np.nan))
+    none = cells.get("none_probability", np.full(len(solved), np.nan))
+    known = solved & np.isfinite(none)
     ranked = queries and protocol == LEAVE_IN
     values = {
         "queries": queries,
@@ -152,6 +156,7 @@ def _summarize(
         "rank_5": float((ranks <= 5).mean()) if ranked else np.nan,
         "reciprocal_rank": float(np.nan_to_num(1 / ranks).mean()) if ranked else np.nan,
         "score": mean_of(cells["score"][solved]),
+        "none": float((none > 0.5)[known].mean()) if known.any() else np.nan,
         "shape_distance": median_of(cells["shape_distance"][solved]),
         "box_iou": median_of(cells["box_iou"][solved]),
         "box_iou_up_to_scale": median_of(up_to_scale[solved]),

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.shapes.tails import probability_within
 
 # Of a covariance's largest eigenvalue, and of the square of the largest length [units squared].
 _NO_VARIANCE = 1e-12
 
 
-def probability_level(error: FloatArray, covariance: FloatArray) -> float | None:
-    """Probability of the smallest ellipsoid of a Gaussian about the estimate that holds the truth.
+def probability_level(
+    error: FloatArray, covariance: FloatArray, degrees_of_freedom: float | None = None
+) -> float | None:
+    """Probability of the smallest ellipsoid about the estimate that holds the truth.
 
     Parameters
     ----------
@@ -19,6 +22,8 @@ def probability_level(error: FloatArray, covariance: FloatArray) -> float | None
         Estimate minus truth.
     covariance : (k, k) float
         As the estimator states it. Directions without variance are held to be known.
+    degrees_of_freedom : float, optional
+        Of a t distribution; None for a Gaussian.
 
     Returns
     -------
@@ -33,8 +38,6 @@ def probability_level(error: FloatArray, covariance: FloatArray) -> float | None
     >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
     True
     """
-    from scipy.special import gammainc
-
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
     if not np.isfinite(values).all() or not free.any():
@@ -43,4 +46,4 @@ def probability_level(error: FloatArray, covariance: FloatArray) -> float | None
     if (parts[~free] ** 2 > 1e-6 * values[-1]).any():
         return 1.0
     square = float((parts[free] ** 2 / values[free]).sum())
-    return float(gammainc(free.sum() / 2, square / 2))  # the distribution of chi-square
+    return float(probability_within(square, int(free.sum()), degrees_of_freedom))

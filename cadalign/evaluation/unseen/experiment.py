@@ -24,9 +24,9 @@ keypoint_error
     it to be least [diagonals].
 rotation_level, stretch_level
     Probability that the method gives the smallest region that holds the truth, about its estimate:
-    of a chi-square of 3 for the rotation, and of 2 for the ratios of the box's lengths, which are
-    free of the object's size. Uniform over [0, 1] where deviations are right; empty where the
-    method states none.
+    of 3 coordinates for the rotation, and of 2 for the ratios of the box's lengths, which are free
+    of the object's size; Gaussian, or of as heavy tails as the shape model found. Uniform over
+    [0, 1] where deviations are right; empty where the method states none.
 keypoints_within_68, keypoints_within_95
     Share of the object's keypoints that lie within the ellipsoids of these probabilities about
     their estimates in the model's frame, whose unit is the diagonal of every model.
@@ -154,15 +154,13 @@ def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
     box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
     gt_box = Box.from_model(sighting.bounds, gt)
     boxes = {"est": box, "gt": gt_box}
-    centres = {
-        "est": Alignment(est.rotation, box.center, np.ones(3)),
-        "gt": Alignment(gt.rotation, gt_box.center, np.ones(3)),
-    }
+    centre = Alignment(est.rotation, box.center, np.ones(3))
+    gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
         "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in found.poses),
-        "translation_error": translation_error(**centres),
-        "translation_error_up_to_scale": translation_error_up_to_scale(**centres),
+        "translation_error": translation_error(est=centre, gt=gt_centre),
+        "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
         "box_iou": overlap(**boxes),
         "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
         "stated_box_iou_up_to_scale": overlap_up_to_scale(
@@ -191,18 +189,19 @@ def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: In
     turn = vector_from_rotation(est.rotation @ sighting.gt.rotation.T)
     lengths = np.ptp(result.bounds, axis=0) * est.scale
     true_lengths = np.ptp(sighting.bounds, axis=0)
-    level = None
+    level, freedom = None, result.degrees_of_freedom
     if (lengths > 0).all() and (true_lengths > 0).all():
         ratios = _RATIOS @ np.log(lengths / true_lengths)
-        level = probability_level(ratios, _RATIOS @ result.covariance[6:, 6:] @ _RATIOS.T)
+        spread = _RATIOS @ result.covariance[6:, 6:] @ _RATIOS.T
+        level = probability_level(ratios, spread, freedom)
     gaps = result.points_3d[rows] * est.scale - sighting.xyz[known]
     levels = [
         found
         for gap, covariance in zip(gaps, result.points_covariance[rows], strict=True)
-        if (found := probability_level(gap, covariance)) is not None
+        if (found := probability_level(gap, covariance, freedom)) is not None
     ]
     return {
-        "rotation_level": probability_level(turn, result.covariance[:3, :3]),
+        "rotation_level": probability_level(turn, result.covariance[:3, :3], freedom),
         "stretch_level": level,
         "keypoints_within_68": _share(levels, 0.68),
         "keypoints_within_95": _share(levels, 0.95),

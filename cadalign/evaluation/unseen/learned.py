@@ -42,7 +42,14 @@ class Learned:
         digest = hashlib.sha256(self.opened_library().fingerprint.encode())
         for category, path in self.shapes:
             shape = _open_shape(path)
-            digest.update(f"{category}\0{shape.inflation!r}\0".encode())
+            digest.update(
+                f"{category}\0{shape.inflation!r}\0{shape.degrees_of_freedom!r}\0".encode()
+            )
+            if shape.few_keypoints is not None:
+                digest.update(f"{shape.few_keypoints!r}\0".encode())
+            if shape.box_margins is not None:
+                digest.update(shape.box_margins.margins.tobytes())
+                digest.update(shape.box_margins.tolerances.tobytes())
             for part in shape.components:
                 numbers = [part.weight, *part.mean.ravel(), *part.modes.ravel()]
                 digest.update(np.append(numbers, part.residual_sigma).tobytes())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 
 from cadalign.datasets import KeypointNet
@@ -22,11 +21,11 @@ _CHUNK = 8
 
 def plan(options: UnseenOptions, folder: RunFolder) -> Plan[UnseenTask]:
     """Plan a run over a split's objects; the folder gets what is learned from the other split."""
-    dataset = KeypointNet(options.root)
+    dataset = KeypointNet(options.root, shapenet_root=options.shapenet)
     tasks = UnseenTasks(dataset, options)
     learned = learn(dataset, tasks.categories, split=options.train, folder=folder)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),

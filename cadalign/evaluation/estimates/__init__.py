@@ -1,0 +1,1 @@
+"""The experiment on estimates of other programs, read from their files."""

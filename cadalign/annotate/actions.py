@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from cadalign.annotate.document import FocalChoice, Pixel
+from cadalign.annotate.action import Action, Outcome, inside
+from cadalign.annotate.choosing.switching import ChooseModel
+from cadalign.annotate.document import Document, FocalChoice, Pair, Pixel, Priors
+from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
+from cadalign.annotate.image_corners import nearest_corner
+from cadalign.annotate.objects.actions import OBJECT_ACTIONS, bring_back
+from cadalign.annotate.worklist import Mark
 from cadalign.errors import InputError, quote
-from cadalign.io.documents import Finite, ForeignDocument, Index, Point2, Point3, Text
+from cadalign.io.documents import (
+    Finite,
+    Index,
+    NotNegative,
+    Point2,
+    Point3,
+    Text,
+)
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import PhotoState, Session
 
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of an action beside the changed document, for the user."""
-
-    selected: int | None = None  # number of the pair that was placed or changed
-    message: str = ""  # such as that the click missed the model
-
-
-class Action(ForeignDocument):
-    """Base of the actions; ``pair`` fields are numbers of pairs."""
-
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        """Record the changed document, or raise a CadalignError."""
-        raise NotImplementedError
+_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
+_LONGEST_REACH = 200.0  # of a corner of the photo [px]
+_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
+_MISSED = "That click missed the model."
+MIRRORED = 0.01
+"""Largest distance of a point from a mirror image that it counts as [diagonals]."""
 
 
 class _Placing(Action, kw_only=True):
@@ -43,11 +44,13 @@ class PlaceUv(_Placing):
     """Place a photo half."""
 
     uv: Point2
+    snap: NotNegative = 0.0  # farthest corner of the photo that it goes to [px]
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
-        document, pair = state.document.place_uv(_inside(self.uv, state), self.pair)
+        uv = _snapped(self.uv, self.snap, session, state)
+        document, pair = state.document.place_uv(uv, self.pair)
         state.history.record(document)
-        return Outcome(pair)
+        return Outcome(pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class PlaceKeypoint(_Placing):
@@ -56,26 +59,71 @@ class PlaceKeypoint(_Placing):
     keypoint: Index
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
-        session.registry[self.keypoint]  # refuses an unknown one
+        state.model.registry[self.keypoint]  # refuses an unknown one
         return _place(self.keypoint, self.pair, state)
 
 
-class Pick(_Placing):
-    """Place a model half by a ray, or the keypoint ``near`` the click if it is visible."""
+class _Aiming(Action, kw_only=True):
+    """Point at the model by a ray, or at the keypoint ``near`` it if that is visible."""
 
     origin: Point3
     direction: Point3
     near: Index | None = None
+    snap: NotNegative = 0.0  # see `CadModel.pick`
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        model, registry = session.model, session.registry
+    def target(self, state: PhotoState) -> int | None:
+        """The keypoint pointed at, registered; None if the ray misses the model."""
+        model, registry = state.model.cad, state.model.registry
         origin = model.from_display(self.origin)
         if self.near is not None and model.is_seen(origin, registry[self.near].xyz):
-            return _place(self.near, self.pair, state)
-        point = model.pick(origin, self.direction)
+            return self.near
+        point = model.pick(origin, self.direction, snap=self.snap)
         if point is None:
-            return Outcome(message="That click missed the model.")
-        return _place(registry.add(point), self.pair, state)
+            return None
+        known = registry.find(point.xyz, tolerance=_SAME_PLACE * model.diagonal)
+        return registry.add(point) if known is None else known
+
+
+class Pick(_Aiming):
+    """Place a model half."""
+
+    pair: Index | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        keypoint = self.target(state)
+        if keypoint is None:
+            return Outcome(message=_MISSED)
+        return _place(keypoint, self.pair, state)
+
+
+class Repick(_Aiming):
+    """Move the model half of a pair."""
+
+    pair: Index
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        keypoint = self.target(state)
+        if keypoint is None:
+            return Outcome(self.pair, _MISSED)
+        state.history.record(state.document.exchange_keypoint(self.pair, keypoint))
+        return Outcome(self.pair)
+
+
+class PlaceMirrored(Action):
+    """Begin a pair at the mirror image of another's model point."""
+
+    pair: Index
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        keypoint = state.document.pair(self.pair).keypoint
+        registry, model = state.model.registry, state.model.cad
+        point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
+        if point is None:
+            raise InputError(
+                "its model point has no mirror image", where="pair", fix="choose another pair"
+            )
+        known = registry.find(point.xyz, tolerance=MIRRORED * model.diagonal)
+        return _place(registry.add(point) if known is None else known, None, state)
 
 
 class PlaceSuggested(_Placing):
@@ -89,7 +137,7 @@ class PlaceSuggested(_Placing):
             )
         keypoint = suggestion.point.semantic_id
         if keypoint is None:
-            keypoint = session.registry.add(suggestion.point)
+            keypoint = state.model.registry.add(suggestion.point)
         return _place(keypoint, self.pair, state)
 
 
@@ -99,12 +147,14 @@ class Move(Action):
     pair: Index
     uv: Point2
     gesture: Index | None = None
+    snap: NotNegative = 0.0  # as of `PlaceUv`
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
-        moved = state.document.move(self.pair, _inside(self.uv, state))
+        uv = _snapped(self.uv, self.snap, session, state)
+        moved = state.document.move(self.pair, uv)
         step = None if self.gesture is None else (self.pair, self.gesture)
         state.history.record(moved, step=step)
-        return Outcome(self.pair)
+        return Outcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class Release(Action):
@@ -139,7 +189,7 @@ class Rename(Action):
             raise InputError(
                 "this pair has no model point yet", where="pair", fix="click on the model first"
             )
-        session.registry.rename(keypoint, self.name)
+        state.model.registry.rename(keypoint, self.name)
         return Outcome(self.pair)
 
 
@@ -156,7 +206,7 @@ class Identify(Action):
             raise InputError(
                 f"{quote(self.label)} is no keypoint of the shape", where="label", fix="choose one"
             )
-        registry = session.registry
+        registry = state.model.registry
         if shape.is_named:
             registry.rename(keypoint, str(self.label))
             return Outcome(self.pair)
@@ -187,24 +237,86 @@ class Focal(Action):
         return Outcome()
 
 
+class Prior(Action):
+    """Choose the prior on the stretch, and whether an estimated focal length has one."""
+
+    stretch: Finite | None = None
+    focal: bool = True
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        low, high = _STRETCH_RANGE
+        if self.stretch is not None and not low <= self.stretch <= high:
+            raise InputError(
+                f"{100 * self.stretch:g} % is no weak prior on the stretch",
+                where="stretch",
+                fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
+            )
+        kept = state.document.priors.focal or state.intrinsics.likely_focal
+        priors = Priors(self.stretch, kept if self.focal else None)
+        state.history.record(replace(state.document, priors=priors))
+        return Outcome()
+
+
+class Accept(Action):
+    """Place pairs as a detector proposes: those of some keypoints, or all that are left."""
+
+    keypoints: list[Index] | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        document, number = state.document, None
+        for proposal in state.proposals:
+            keypoint = proposal.keypoint
+            if self.keypoints is not None and keypoint not in self.keypoints:
+                continue
+            if keypoint not in document.keypoints:
+                number = document.next_number
+                document = document.append(Pair(number, proposal.uv, keypoint))
+        if number is None:
+            return Outcome(message="Nothing is proposed that is not placed.")
+        state.history.record(document)
+        return Outcome(number)
+
+
+class MarkPhoto(Action):
+    """Say that a photo is done or skipped, or neither."""
+
+    mark: Mark | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        session.before_saving()
+        session.worklist = session.worklist.marked(state.photo.path.name, self.mark)
+        return Outcome()
+
+
 class Undo(Action):
     """Undo the last change."""
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
-        return Outcome(message="" if state.history.undo() else "There is nothing to undo.")
+        deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
+        if deleted is not None:
+            return bring_back(deleted)
+        before = state.marked
+        is_done = state.history.undo()
+        return _gone_through(state, before, "" if is_done else "There is nothing to undo.")
 
 
 class Redo(Action):
     """Redo the last undone change."""
 
     def apply(self, session: Session, state: PhotoState) -> Outcome:
-        return Outcome(message="" if state.history.redo() else "There is nothing to redo.")
+        before = state.marked
+        is_done = state.history.redo()
+        if state.owner.document.is_gone:
+            session.deletions.add(session.place_of(state)[0], state.owner)
+        return _gone_through(state, before, "" if is_done else "There is nothing to redo.")
 
 
 ACTIONS: dict[str, type[Action]] = {
     "place_uv": PlaceUv,
     "place_keypoint": PlaceKeypoint,
     "pick": Pick,
+    "repick": Repick,
+    "mirrored": PlaceMirrored,
     "suggested": PlaceSuggested,
     "move": Move,
     "release": Release,
@@ -212,13 +324,36 @@ ACTIONS: dict[str, type[Action]] = {
     "rename": Rename,
     "identify": Identify,
     "focal": Focal,
+    "prior": Prior,
+    **EVIDENCE_ACTIONS,
+    **OBJECT_ACTIONS,
+    "accept": Accept,
+    "model": ChooseModel,
+    "mark": MarkPhoto,
     "undo": Undo,
     "redo": Redo,
 }
 """Actions by the name that the page sends as ``do``."""
 
+DELETING = ("delete_object", "undo", "redo")
+"""Those after which undoing brings back what was deleted."""
+
 RENAMING = ("rename", "identify")
 """Those that may change the names of keypoints instead of the document."""
+
+
+def _gone_through(state: PhotoState, before: Document, nothing: str) -> Outcome:
+    """The outcome of undoing or redoing, which may concern another photo of the object.
+
+    ``nothing`` says that nothing was done, if so; ``before`` is what was marked in the photo.
+    """
+    if nothing:
+        return Outcome(message=nothing)
+    if not state.is_shown:
+        return Outcome(message="This photo is no longer one of the object's.")
+    if len(state.all_views) > 1 and state.marked == before:
+        return Outcome(message="That was a change in another photo of this object.")
+    return Outcome()
 
 
 def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:
@@ -227,10 +362,14 @@ def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:
     return Outcome(number)
 
 
-def _inside(uv: Pixel, state: PhotoState) -> Pixel:
-    """Refuse a place outside the photo."""
-    if not state.intrinsics.camera.contains(np.array([uv]))[0]:
-        raise InputError(
-            f"({uv[0]:.1f}, {uv[1]:.1f}) is outside the photo", where="uv", fix="place it inside"
-        )
-    return uv
+def _snapped(uv: Pixel, reach: float, session: Session, state: PhotoState) -> Pixel:
+    """The nearest corner of the photo within reach [px], or the place itself."""
+    uv = inside(uv, state)
+    if not reach > 0:
+        return uv
+    corner = nearest_corner(session.pixels(state), uv, reach=min(reach, _LONGEST_REACH))
+    return uv if corner is None else corner
+
+
+def _no_corner(snap: float, *, moved: bool) -> str:
+    return "No corner of the photo near this place." if snap > 0 and not moved else ""

@@ -53,6 +53,7 @@ def rank(
         ids=(*ids, *candidates),
         bounds=model.scene.bounds,
         mesh=scene.mesh,
+        scale_prior_sigma=None if result.options is None else result.options.scale_prior_sigma,
     )
     sigma = _widening(result) * marked.sigma / times
     view = View(camera, _reduced_pixels(marked.points_2d, times), ids=ids, sigma=sigma)
@@ -84,7 +85,7 @@ def _reduced_pixels(pixels: FloatArray, times: float) -> FloatArray:
 
 
 def _widening(result: FitResult) -> float:
-    """How much larger the deviations are than those of the linearised problem, on average."""
+    """Mean ratio of the deviations to those of the linearised problem."""
     linear, calibrated = result.covariance, result.posterior_covariance
     if linear is None or calibrated is None:
         return 1.0

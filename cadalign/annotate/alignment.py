@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.document import FocalChoice, Priors
 from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.fitting.fit import fit
+from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.outliers import Rows, find_outliers
 from cadalign.fitting.result import FitResult
+from cadalign.geometry.camera import Camera
 
 LEAST_PAIRS = 4
 LEAST_SIGMA = 1.0  # of clicks [px]
 _ROBUST_ROUNDS = 3
 _ROBUST_SHARE = 2.0  # of the median residual
+# Of clicks on natural points of a model that is not quite the object [longer sides of the photo],
+# and the weight of that expectation against residuals, as that of so many equations.
+_EXPECTED_NOISE = 0.005
+_NOISE_EQUATIONS = 4
+_FIRST_NOISE = 4.0  # over the expected one
+_NOISE_ROUNDS = 12
+_NOISE_TOLERANCE = 0.02
+LIKELY_STRETCH = 0.25
+"""Standard deviation of the logarithm of each scale about 1, until another one is chosen."""
 _LIKELY_STRETCH = 0.3  # standard deviation of its logarithm, if the pairs leave it open
 
 
@@ -37,12 +48,17 @@ class LiveAlignment:
     outliers: dict[int, float]  # see `find_outliers`
     sigma: float  # of the pairs [px], larger if the residuals are
     provisional: bool
-    fit_options: Mapping[str, Any]  # with which `cadalign fit` finds ``cautious``
+    fit_options: Mapping[str, Any]  # with which, and the priors, `cadalign fit` finds ``cautious``
 
     @property
     def shown(self) -> FitResult | None:
         """The result that is shown and saved."""
         return self.cautious
+
+    @property
+    def also_used(self) -> tuple[str, ...]:
+        """Evidence beyond the pairs, of which there is none here."""
+        return ()
 
     @property
     def residuals(self) -> FloatArray:
@@ -61,15 +77,23 @@ def align(
     sigma: FloatArray | None,
     intrinsics: Intrinsics,
     choice: FocalChoice,
+    priors: Priors | None = None,
 ) -> LiveAlignment:
-    """Fit the model to the complete pairs: (n, 3), (n, 2) [px] and (n,) [px], by default 1."""
+    """Fit the model to the complete pairs: (n, 3), (n, 2) [px] and (n,) [px], by default 1.
+
+    By default there is no prior but that of the photo's EXIF data on an estimated focal length.
+    """
     count = len(points_3d)
     if count < LEAST_PAIRS:
         missing = LEAST_PAIRS - count
         return LiveAlignment.missing(
             f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
         )
-    fitter = _Fitter(points_3d, points_2d, intrinsics, choice, None)
+    priors = priors or Priors(focal=intrinsics.prior)
+    focal_prior = None if choice.known else priors.focal
+    fitter = _Fitter(points_3d, points_2d, intrinsics, choice, priors.stretch, focal_prior)
+    if priors.stretch is not None:
+        return _align_with_prior(fitter, sigma)
     given = LEAST_SIGMA if sigma is None else sigma
     message = ""
     if not choice.known and count <= LEAST_PAIRS:
@@ -108,6 +132,72 @@ def align(
     )
 
 
+def _align_with_prior(fitter: _Fitter, sigma: FloatArray | None) -> LiveAlignment:
+    """Fit with a prior on the stretch, at the largest sigma that explains the residuals."""
+    weights = np.ones(len(fitter.points_3d)) if sigma is None else sigma
+    reason = ""
+    for attempt, assumed in fitter.attempts():
+        try:
+            result, factor = _settle(attempt, weights)
+        except DegenerateError as error:
+            reason = error.what
+            continue
+        except CadalignError as error:
+            return LiveAlignment.missing(f"No alignment: {error}.")
+        unknowns = 8 if result.covariance is None else len(result.covariance)
+        given = fitter.points_3d, fitter.points_2d
+        return LiveAlignment(
+            result=result,
+            cautious=result,
+            message=assumed,
+            outliers=find_outliers(*given, attempt.fit_rows, unknowns=unknowns),
+            sigma=factor,
+            provisional=bool(assumed),
+            fit_options={"sigma": factor if sigma is None else (factor * sigma).tolist()},
+        )
+    return LiveAlignment.missing(f"No alignment yet: {reason}.")
+
+
+def _settle(fitter: _Fitter, weights: FloatArray) -> tuple[FitResult, float]:
+    """Fit at the factor of the weights (n,) [px] that explains the residuals; and that factor.
+
+    It is the fixed point of its estimate, reached from above, so that residuals first count as
+    noise, and as a stretch only where the noise does not explain them.
+    """
+    noise = ExpectedNoise.of(fitter.intrinsics.camera)
+    factor = _FIRST_NOISE * noise.sigma
+    result = fitter.fit(factor * weights)
+    # The focal length is searched for again at the end alone, which takes most of the time.
+    near = fitter if fitter.choice.known else fitter.at_focal(result.camera.fx)
+    for _ in range(_NOISE_ROUNDS):
+        squares = float(((result.residuals / weights[:, None]) ** 2).sum())
+        before = factor
+        factor = noise.with_residuals(squares, redundancy=2 * len(weights) - 8)
+        if abs(factor / before - 1) < _NOISE_TOLERANCE:
+            break
+        result = near.fit(factor * weights)
+    factor = max(LEAST_SIGMA, factor)
+    return fitter.fit(factor if (weights == 1).all() else factor * weights), factor
+
+
+@dataclass(frozen=True)
+class ExpectedNoise:
+    """Deviation of clicks on natural points of a model that is not quite the object [px]."""
+
+    sigma: float
+
+    @classmethod
+    def of(cls, *cameras: Camera) -> ExpectedNoise:
+        """That of the cameras' photos, on average."""
+        sides = [max(camera.width, camera.height) for camera in cameras]
+        return cls(_EXPECTED_NOISE * sum(sides) / len(sides))
+
+    def with_residuals(self, squares: float, *, redundancy: int) -> float:
+        """The deviation in view of residuals, by their sum of squares and their redundancy."""
+        expected = _NOISE_EQUATIONS * self.sigma**2
+        return math.sqrt((squares + expected) / (redundancy + _NOISE_EQUATIONS))
+
+
 def _estimate_sigma(result: FitResult, sigma: FloatArray | None, *, redundancy: int) -> float:
     """Estimate the common factor of the sigmas, by default 1 px, from the residuals."""
     if redundancy <= 0:
@@ -125,6 +215,23 @@ class _Fitter:
     intrinsics: Intrinsics
     choice: FocalChoice
     scale_prior_sigma: float | None
+    focal_prior: FocalPrior | None
+    stretch: str | None = None
+
+    def attempts(self) -> Iterator[tuple[_Fitter, str]]:
+        """Fits to try, the best first, down to what is left where the pairs do not suffice."""
+        yield self, ""
+        fitter = self
+        if not self.choice.known:
+            prior = self.focal_prior
+            fitter = self.at_focal(self.intrinsics.camera.fx if prior is None else prior.focal)
+            yield fitter, "The focal length is assumed: add a pair elsewhere to have it estimated."
+        rigid = replace(fitter, scale_prior_sigma=None, stretch="none")
+        yield rigid, "The model is shown unstretched: add a pair elsewhere."
+
+    def at_focal(self, pixels: float) -> _Fitter:
+        """The same at a known focal length."""
+        return replace(self, choice=FocalChoice(known=True, pixels=pixels), focal_prior=None)
 
     def fit(self, sigma: float | FloatArray | None) -> FitResult:
         """Fit all pairs as `cadalign fit` does, with one sigma or (n,) [px], or to be estimated."""
@@ -149,6 +256,7 @@ class _Fitter:
             sigma=sigma,
             loss=loss,
             scale_prior_sigma=self.scale_prior_sigma,
+            stretch=self.stretch,
             focal="known" if self.choice.known else "estimate",
-            focal_prior=None if self.choice.known else self.intrinsics.prior,
+            focal_prior=None if self.choice.known else self.focal_prior,
         )

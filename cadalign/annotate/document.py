@@ -1,13 +1,19 @@
-"""Annotation document of one photo: pairs of a photo point and a keypoint of the model.
+"""Annotation document of one object: pairs of a photo point and a keypoint of the model.
+
+The document is that of the object's first photo; those of its further photos are held by it.
 
 Documents are immutable; every edit makes a new one, which the history keeps for undo and redo.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
+from cadalign.annotate.evidence import Evidence
 from cadalign.errors import InputError
+from cadalign.fitting.focal.prior import FocalPrior
 
 Pixel = tuple[float, float]
 _LONGEST = 1000  # of a history
@@ -22,6 +28,7 @@ class Pair:
     keypoint: int | None = None  # the model half: a semantic id
     sigma: float | None = None  # of ``uv`` [px], if the observation file gives one
     confidence: float | None = None  # in the observation file
+    depth: float | None = None  # in the observation file [model units]
 
     @property
     def complete(self) -> bool:
@@ -38,12 +45,99 @@ class FocalChoice:
 
 
 @dataclass(frozen=True)
+class Priors:
+    """Priors on stretch and focal length until the pairs say otherwise; None for none.
+
+    Parameters
+    ----------
+    stretch : float, optional
+        Standard deviation of the logarithm of each scale about 1.
+    focal : FocalPrior, optional
+        On a focal length that is estimated.
+    """
+
+    stretch: float | None = None
+    focal: FocalPrior | None = None
+
+    def fit_options(self, exif: FocalPrior | None) -> dict[str, Any]:
+        """Options with which `cadalign fit` has them, where it takes the EXIF data's otherwise."""
+        options: dict[str, Any] = {}
+        if self.stretch is not None:
+            options["scale_prior_sigma"] = self.stretch
+        if self.focal != exif:
+            options["focal_prior"] = None if self.focal is None else asdict(self.focal)
+        return options
+
+
+@dataclass(frozen=True)
+class FurtherView:
+    """The annotations of an object's further photo, of which ``photo`` is the file."""
+
+    photo: str
+    document: Document
+
+
+@dataclass(frozen=True)
 class Document:
-    """All annotations of one photo; ``next_number`` is the number of the next pair."""
+    """All annotations of one object in one photo; ``next_number`` is the number of the next pair.
+
+    Prior on the stretch, known lengths and name are the object's: those of its further photos'
+    documents do not count.
+    """
 
     pairs: tuple[Pair, ...] = ()
     focal: FocalChoice = FocalChoice(known=False)
+    priors: Priors = Priors()
     next_number: int = 1
+    evidence: Evidence = field(default_factory=Evidence)
+    name: str = ""  # of the object, if the user gave one
+    is_deleted: bool = False
+    further_views: tuple[FurtherView, ...] = ()
+
+    @property
+    def is_empty(self) -> bool:
+        """True if nothing is marked."""
+        return not (self.pairs or self.further_views) and self.evidence == Evidence()
+
+    @property
+    def is_gone(self) -> bool:
+        """True if the object was deleted, and nothing was marked since."""
+        return self.is_deleted and self.is_empty
+
+    def view(self, photo: str) -> Document | None:
+        """The document of a further photo, with what is the object's; None if there is none."""
+        for view in self.further_views:
+            if view.photo == photo:
+                own = view.document
+                return replace(
+                    own,
+                    priors=replace(own.priors, stretch=self.priors.stretch),
+                    evidence=replace(own.evidence, lengths=self.evidence.lengths),
+                    name=self.name,
+                )
+        return None
+
+    def with_view(self, photo: str, document: Document) -> Document:
+        """The document with that of a further photo, which is added if it has none."""
+        others = [view.photo for view in self.further_views]
+        views = [
+            FurtherView(photo, document) if view.photo == photo else view
+            for view in self.further_views
+        ]
+        if photo not in others:
+            views.append(FurtherView(photo, document))
+        return replace(
+            self,
+            further_views=tuple(views),
+            priors=replace(self.priors, stretch=document.priors.stretch),
+            evidence=replace(self.evidence, lengths=document.evidence.lengths),
+            name=document.name,
+        )
+
+    def without_view(self, photo: str) -> Document:
+        """The document without that of a further photo."""
+        left = tuple(view for view in self.further_views if view.photo != photo)
+        return replace(self, further_views=left)
 
     @property
     def complete_pairs(self) -> tuple[Pair, ...]:
@@ -76,13 +170,7 @@ class Document:
 
     def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Document, int]:
         """Place the model half of a pair, as `place_uv`; it must not be placed already."""
-        for position, pair in enumerate(self.pairs, start=1):
-            if pair.keypoint == keypoint:
-                raise InputError(
-                    f"this keypoint is already used by pair {position}",
-                    where="keypoint",
-                    fix="move or delete that pair: a keypoint occurs once in a photo",
-                )
+        self._refuse_second(keypoint)
         pair = self._lacking("keypoint", preferred)
         return self._with(replace(pair, keypoint=keypoint)), pair.number
 
@@ -99,12 +187,22 @@ class Document:
 
     def exchange_keypoint(self, number: int, keypoint: int) -> Document:
         """Replace the model half of a pair, of which it keeps the photo half."""
+        self._refuse_second(keypoint, number)
         return self._with(replace(self.pair(number), keypoint=keypoint))
 
     def delete(self, number: int) -> Document:
         """Delete a pair."""
         gone = self.pair(number)
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
+
+    def _refuse_second(self, keypoint: int, own: int | None = None) -> None:
+        for pair in self.pairs:
+            if pair.keypoint == keypoint and pair.number != own:
+                raise InputError(
+                    f"this keypoint is already used by pair {pair.number}",
+                    where="keypoint",
+                    fix="move or delete that pair: a keypoint occurs once in a photo",
+                )
 
     def _lacking(self, half: str, preferred: int | None) -> Pair:
         """The preferred pair if it lacks this half, otherwise the first that does, or a new one."""
@@ -122,12 +220,33 @@ class Document:
 class History:
     """The current document, those before it, and those that were undone."""
 
-    def __init__(self, document: Document) -> None:
+    def __init__(
+        self,
+        document: Document,
+        *,
+        before: Iterable[Document] = (),
+        after: Iterable[Document] = (),
+    ) -> None:
         self.document = document
         self.revision = 0  # grows with every change, those by undo and redo included
-        self._before: list[Document] = []
-        self._after: list[Document] = []
+        self._before = list(before)
+        self._after = list(after)
         self._step: object = None
+
+    @property
+    def object_document(self) -> Document:
+        """The document of the object, which the first photo's is."""
+        return self.document
+
+    @property
+    def before(self) -> tuple[Document, ...]:
+        """Documents that undoing leads to, the last one first reached."""
+        return tuple(self._before)
+
+    @property
+    def after(self) -> tuple[Document, ...]:
+        """Documents that redoing leads to, the last one first reached."""
+        return tuple(self._after)
 
     @property
     def can_undo(self) -> bool:

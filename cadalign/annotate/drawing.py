@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.shape_alignment import LiveShape
@@ -28,17 +29,34 @@ def drawing_of_fit(result: FitResult, wireframe: Wireframe) -> dict[str, Any]:
     }
 
 
+def box_of(live: LiveAlignment | LiveShape, wireframe: Wireframe) -> list[float]:
+    """The box of an estimate alone; empty without one."""
+    if live.shown is None:
+        return []
+    if isinstance(live, LiveShape):
+        assert live.camera is not None
+        return _flat(box_lines(live.shown.bounds, live.camera, live.alignment))
+    return _flat(box_lines(wireframe.scene.bounds, live.shown.camera, live.shown.alignment))
+
+
 def drawing_of_shape(
-    live: LiveShape, shape: ObjectShape, registry: KeypointRegistry, used: frozenset[int]
+    live: LiveShape, shape: ObjectShape | None, registry: KeypointRegistry, used: frozenset[int]
 ) -> dict[str, Any]:
     """Box and edges of the warped model, and all keypoints with the regions that hold them.
 
-    Those of keypoints that the model lacks are the faint ones.
+    Those of keypoints that the model lacks are the faint ones. There are none for the stretched
+    model, of which nothing but the pairs is estimated, nor in another view than the first.
     """
     result, camera, warped = live.shown, live.camera, live.warped
     assert result is not None
     assert camera is not None
     assert warped is not None
+    lines = {
+        "box": _flat(box_lines(result.bounds, camera, live.alignment)),
+        "lines": _flat(warped.wireframe.seen_in(camera, live.alignment)),
+    }
+    if shape is None or live.place:
+        return {**lines, "keypoints": [], "regions": [], "faint_regions": []}
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}
     keypoints = []
@@ -55,8 +73,7 @@ def drawing_of_shape(
         state = "marked" if is_used else "unmarked" if label in names else "unknown"
         keypoints.append({"uv": np.round(uv, 1).tolist(), "name": name, "state": state})
     return {
-        "box": _flat(box_lines(result.bounds, camera, result.alignment)),
-        "lines": _flat(warped.wireframe.seen_in(camera, result.alignment)),
+        **lines,
         "keypoints": keypoints,
         "regions": _regions(pixels[on_model], covariances[on_model]),
         "faint_regions": _regions(pixels[~on_model], covariances[~on_model]),

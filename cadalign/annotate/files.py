@@ -1,72 +1,92 @@
-"""Files of the annotator: an observation for each photo, and the model's keypoints.
+"""Files of the annotator: an observation for each object, and the model's keypoints.
 
 Beside the observation `photo.json` there may be
 
 - `photo_fit/fit.json`, the alignment as `cadalign fit` finds and writes it,
 - `photo.unfinished.json`, pairs with only one half placed, and those whose keypoint the category's
-  shape lacks, so that `cadalign fit` could not use them.
+  shape lacks, so that `cadalign fit` could not use them; and those of the object's further photos.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.document import Document, Pair
+from cadalign.annotate.document import Document, Pair, Priors
+from cadalign.annotate.further import FurtherEvidence, known_depths
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.names import unfinished_file
 from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.objects.unfinished import (
+    RENAME,
+    LeftOut,
+    StoredView,
+    read_unfinished,
+    with_halves,
+    with_unfinished,
+    write_unfinished,
+    written_pair,
+)
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
+from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Document as JsonDocument
 from cadalign.io.documents import (
-    Labelled,
-    NotNegative,
-    PathText,
-    Point2,
-    Positive,
-    convert,
     in_file,
     path_from,
     read_json,
+    written_path,
 )
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
 
 logger = logging.getLogger("cadalign")
 
-_UNFINISHED = "cadalign unfinished pairs"
-_RENAME = "rename it: the annotator writes a file of this name"
+_OF_THE_OBJECT = (
+    "init",
+    "model",
+    "object",
+    "shape",
+    "size",
+    "symmetry",
+    "fit",
+)  # fields that are not of one image
 SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
 
 
-class _Half(Labelled, kw_only=True):
-    """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """An earlier session's annotation; ``camera`` is None without an observation file."""
 
-    uv: Point2 | None = None
-    sigma: Positive | None = None
-    confidence: NotNegative | None = None
+    document: Document
+    camera: Camera | None
+    further: FurtherEvidence
+    fit_options: Mapping[str, Any]
+    views: tuple[StoredView, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.uv is None and self.semantic_id is None:
-            raise InputError("uv and semantic_id are both missing", fix="give one of them")
+    def priors_or(self, likely: Priors, *, exif: FocalPrior | None) -> Priors:
+        """The priors of `cadalign fit` on the stored pairs; the likely ones before there are any.
 
-
-class _Unfinished(JsonDocument):
-    """File of the pairs that the observation lacks."""
-
-    pairs: list[_Half]
-    format: str = ""
+        ``exif`` is the prior of the photo, which `cadalign fit` takes where none is stored.
+        """
+        if self.camera is None or not self.document.complete_pairs:
+            return likely
+        focal = exif
+        if "focal_prior" in self.fit_options:
+            stored = self.fit_options["focal_prior"]
+            focal = None if stored is None else FocalPrior(**stored)
+        return Priors(self.fit_options.get("scale_prior_sigma"), focal)
 
 
 @dataclass(frozen=True)
@@ -87,38 +107,43 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
+    @property
+    def written(self) -> tuple[Path, ...]:
+        """The files whose writers exclude each other."""
+        return (self.observation, self.unfinished)
+
     def read(
         self, registry: KeypointRegistry, diagonal: float, shape: ObjectShape | None = None
-    ) -> tuple[Document, Camera | None]:
+    ) -> Stored:
         """Read an earlier session's annotation.
 
-        New model points are added to the registry; ``diagonal`` is that of the model's box. The
-        second value is the observation's camera, if the file exists.
+        New model points are added to the registry; ``diagonal`` is that of the model's box.
         """
-        document, camera = Document(), None
+        document, camera, further = Document(), None, FurtherEvidence()
+        fit_options: Mapping[str, Any] = {}
+        views: list[StoredView] = []
         if self.observation.exists():
             observation = self._load()
-            camera = observation.camera
+            further = FurtherEvidence.of(observation, self.image, where=self.observation)
+            photo = observation.views[further.place]
+            camera, fit_options = photo.camera, observation.fit_options
             self._warn_of_options(observation, shape)
-            document = _document_of(observation, registry, diagonal)
+            document = _document_of(photo, registry, diagonal)
+            document = replace(document, name=observation.object_name or "")
+            views = _views_of(further, registry, diagonal)
         if self.unfinished.exists():
-            document = _with_halves(document, self.unfinished, registry)
+            unfinished = read_unfinished(self.unfinished)
+            document = with_halves(document, unfinished.pairs, registry)
+            views = with_unfinished(views, unfinished.views, self.unfinished, registry)
         self._refuse_other_fit()
-        return document, camera
+        return Stored(document, camera, further, fit_options, tuple(views))
 
-    def observation_of(
-        self,
-        pairs: Sequence[Pair],
-        registry: KeypointRegistry,
-        camera: Camera,
-        fit_options: Mapping[str, Any],
-        shape: ObjectShape | None = None,
-    ) -> Observation:
-        """The observation of some complete pairs."""
+    def image_of(
+        self, pairs: Sequence[Pair], registry: KeypointRegistry, camera: Camera
+    ) -> ObservedImage:
+        """The photo with some complete pairs."""
         keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
-        if shape is not None and shape.sigma is not None:
-            fit_options = {**fit_options, "shape_sigma": shape.sigma}
-        return Observation(
+        return ObservedImage(
             points_3d=registry.xyz(keypoints),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=camera,
@@ -127,9 +152,29 @@ class AnnotationFiles:
             names=tuple(registry[keypoint].name for keypoint in keypoints),
             confidences=filled(pair.confidence for pair in pairs),
             image=self.image,
+            depths=known_depths([pair.depth for pair in pairs]),
+        )
+
+    def observation_of(
+        self,
+        pairs: Sequence[Pair],
+        registry: KeypointRegistry,
+        camera: Camera,
+        fit_options: Mapping[str, Any],
+        further: FurtherEvidence,
+        shape: ObjectShape | None = None,
+        name: str = "",
+    ) -> Observation:
+        """The observation of some complete pairs, of the object of that name."""
+        if shape is not None and shape.sigma is not None:
+            fit_options = {**fit_options, "shape_sigma": shape.sigma}
+        return further.added_to(
+            self.image_of(pairs, registry, camera),
             model=self.model,
             fit_options=fit_options,
+            size=further.size,
             shape=None if shape is None else shape.path,
+            object_name=name or None,
         )
 
     def write(
@@ -138,18 +183,64 @@ class AnnotationFiles:
         registry: KeypointRegistry,
         camera: Camera,
         fit_options: Mapping[str, Any],
+        further: FurtherEvidence,
         shape: ObjectShape | None = None,
-    ) -> None:
-        """Write the photo's observation and other pairs; raises DataError on failure."""
+        unfinished_views: Sequence[Mapping[str, Any]] = (),
+        *,
+        unfinished: LeftOut | None = None,
+    ) -> LeftOut:
+        """Write the photo's observation and other pairs; raises DataError on failure.
+
+        A pair that moves from one file to the other is in both meanwhile: killed at any moment,
+        nothing is lost. ``unfinished_views`` are those of `unfinished_view` of the object's further
+        photos, ``unfinished`` is what the other file has; returns what it has then.
+        """
         used = known_pairs(document, registry, shape)
-        observation = self.observation_of(used, registry, camera, fit_options, shape)
+        observation = self.observation_of(
+            used, registry, camera, fit_options, further, shape, document.name
+        )
+        others = tuple(pair for pair in document.pairs if pair not in used)
+        now = LeftOut(others, tuple(unfinished_views))
+        before = unfinished or LeftOut()
+        now_used = {pair.number for pair in used}
+        completed = tuple(pair for pair in before.pairs if pair.number in now_used)
+        left = tuple(view for view in before.views if view not in now.views)
+        if now.pairs or now.views:
+            self._write_unfinished(LeftOut(now.pairs + completed, left + now.views))
         observation.save(self.observation)
-        others = [_written(pair) for pair in document.pairs if pair not in used]
-        if others:
-            write_json(self.unfinished, {"format": _UNFINISHED, "pairs": others})
-        else:
+        if completed or left or not (now.pairs or now.views):
+            self._write_unfinished(now)
+        return now
+
+    def _write_unfinished(self, unfinished: LeftOut) -> None:
+        if not unfinished.pairs and not unfinished.views:
             with writing(self.unfinished):
                 self.unfinished.unlink(missing_ok=True)
+            return
+        write_unfinished(self.unfinished, unfinished)
+
+    def unfinished_view(
+        self,
+        document: Document,
+        registry: KeypointRegistry,
+        camera: Camera,
+        shape: ObjectShape | None,
+    ) -> dict[str, Any]:
+        """A further photo with the pairs that the observation lacks, as written beside it."""
+        used = known_pairs(document, registry, shape)
+        return {
+            "image": written_path(self.image, folder=self.observation.parent),
+            "camera": camera.to_dict(pixel_origin="corner"),
+            "pairs": [written_pair(pair) for pair in document.pairs if pair not in used],
+        }
+
+    def remove(self) -> None:
+        """Remove the files of a deleted object; raises DataError on failure."""
+        for path in (self.observation, self.unfinished, self.fit):
+            with writing(path):
+                path.unlink(missing_ok=True)
+        with suppress(OSError):  # something else is in it
+            self.fit.parent.rmdir()
 
     def write_fit(self, result: FitResult | AlignResult | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
@@ -163,9 +254,16 @@ class AnnotationFiles:
     def _warn_of_options(self, observation: Observation, shape: ObjectShape | None) -> None:
         """Warn of stored options of the fit that the page does not use."""
         ours = {} if shape is None else {"shape_sigma": shape.sigma}
+        stored = dict(observation.fit_options)
+        stored.pop("focal_prior", None)
+        if shape is None:
+            # With a prior on the stretch the annotator stores sigma, too.
+            prior = stored.pop("scale_prior_sigma", None)
+            if prior is not None or not observation.is_plain or stored.get("sigma") is None:
+                stored.pop("sigma", None)
         others = [
             name
-            for name, value in observation.fit_options.items()
+            for name, value in stored.items()
             if (name != "sigma" or isinstance(value, float)) and value != ours.get(name)
         ]
         if observation.shape is not None and (shape is None or shape.path is None):
@@ -181,29 +279,22 @@ class AnnotationFiles:
         """Refuse a file in the alignment's place that is something else, before it is replaced."""
         folder = self.fit.parent
         if folder.exists() and not folder.is_dir():
-            raise DataError("not a folder", where=str(folder), fix=_RENAME)
+            raise DataError("not a folder", where=str(folder), fix=RENAME)
         if self.fit.exists():
             data = read_json(self.fit)
             if not isinstance(data, dict) or "alignment" not in data:
-                raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
+                raise DataError("not an alignment of cadalign", where=str(self.fit), fix=RENAME)
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
         if isinstance(data, dict) and data.get("keypoints") == [] and "camera" in data:
-            # All pairs were deleted; the camera is kept, and unfinished pairs belong to the model.
+            # All pairs were deleted: what is left is kept, and unfinished pairs are the model's.
+            of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
             with in_file(self.observation):
-                camera = Camera.from_dict(data["camera"])
-                named: str | None = convert(data.get("model"), PathText | None, where="model")
-            model = None if named is None else path_from(named, self.observation.parent)
-            observation = Observation(np.empty((0, 3)), np.empty((0, 2)), camera, model=model)
+                data = {"views": [data], **of_the_object}
+                observation = Observation.from_dict(data, folder=self.observation.parent)
         else:
             observation = Observation.load(self.observation)
-        if not observation.is_plain:
-            raise DataError(
-                "has evidence beyond keypoints in one image, which the annotator would not keep",
-                where=str(self.observation),
-                fix="give another --observation",
-            )
         refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
 
@@ -219,23 +310,19 @@ def known_pairs(
     )
 
 
-def _written(pair: Pair) -> dict[str, Any]:
-    """A pair that the observation lacks, as an entry of the other file."""
-    fields = {
-        "semantic_id": pair.keypoint,
-        "uv": None if pair.uv is None else list(pair.uv),
-        "sigma": pair.sigma,
-        "confidence": pair.confidence,
-    }
-    return {name: value for name, value in fields.items() if value is not None}
-
-
 def filled(values: Iterable[float | None]) -> FloatArray | None:
     """The values (n,), 1 where one is missing; None if all are missing."""
     listed = list(values)
     if all(value is None for value in listed):
         return None
     return np.array([1.0 if value is None else value for value in listed])
+
+
+def model_named_in(observation: Path, default: Path) -> Path:
+    """The model that an observation names; the default if it names none."""
+    data = read_json(observation)
+    named = data.get("model") if isinstance(data, dict) else None
+    return path_from(named, observation.parent) if isinstance(named, str) else default
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
@@ -260,7 +347,9 @@ def write_keypoints(
     ModelKeypoints(kept, model).save(path)
 
 
-def _document_of(observation: Observation, registry: KeypointRegistry, diagonal: float) -> Document:
+def _document_of(
+    observation: ObservedImage, registry: KeypointRegistry, diagonal: float
+) -> Document:
     document = Document()
     ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
@@ -277,13 +366,14 @@ def _document_of(observation: Observation, registry: KeypointRegistry, diagonal:
             keypoint=_registered(point, registry, SAME_PLACE * diagonal, document.keypoints),
             sigma=_entry(observation.sigma, row),
             confidence=_entry(observation.confidences, row),
+            depth=_entry(observation.depths, row),
         )
         document = document.append(pair)
     return document
 
 
 def _entry(values: FloatArray | None, row: int) -> float | None:
-    return None if values is None else float(values[row])
+    return None if values is None or np.isnan(values[row]) else float(values[row])
 
 
 def _registered(
@@ -302,23 +392,12 @@ def _registered(
     return registry.add(point if free else replace(point, semantic_id=None))
 
 
-def _with_halves(document: Document, path: Path, registry: KeypointRegistry) -> Document:
-    found = read_json(path)
-    if isinstance(found, dict) and "pairs" not in found:
-        raise DataError(f"not a file of {_UNFINISHED}", where=str(path), fix=_RENAME)
-    with in_file(path):
-        data: _Unfinished = convert(found, _Unfinished)
-    if data.format != _UNFINISHED:
-        raise DataError(
-            f"not a file of {_UNFINISHED}", where=str(path), fix="delete it to start without them"
-        )
-    for half in data.pairs:
-        keypoint = half.semantic_id
-        if keypoint not in registry or keypoint in document.keypoints:
-            keypoint = None  # it was saved in another pair, or the keypoints file was deleted
-        if half.uv is None and keypoint is None:
-            continue
-        number = document.next_number
-        pair = Pair(number, half.uv, keypoint, sigma=half.sigma, confidence=half.confidence)
-        document = document.append(pair)
-    return document
+def _views_of(
+    further: FurtherEvidence, registry: KeypointRegistry, diagonal: float
+) -> list[StoredView]:
+    """The other images of an observation that are there, so that they can be annotated."""
+    return [
+        StoredView(view.image, _document_of(view, registry, diagonal), view.camera, view.evidence)
+        for view in further.others
+        if view.image is not None and view.image.exists()
+    ]

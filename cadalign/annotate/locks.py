@@ -74,6 +74,24 @@ class WriterLocks:
             self._release()
             self._acquire()
 
+    def reserve(self, files: Sequence[Path]) -> None:
+        """Lock further files of the folder that the session writes.
+
+        Raises DataError if another annotator has one of them.
+        """
+        new = {_lock_path(file): file for file in files if _lock_path(file) not in self._files}
+        if self._whole_folder or not new:
+            return
+        with ExitStack() as passing, ExitStack() as held:
+            gate = _Lock(self._folder / f".{_ENDING}", self._folder, self._note)
+            passing.enter_context(gate.hold(_QUEUE))
+            locks = [_Lock(path, file, self._note) for path, file in new.items()]
+            for lock in locks:
+                held.enter_context(lock.hold(_PATIENCE))
+            self._held.enter_context(held.pop_all())
+        self._locks += locks
+        self._files |= new
+
     def _acquire(self) -> None:
         with ExitStack() as passing, ExitStack() as held:
             gate_holder = held if self._whole_folder else passing

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats
+from cadalign.annotate.mirror import MirrorPlanes
+from cadalign.annotate.snapping import CREASE, SnapPoints, find_rim
+from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import simplify
 from cadalign.render.drawing.color import bytes_from_linear
+from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.scene import Scene
 
 MOST_FACES = 150_000  # that are displayed
@@ -25,6 +29,20 @@ _NEAREST_SAMPLES = 2e-3  # in diagonals
 # corners, where rays to them graze other parts. The page uses the same value.
 _BENEATH = 0.02
 _EXACT = 1e-6
+_MOST_TRIED = 40  # vertices near a click, of which the first visible one is taken
+
+
+@dataclass(frozen=True, eq=False)
+class Displayed:
+    """Triangles as they are displayed: simplified, and of those in one place one for each side.
+
+    ``color`` (m, 4) is linear, with the opacity; ``is_doubled`` (m,) are those of which another one
+    shows the back.
+    """
+
+    mesh: Mesh
+    color: npt.NDArray[np.float32]
+    is_doubled: BoolArray
 
 
 class CadModel:
@@ -46,12 +64,22 @@ class CadModel:
         """Turn the page's coordinates (..., 3) into model coordinates."""
         return np.asarray(np.asarray(xyz, dtype=float) * self.diagonal + self.center)
 
-    def pick(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> ModelKeypoint | None:
-        """Intersect a ray, in model coordinates, with the surface; None if it misses."""
+    def pick(
+        self, origin: npt.ArrayLike, direction: npt.ArrayLike, *, snap: float = 0.0
+    ) -> ModelKeypoint | None:
+        """Intersect a ray, in model coordinates, with the surface; None if it misses.
+
+        With ``snap``, the tangent of half the angle of a cone about the ray, the point is a visible
+        corner in the cone, else a vertex of a crease, else on the silhouette, else a vertex.
+        """
         start = as_floats(origin, name="origin", shape=(3,))
         along = as_floats(direction, name="direction", shape=(3,))
         if not along.any():
             raise InputError("the vector is zero", where="direction")
+        if snap > 0:
+            snapped = self._snapped(start, along / np.linalg.norm(along), snap)
+            if snapped is not None:
+                return snapped
         face, distance = self.scene.caster.first_hits(start, along[None])
         if face[0] < 0 or not np.isfinite(distance[0]):
             return None
@@ -66,6 +94,21 @@ class CadModel:
             return True
         _, distance = self.scene.caster.first_hits(start, sight[None])
         return bool(distance[0] >= 1 - _BENEATH * self.diagonal / length)
+
+    def mirrored(self, xyz: npt.ArrayLike) -> ModelKeypoint | None:
+        """The mirror image of a point of a symmetric model; None without one."""
+        image = self.mirror_planes.image(as_floats(xyz, name="xyz", shape=(3,)))
+        return None if image is None else self._on_triangle(*image)
+
+    @cached_property
+    def mirror_planes(self) -> MirrorPlanes:
+        """Planes that take the model to itself."""
+        return MirrorPlanes.of_mesh(self.scene.mesh, self.center, self.diagonal)
+
+    @cached_property
+    def snap_points(self) -> SnapPoints:
+        """Vertices that clicks snap to."""
+        return SnapPoints.of_mesh(self.scene.mesh, self.diagonal)
 
     @cached_property
     def samples(self) -> tuple[ModelKeypoint, ...]:
@@ -100,6 +143,35 @@ class CadModel:
         small = simplify(mesh, max_faces=MOST_FACES)
         return Scene(Mesh(small.vertices, small.faces))
 
+    @cached_property
+    def displayed(self) -> Displayed:
+        """The triangles that are displayed."""
+        small = simplify(self.scene.mesh, max_faces=MOST_FACES)
+        alike, opposite = coincident_faces(small.vertices, small.faces)
+        first = np.flatnonzero(alike == np.arange(len(alike)))
+        weights = np.full((len(first), 3), 1 / 3, dtype=np.float32)
+        triangles: FaceArray = small.source[first].astype(np.int32)
+        color = self.scene.surface.color(triangles, weights)
+        mesh = Mesh(small.vertices, small.faces[first])
+        return Displayed(mesh, color, opposite[first] != alike[first])
+
+    def _snapped(
+        self, origin: FloatArray, direction: FloatArray, reach: float
+    ) -> ModelKeypoint | None:
+        points = self.snap_points
+        seen = [
+            row
+            for row in points.near(origin, direction, reach)[:_MOST_TRIED].tolist()
+            if self.is_seen(origin, points.xyz[row])
+        ]
+        if not seen or points.kind[seen[0]] > CREASE:
+            rim = find_rim(self.scene.caster, origin, direction, reach, self.diagonal)
+            if rim is not None:
+                return self._on_triangle(*rim)
+        return (
+            self._on_triangle(int(points.triangle[seen[0]]), points.xyz[seen[0]]) if seen else None
+        )
+
     def _on_triangle(self, triangle: int, xyz: FloatArray) -> ModelKeypoint:
         """Make a keypoint of a point on a triangle, with the file's face number and barycentrics.
 
@@ -122,27 +194,42 @@ class CadModel:
         return ModelKeypoint(name="", xyz=(x, y, z), face_index=face, barycentric=(a, b, c))
 
 
-def display_bytes(model: CadModel, *, max_faces: int = MOST_FACES) -> bytes:
-    """Encode the model for display, simplified to at most ``max_faces`` triangles.
+def display_bytes(model: CadModel) -> bytes:
+    """Encode the model for display, simplified to at most `MOST_FACES` triangles.
 
     First the length of a JSON header (uint32, little-endian, a multiple of 4 with padding), and the
     header with ``shown`` and ``all``, the numbers of faces; then positions (faces, 3, 3) float32 in
     display coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
     """
-    mesh = model.scene.mesh
-    small = simplify(mesh, max_faces=max_faces)
-    shown = Mesh(model.to_display(small.vertices), small.faces)
-    header = json.dumps({"shown": len(small.faces), "all": len(mesh.faces)}).encode()
+    displayed = model.displayed
+    mesh = displayed.mesh
+    shown = Mesh(model.to_display(mesh.vertices), mesh.faces)
+    header = json.dumps({"shown": len(mesh.faces), "all": len(model.scene.mesh.faces)}).encode()
     header += b" " * (-len(header) % 4)
-    weights = np.full((len(small.faces), 3), 1 / 3, dtype=np.float32)
-    triangles: FaceArray = small.source.astype(np.int32)
-    color = model.scene.surface.color(triangles, weights)
     return b"".join(
         [
             len(header).to_bytes(4, "little"),
             header,
             shown.triangles.astype("<f4").tobytes(),
             Scene(shown).corner_normals.astype("<f4").tobytes(),
-            bytes_from_linear(color[:, :3]).tobytes(),
+            bytes_from_linear(displayed.color[:, :3]).tobytes(),
+        ]
+    )
+
+
+def detail_bytes(model: CadModel, creases: FloatArray) -> bytes:
+    """Encode what `display_bytes` leaves out, of the same triangles.
+
+    Creases (k, 2, 3) [model units] as float32 in display coordinates, their number (uint32) before
+    them; opacities (faces,) uint8; and sides (faces,) uint8, which are 1 for a triangle that only
+    its front shows, since another one lies in its place, wound the other way.
+    """
+    opacity = np.round(255 * np.clip(model.displayed.color[:, 3], 0, 1)).astype(np.uint8)
+    return b"".join(
+        [
+            len(creases).to_bytes(4, "little"),
+            model.to_display(creases).astype("<f4").tobytes(),
+            opacity.tobytes(),
+            model.displayed.is_doubled.astype(np.uint8).tobytes(),
         ]
     )

@@ -3,20 +3,22 @@
 The observation of `photo.jpg` is `photo.json`. It is `photo.jpg.json` where the shorter name might
 be another file's: photos of one folder differ only in their endings, or the name without its ending
 ends like a derived one (`photo.unfinished.jpg`, `chair.keypoints.jpg`, `photo.png.jpg`). An
-observation of an earlier session that names the photo is found under either name.
+observation of an earlier session that names the photo is found under either name. Further objects
+of the photo are `photo.object-2.json` and so on.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import unicodedata
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from cadalign.annotate.photos import ENDINGS
+from cadalign.annotate.photos import ENDINGS, MASK, SECOND_MASK
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
@@ -26,6 +28,7 @@ UNFINISHED = ".unfinished.json"
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
 _AMBIGUOUS = (UNFINISHED.removesuffix(".json"), SUFFIX.removesuffix(".json"), *ENDINGS)
+_OBJECT = re.compile(r"\.object-([1-9][0-9]*)$")  # at the end of a stem
 _OTHER_FOLDER = "give another --observation or --out"
 
 
@@ -41,14 +44,52 @@ def file_name(stem: str, ending: str) -> str:
     return name
 
 
-def keypoints_file(model: Path, folder: Path) -> Path:
-    """Path of a model's keypoints file in a folder."""
-    return folder / file_name(model.stem, SUFFIX)
+def keypoints_file(model: Path, folder: Path, *, parents: int = 0) -> Path:
+    """Path of a model's keypoints file in a folder, named by the model and some of its folders."""
+    parts = model.resolve().parts[-1 - parents : -1] if parents else ()
+    return folder / file_name(".".join([*parts, model.stem]), SUFFIX)
 
 
 def unfinished_file(observation: Path) -> Path:
     """Path of the unfinished pairs' file beside an observation."""
     return observation.with_name(file_name(observation.stem, UNFINISHED))
+
+
+def mask_file(observation: Path, base: str | None) -> Path:
+    """Path of the mask beside an observation, other than that of the mask under its strokes."""
+    first, second = (
+        observation.with_name(file_name(observation.stem, ending)) for ending in (MASK, SECOND_MASK)
+    )
+    return second if base is not None and Path(base).resolve() == first.resolve() else first
+
+
+def object_file(observation: Path, number: int) -> Path:
+    """Path of a further object's observation beside that of the photo's first object."""
+    return observation.with_name(file_name(f"{observation.stem}.object-{number}", ".json"))
+
+
+def object_number(observation: Path) -> int:
+    """The number of the object in the name of its observation; 1 without one."""
+    found = _OBJECT.search(observation.stem)
+    return 1 if found is None else int(found[1])
+
+
+def object_files(observation: Path, photo: Path) -> list[Path]:
+    """Observations of a photo's further objects beside that of its first one, by number."""
+    folder = observation.parent
+    try:
+        names = os.listdir(folder)
+    except OSError:  # it is not there yet
+        return []
+    prefix = f"{observation.stem}.object-"
+    paths = [folder / name for name in names if name.startswith(prefix) and name.endswith(".json")]
+    found = [
+        path
+        for path in paths
+        if path == object_file(observation, object_number(path))
+        and any(other.samefile(photo) for other in _named_photos(path))
+    ]
+    return sorted(found, key=object_number)
 
 
 def observation_file(photo: Path, folder: Path) -> Path:
@@ -57,19 +98,20 @@ def observation_file(photo: Path, folder: Path) -> Path:
     Raises DataError if the files of these names belong to other photos.
     """
     short, full = (folder / file_name(name, ".json") for name in (photo.stem, photo.name))
-    named = {path: _named_photo(path) for path in (short, full)}
-    for path, other in named.items():
-        if other is not None and other.samefile(photo):
+    named = {path: _named_photos(path) for path in (short, full)}
+    for path, others in named.items():
+        if any(other.samefile(photo) for other in others):
             return path
-    taken = {path for path, other in named.items() if other is not None}
+    taken = {path for path, others in named.items() if others}
     if not _has_namesake(photo) and short not in taken:
-        is_plain = not _folded(photo.stem).endswith(_AMBIGUOUS)
+        stem = _folded(photo.stem)
+        is_plain = not stem.endswith(_AMBIGUOUS) and _OBJECT.search(stem) is None
         if is_plain or _is_observation(short):
             return short
     if full not in taken:
         return full
     raise DataError(
-        f"belongs to the photo {named[full]}, not {photo}", where=str(full), fix=_OTHER_FOLDER
+        f"belongs to the photo {named[full][0]}, not {photo}", where=str(full), fix=_OTHER_FOLDER
     )
 
 
@@ -105,14 +147,28 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _is_observation(path: Path) -> bool:
-    return {"camera", "keypoints"} <= _load(path).keys()
+    data = _load(path)
+    return {"camera", "keypoints"} <= data.keys() or isinstance(data.get("views"), list)
 
 
-def _named_photo(path: Path) -> Path | None:
-    """Photo that an observation names, if it is there; None for what is no observation."""
-    image = _load(path).get("image") if _is_observation(path) else None
-    photo = path_from(image, path.parent) if isinstance(image, str) and image else None
-    return photo if photo is not None and os.path.exists(photo) else None
+def _named_photos(path: Path) -> list[Path]:
+    """Photos that an observation names and that are there; none for what is no observation."""
+    if not _is_observation(path):
+        return []
+    data = _load(path)
+    views = data.get("views", [data])
+    images = [view.get("image") for view in views if isinstance(view, dict)]
+    named = [path_from(each, path.parent) for each in images if isinstance(each, str) and each]
+    return [photo for photo in named if os.path.exists(photo)]
+
+
+def named_model(path: Path) -> Path | None:
+    """The model's mesh that an observation file names and that is there; None without one."""
+    given = _load(path).get("model")
+    if not isinstance(given, str) or not given or not _is_observation(path):
+        return None
+    mesh = path_from(given, path.parent)
+    return mesh if mesh.is_file() else None
 
 
 def _has_namesake(photo: Path) -> bool:

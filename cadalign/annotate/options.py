@@ -4,28 +4,57 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+LOOPBACK = "127.0.0.1"
+"""Address that only this machine reaches."""
 
 
-@dataclass(frozen=True)
-class SessionOptions:
-    """Photos, model, and the files beside them."""
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """The files beside photos and model, and the object's shape."""
 
-    image: Path
-    """A photo, or a folder of photos."""
-    model: Path
-    """OBJ, PLY, GLB, glTF, STL or OFF file."""
     observation: Path | None = None
     """Observation file of a single photo, continued if it exists; by default beside the photo."""
     out: Path | None = None
     """Folder for the observations; by default the photos'."""
     camera: Path | None = None
-    """JSON file of the calibrated camera (COLMAP's form, Open3D's or NeRF's). Without one the focal
-    length is estimated."""
+    """File of the calibrated camera: a matrix K (text, .npy or JSON), or JSON in COLMAP's form,
+    Open3D's or NeRF's. Without one the focal length is estimated."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
+    mask: Path | None = None
+    """Mask of the object in a single photo: a grey PNG of its size, not 0 on the object."""
+    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
+    """Known lengths of a single photo's object: width, height, length (along the model's x, y, z)
+    and sigma, their relative standard deviation, as in --size height 0.91 sigma 0.005."""
+    models: tuple[Path, ...] = ()
+    """Further models that objects in the photos can have."""
+    further_photos: tuple[Path, ...] = ()
+    """Further photos, such as other views of the same object, which the page can add to it."""
+    detections: Path | None = None
+    """Keypoints of a detector, proposed to confirm or correct: COCO's JSON, MMPose's, ultralytics'
+    or CSV, with the photos' file names and the names of the model's keypoints."""
+    library: Path | None = None
+    """File of `cadalign library build`: the model can be chosen from it by the pairs marked so far,
+    and MODEL may be left out. The pairs keep their keypoints by name."""
+    category: str | None = None
+    """The only category of the library to choose from."""
     shape: Path | None = None
     """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
     keypoints that it knows by semantic id or name."""
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionOptions(FileOptions):
+    """Photos, model, and the files beside them."""
+
+    image: Path
+    """A photo, or a folder of photos."""
+    model: Path
+    """OBJ, PLY, GLB, glTF, STL or OFF file."""

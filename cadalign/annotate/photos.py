@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 from PIL import ImageOps
 
 from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.worklist import natural_key
 from cadalign.errors import DataError, InputError
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import in_file, read_json
+from cadalign.io import camera_file
 from cadalign.io.files import reading
-from cadalign.io.images import open_photo, photo_size
+from cadalign.io.images import open_photo, photo_size, read_photo
 from cadalign.render.views.camera_files import read_camera_views
 
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+MASK, SECOND_MASK = ".mask.png", ".mask-2.png"
+"""Endings of the files of masks; the second is for one that is painted over the first."""
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
+_THUMBNAIL = (240, 180)  # [px]
+_USUAL_LENSES = 0.4  # standard deviation of the logarithm of their focal lengths
 _DEFAULT_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]
 
 
@@ -38,6 +46,20 @@ class Photo:
     def open(cls, path: Path) -> Photo:
         """Read a photo's size; raises DataError if it is missing or no photo."""
         return cls(path, *photo_size(path))
+
+    def pixels(self) -> npt.NDArray[np.uint8]:
+        """The upright photo, (h, w, 3); raises DataError if the file is damaged."""
+        return read_photo(self.path)
+
+    def thumbnail(self) -> bytes:
+        """Encode the upright photo as a small JPEG; raises DataError if it is damaged."""
+        with open_photo(self.path) as image:
+            image.draft("RGB", _THUMBNAIL)
+            small = ImageOps.exif_transpose(image).convert("RGB")
+        small.thumbnail(_THUMBNAIL)
+        data = io.BytesIO()
+        small.save(data, format="JPEG", quality=80)
+        return data.getvalue()
 
     def encoded(self) -> tuple[str, bytes]:
         """Encode the upright photo for a browser: media type and bytes.
@@ -57,12 +79,15 @@ class Photo:
 
 
 def find_photos(path: Path) -> list[Path]:
-    """List the photos of a folder by name, or the given photo."""
+    """List the photos of a folder by name, numbers in order,, or the given photo."""
     with reading(path):
         in_folder, exists = path.is_dir(), path.exists()
         entries = list(path.iterdir()) if in_folder else []
     if in_folder:
-        found = sorted(p for p in entries if p.suffix.lower() in ENDINGS and p.is_file())
+        photos = [p for p in entries if p.suffix.lower() in ENDINGS and p.is_file()]
+        stems = {p.stem for p in photos}
+        own = [p for p in photos if not _is_mask(p, stems)]
+        found = sorted(own, key=lambda p: natural_key(p.name))
         if not found:
             raise InputError(
                 "there are no photos in this folder",
@@ -75,6 +100,15 @@ def find_photos(path: Path) -> list[Path]:
     return [path]
 
 
+def _is_mask(path: Path, stems: Collection[str]) -> bool:
+    """True for a mask of another photo of the folder, as the annotator names them."""
+    stem = path.name.removesuffix(MASK).removesuffix(SECOND_MASK)
+    if stem == path.name:
+        return False
+    # That of a further object or view has more between the photo's name and the ending.
+    return any(stem == photo or stem.startswith(f"{photo}.") for photo in stems)
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     """Intrinsics of the camera that took a photo, and their source.
@@ -85,6 +119,14 @@ class Intrinsics:
     camera: Camera
     calibrated: bool  # True if the focal length was given
     prior: FocalPrior | None = None  # from the photo's EXIF data
+
+    @property
+    def likely_focal(self) -> FocalPrior:
+        """Prior on an unknown focal length: of the EXIF data, or that of usual lenses."""
+        if self.prior is not None:
+            return self.prior
+        width, height = self.camera.width, self.camera.height
+        return FocalPrior(_default_focal(width, height), _USUAL_LENSES)
 
     @property
     def note(self) -> str:
@@ -107,15 +149,15 @@ class Intrinsics:
         )
 
 
-def read_camera(path: Path) -> Camera:
-    """Read a camera in COLMAP's form, or the first one of an Open3D, NeRF or COLMAP file."""
+def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
+    """Read a camera as `camera_file` does, or the first one of an Open3D, NeRF or COLMAP file.
+
+    ``size`` is the photos', for a file that holds a calibration matrix alone.
+    """
     with reading(path):
         in_folder = path.is_dir()
-    if not in_folder:
-        data = read_json(path)
-        if isinstance(data, dict) and "params" in data:
-            with in_file(path):
-                return Camera.from_dict(data)
+    if not in_folder and camera_file.is_camera_file(path):
+        return camera_file.read_camera(path, size=size)
     return read_camera_views(path)[0].camera
 
 
@@ -133,6 +175,10 @@ def intrinsics_of(photo: Photo, camera: Camera | None) -> Intrinsics:
     prior = FocalPrior.from_exif(photo.path)
     if camera.focal_known:
         return Intrinsics(camera, calibrated=True, prior=prior)
-    default = max(photo.width, photo.height) / 2 / math.tan(math.radians(_DEFAULT_FOV / 2))
+    default = _default_focal(photo.width, photo.height)
     likely = default if prior is None else prior.focal
     return Intrinsics(camera.with_focal(likely), calibrated=False, prior=prior)
+
+
+def _default_focal(width: int, height: int) -> float:
+    return max(width, height) / 2 / math.tan(math.radians(_DEFAULT_FOV / 2))

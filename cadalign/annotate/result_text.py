@@ -20,6 +20,9 @@ UNKNOWNS = (
 """Names of the unknowns of a covariance, for a sentence."""
 _ROTATIONS = 3
 UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
+LEFT_OPEN = 0.8
+"""Share of a prior's standard deviation beyond which the pairs tell nothing."""
+_UNCERTAIN_DEG = 60.0
 UNDETERMINED = "not determined", "these pairs leave it open"
 
 
@@ -39,10 +42,12 @@ def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
         return ()
     facts = [_stretch(result, axis) for axis in result.stretched_axes]
     if result.std is not None:
-        facts.append(Fact("Rotation", f"known to ± {short(result.std.rotation_deg)}°", ""))
+        facts.append(rotation_fact(result.std.rotation_deg))
     facts += [_distance(result), _focal(result)]
     if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
         note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
+        if result.options is not None and result.options.scale_prior_sigma is not None:
+            note = f"for points off by {short(live.sigma)} px"
         note = f"rms; the standard deviations above are {note}"
         facts.append(Fact("Pairs agree to", f"{short(result.rms)} px", note))
     return tuple(facts)
@@ -85,6 +90,19 @@ def evidence_text(advice: Advice, keypoint: str) -> str:
     return f"{str(advice.detail).capitalize()}, measured to {100 * LENGTH_SIGMA:.0f} %"
 
 
+def how_text(advice: Advice, observation: str) -> str:
+    """Advice on adding a piece of evidence to the observation file of the name; none for pairs."""
+    by = {
+        "mask": "Start with --mask mask.png, an image of the photo's size that is not 0 on the "
+        'object; or write "mask": "mask.png"',
+        "view": "Start with a folder of photos, or with --further-photos right.jpg, and add the "
+        "photo by 'Objects…' (T), which writes it",
+        "lengths": "Start with --size width 0.45 height 0.91 sigma 0.01, in model units; or write "
+        '"size": {"width": 0.45, "height": 0.91, "sigma": 0.01}',
+    }
+    return f"{by[advice.kind]} into {observation}." if advice.kind in by else ""
+
+
 def left_text(advice: Advice) -> str:
     """The largest standard deviation that is left with a piece of evidence."""
     if advice.worst > UNCERTAIN:
@@ -104,6 +122,10 @@ def _stretch(result: FitResult, axis: str) -> Fact:
     relative = 0.0 if std is None else std.scale["xyz".index(axis)]
     if relative > UNCERTAIN:
         return Fact(label, *UNDETERMINED)
+    prior = None if result.options is None else result.options.scale_prior_sigma
+    if prior is not None and relative > LEFT_OPEN * prior:
+        note = f"the pairs leave it open: about 1 by the prior of ± {100 * prior:.0f} %"
+        return Fact(label, "not determined", note)
     percent = 100 * (value - 1)
     if abs(percent) < 0.5:
         note = "as long as the model"
@@ -115,6 +137,13 @@ def _stretch(result: FitResult, axis: str) -> Fact:
     return Fact(label, f"{value:.3g}{uncertainty}", note)
 
 
+def rotation_fact(deviation: float) -> Fact:
+    """Standard deviation of the rotation [degrees]."""
+    if deviation > _UNCERTAIN_DEG:
+        return Fact("Rotation", *UNDETERMINED)
+    return Fact("Rotation", f"known to ± {short(deviation)}°", "")
+
+
 def _distance(result: FitResult) -> Fact:
     translation = result.alignment.translation
     distance = float(np.linalg.norm(translation))
@@ -123,6 +152,8 @@ def _distance(result: FitResult) -> Fact:
         return Fact("Distance", f"{distance:.3g} model units", "")
     along = translation / distance
     std = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
+    if std > UNCERTAIN * distance:
+        return Fact("Distance", *UNDETERMINED)
     return Fact("Distance", f"{distance:.3g} ± {short(std)}", "model units")
 
 

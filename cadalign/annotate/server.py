@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
+import secrets
 import socket
 from functools import partial
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
+from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -14,14 +19,21 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from cadalign.annotate.choosing.ranking import ranking_state, thumbnail_of
+from cadalign.annotate.claims import Claims
+from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
 from cadalign.annotate.guard import Access, Guard
-from cadalign.annotate.model import display_bytes
-from cadalign.annotate.page_state import advice_state, page_state
+from cadalign.annotate.model import detail_bytes, display_bytes
+from cadalign.annotate.options import LOOPBACK
+from cadalign.annotate.page_state import advice_state, mask_pixels, page_state
 from cadalign.annotate.session import Session
+from cadalign.annotate.worklist_state import worklist_state
 from cadalign.errors import CadalignError, InputError
+from cadalign.errors import quote as quoted
 from cadalign.web import asset
 
-LOOPBACK = "127.0.0.1"
+_LONGEST_NUMBER = 9  # digits
+_BROWSER = "cadalign-browser"  # cookie that tells browsers apart, not the tabs of one
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
@@ -33,26 +45,41 @@ def make_app(session: Session, access: Access) -> ASGIApp:
             Route("/annotate.js", partial(_send, "annotate.js", "text/javascript")),
             Route("/annotate.css", partial(_send, "annotate.css", "text/css")),
             Route("/model", routes.model),
+            Route("/details", routes.details),
             Route("/photo/{number:int}", routes.photo),
+            Route("/worklist", routes.worklist),
+            Route("/thumbnail/{number:int}", routes.thumbnail),
+            Route("/export/coco.json", routes.coco),
+            Route("/export/{number:int}.glb", routes.glb),
+            Route("/export/{form:str}.zip", routes.photo_set),
+            Route("/mask/{number:int}", routes.mask),
             Route("/state/{number:int}", routes.state),
             Route("/advice/{number:int}", routes.advice),
             Route("/act/{number:int}", routes.act, methods=["POST"]),
+            Route("/models/{number:int}", routes.models),
+            Route("/library/{number:int}.jpg", routes.library),
         ],
         exception_handlers={CadalignError: _refused},
     )
     return Guard(app, access)
 
 
-def listen(port: int) -> socket.socket:
-    """Open a socket on the loopback interface; port 0 chooses a free one."""
+def listen(port: int, host: str = LOOPBACK) -> socket.socket:
+    """Open a socket on an interface of this machine; port 0 chooses a free one."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((LOOPBACK, port))
+        listener.bind((host, port))
         listener.listen()  # connections wait until the server runs
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
+        if host != LOOPBACK:
+            raise InputError(
+                f"{host}, port {port} cannot be opened ({reason})",
+                where="--host",
+                fix="give an address of this machine, or 0.0.0.0 for all",
+            ) from None
         raise InputError(
             f"port {port} cannot be opened ({reason})",
             where="--port",
@@ -77,17 +104,26 @@ class _Routes:
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session
         self._access = access
-        self._model: bytes | None = None
+        self._models: dict[int, bytes] = {}
+        self._claims = Claims()
 
     async def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
         response.set_cookie(
             self._access.cookie, self._access.token, httponly=True, samesite="strict"
         )
+        if _BROWSER not in request.cookies:
+            browser = secrets.token_urlsafe(12)
+            response.set_cookie(_BROWSER, browser, httponly=True, samesite="strict")
         return response
 
     async def model(self, request: Request) -> Response:
-        data = await run_in_threadpool(self._display)
+        data = await run_in_threadpool(self._display, _number(request, "number") or 0)
+        return Response(data, media_type="application/octet-stream")
+
+    async def details(self, request: Request) -> Response:
+        model = self._session.models[_number(request, "number") or 0]
+        data = await run_in_threadpool(detail_bytes, model.cad, model.wireframe.creases)
         return Response(data, media_type="application/octet-stream")
 
     async def photo(self, request: Request) -> Response:
@@ -95,12 +131,68 @@ class _Routes:
         kind, data = await run_in_threadpool(photo.encoded)
         return Response(data, media_type=kind)
 
+    async def worklist(self, request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(worklist_state, self._session))
+
+    async def thumbnail(self, request: Request) -> Response:
+        photo = self._session.photo_state(request.path_params["number"]).photo
+        data = await run_in_threadpool(photo.thumbnail)
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
+
+    async def coco(self, request: Request) -> Response:
+        data = await run_in_threadpool(coco_of, self._session)
+        return JSONResponse(data, headers=_as_file("keypoints.coco.json"))
+
+    async def glb(self, request: Request) -> Response:
+        number, slot = _place(request)
+        data = await run_in_threadpool(glb_of, self._session, number, slot=slot)
+        name = self._session.photo_state(number, slot).files.observation.with_suffix(".glb").name
+        return Response(data, media_type="model/gltf-binary", headers=_as_file(name))
+
+    async def photo_set(self, request: Request) -> Response:
+        form = request.path_params["form"]
+        data = await run_in_threadpool(zipped_photo_set, self._session, form)
+        return Response(data, media_type="application/zip", headers=_as_file(f"{form}.zip"))
+
+    async def mask(self, request: Request) -> Response:
+        number, slot = _place(request)
+
+        def work() -> bytes:
+            pixels = mask_pixels(self._session, number, slot=slot)
+            mask = np.where(pixels, 255, 0).astype(np.uint8)
+            # Its opacity is what the page draws, in a colour of its own.
+            data = io.BytesIO()
+            empty = np.zeros_like(mask)
+            Image.fromarray(np.stack([empty, mask], axis=2), "LA").save(data, "PNG")
+            return data.getvalue()
+
+        return Response(await run_in_threadpool(work), media_type="image/png")
+
     async def state(self, request: Request) -> Response:
-        return await self._answer(request.path_params["number"], None)
+        return await self._answer(request, None)
 
     async def advice(self, request: Request) -> Response:
-        number = request.path_params["number"]
-        return JSONResponse(await run_in_threadpool(advice_state, self._session, number))
+        number, slot = _place(request)
+
+        def work() -> dict[str, Any]:
+            return advice_state(self._session, number, slot=slot)
+
+        return JSONResponse(await run_in_threadpool(work))
+
+    async def models(self, request: Request) -> Response:
+        number, slot = _place(request)
+
+        def work() -> dict[str, Any]:
+            return ranking_state(self._session, number, slot=slot)
+
+        return JSONResponse(await run_in_threadpool(work))
+
+    async def library(self, request: Request) -> Response:
+        choice = self._session.choice
+        if choice is None:
+            raise InputError("the session has no library", where="library")
+        data = await run_in_threadpool(thumbnail_of, choice, request.path_params["number"])
+        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
 
     async def act(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":
@@ -113,22 +205,50 @@ class _Routes:
             raise InputError("not JSON", where="body", fix="send an action as JSON") from None
         if not isinstance(action, dict):
             raise InputError("not a JSON object", where="body", fix="send an action as JSON")
-        return await self._answer(request.path_params["number"], action)
+        return await self._answer(request, action)
 
-    async def _answer(self, number: int, action: dict[str, Any] | None) -> Response:
+    async def _answer(self, request: Request, action: dict[str, Any] | None) -> Response:
+        session = self._session
+        number, slot = _place(request)
+        browser = request.cookies.get(_BROWSER, "")
+
         def work() -> bytes:
-            with self._session.lock:
-                outcome = None if action is None else self._session.act(number, action)
-                state = page_state(self._session, number, outcome)
+            with session.lock:
+                outcome = None
+                if action is not None:
+                    views = session.photo_state(number, slot).all_views
+                    photos = {number, *(session.place_of(view)[0] for view in views)}
+                    self._claims.take_all(photos, browser)
+                    outcome = session.act(number, action, slot=slot)
+                state = page_state(session, number, outcome, slot=slot)
             return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
 
         return Response(await run_in_threadpool(work), media_type="application/json")
 
-    def _display(self) -> bytes:
+    def _display(self, number: int) -> bytes:
         with self._session.lock:
-            if self._model is None:
-                self._model = display_bytes(self._session.model)
-            return self._model
+            if number not in self._models:
+                self._models[number] = display_bytes(self._session.models[number].cad)
+            return self._models[number]
+
+
+def _place(request: Request) -> tuple[int, int | None]:
+    """The numbers of a photo, and of one of its objects if the address has it."""
+    return request.path_params["number"], _number(request, "object")
+
+
+def _number(request: Request, name: str) -> int | None:
+    given = request.query_params.get(name)
+    if given is None:
+        return None
+    if not given.isdecimal() or len(given) > _LONGEST_NUMBER:
+        raise InputError(f"{quoted(given)} is no number", where=name, fix="reload the page")
+    return int(given)
+
+
+def _as_file(name: str) -> dict[str, str]:
+    """Headers that let a browser save a response under a name."""
+    return {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
 
 
 async def _send(name: str, media_type: str, request: Request) -> Response:

@@ -1,14 +1,15 @@
-"""Live alignment of the object's own shape: `cadalign.align` to the pairs that it knows."""
+"""Live alignment by `cadalign.align`: an object's own shape, or evidence beyond keypoints."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.alignment import LEAST_SIGMA
+from cadalign.annotate.alignment import LEAST_SIGMA, ExpectedNoise
+from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.arrays import BoolArray, FloatArray
@@ -16,16 +17,21 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.fitting.joint.align import align
 from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.observed import views_of
+from cadalign.fitting.joint.observed import model_of, size_of, views_of
 from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.size import Size
 from cadalign.fitting.joint.view import View
-from cadalign.fitting.options import RansacOptions
+from cadalign.fitting.options import FitOptions, RansacOptions
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 
 LEAST_SHAPE_PAIRS = 3
 _LEAST_JUDGED = 6  # pairs from which on one can contradict the others
+_NOISE_ROUNDS = 4
+_NOISE_TOLERANCE = 0.1
 _CONTRADICTS = 5.0  # distance from the others' prediction [sigmas]; hands click to about 2 px
 
 
@@ -42,10 +48,11 @@ class WarpedModel:
 
 @dataclass(frozen=True, eq=False)
 class LiveShape:
-    """Alignment and shape from the pairs placed so far.
+    """Alignment and shape from the pairs placed so far, and from evidence beyond them.
 
     It is provisional if the focal length was assumed. ``counts`` (n,) are the complete pairs whose
-    keypoints the shape knows; the others' residuals are those of points that the warp carries.
+    keypoints the shape knows; the others' residuals are those of points that the warp carries. The
+    photo is the view of number ``place``.
     """
 
     shown: AlignResult | None
@@ -58,11 +65,16 @@ class LiveShape:
     warped: WarpedModel | None = None
     prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
     sigma: float = LEAST_SIGMA
+    place: int = 0
+    also_used: tuple[str, ...] = ()
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
+    """Options with which, and the priors, `cadalign fit` finds the same."""
 
     @property
-    def fit_options(self) -> Mapping[str, Any]:
-        """Options with which `cadalign fit` finds the same: its defaults."""
-        return {}
+    def alignment(self) -> Alignment:
+        """The alignment in the photo's camera."""
+        assert self.shown is not None
+        return self.shown.poses[self.place]
 
 
 def warm_up_joint(points_3d: FloatArray, points_2d: FloatArray, camera: Camera) -> None:
@@ -72,74 +84,187 @@ def warm_up_joint(points_3d: FloatArray, points_2d: FloatArray, camera: Camera) 
         align(Model(points_3d=points_3d, shape_sigma=0.01), view, ransac=ransac)
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Prior knowledge of the object, before any pair and beside them.
+
+    Parameters
+    ----------
+    shape : ObjectShape, optional
+        The object's own shape; None for the stretched model.
+    further : FurtherEvidence
+    scale_prior_sigma : float, optional
+        Prior on the stretch.
+    anchors : mapping
+        The model's keypoints that the shape knows, by their ids there.
+    assumed_focal : tuple of str
+        Photos whose focal length is neither measured nor chosen, this one by an empty name.
+    """
+
+    shape: ObjectShape | None
+    further: FurtherEvidence
+    scale_prior_sigma: float | None
+    anchors: Mapping[Any, ModelKeypoint]
+    assumed_focal: tuple[str, ...]
+
+    def model_for(self, observation: Observation, mesh: Mesh) -> Model | ShapeModel:
+        """The model that `cadalign fit` aligns to the observation."""
+        shape = self.shape
+        if shape is not None and (shape.learned is not None or not observation.others):
+            return shape.model_with(self.anchors.values(), mesh)
+        prior = self.scale_prior_sigma
+        sigma = None if shape is None else shape.sigma
+        options = FitOptions(scale_prior_sigma=prior)
+        return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+
+    def has_open_sigma(self, observation: Observation) -> bool:
+        """True if the residuals say how far the keypoints lie from the stretched model's.
+
+        With an own shape it says so; without a prior, residuals would be fitted away by a stretch.
+        """
+        own = any(view.sigma is not None for view in observation.views)
+        return self.shape is None and self.scale_prior_sigma is not None and not own
+
+    def counts(self, points: Sequence[ModelKeypoint]) -> BoolArray:
+        """The points (n,) whose pairs count."""
+        shape = self.shape
+        return np.array([shape is None or shape.knows(point) for point in points], dtype=bool)
+
+    def prior_lengths(self, model: Model | ShapeModel) -> FloatArray:
+        """Standard deviations (3,) of the logarithms of the box's lengths before any pair."""
+        if self.shape is not None:
+            return self.shape.length_sigmas(model)
+        prior = self.scale_prior_sigma or np.inf
+        return np.array([0.0, prior, prior])
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate:
+    """An alignment from all photos of an object, and what it was computed from.
+
+    ``sigma`` is the deviation [px] that the estimate took for all keypoints, None for their own.
+    """
+
+    model: Model | ShapeModel
+    views: tuple[View, ...]
+    result: AlignResult
+    sigma: float | None
+
+    @classmethod
+    def of(cls, known: Known, mesh: Mesh, observation: Observation) -> JointEstimate:
+        """Align as `cadalign fit` does; raises a CadalignError if that is impossible."""
+        model, size = known.model_for(observation, mesh), size_of(observation)
+        sigma = known.further.sigma
+        views = views_of(observation, model, sigma=sigma)
+        if sigma is not None or not known.has_open_sigma(observation):
+            return cls(model, views, align(model, views, size=size), sigma)
+        sigma = _explaining_sigma(model, views, size)
+        used = [replace(view, sigma=sigma) for view in views]
+        return cls(model, views, align(model, used, size=size), sigma)
+
+
+def _explaining_sigma(model: Model | ShapeModel, views: Sequence[View], size: Size | None) -> float:
+    """The deviation of keypoints [px] that explains what a model which is only similar leaves.
+
+    The fixed point of its estimate, from the expected one. Without masks, which take longer than
+    all the rest.
+    """
+    noise = ExpectedNoise.of(*(view.camera for view in views))
+    sigma = noise.sigma
+    for _ in range(_NOISE_ROUNDS):
+        used = [replace(view, mask=None, mask_sigma=None, sigma=sigma) for view in views]
+        try:
+            result = align(model, used, size=size)
+        except CadalignError:  # it takes the masks
+            break
+        residuals = np.concatenate(result.residuals)
+        redundancy = max(0, residuals.size - len(result.covariance))
+        before = sigma
+        sigma = noise.with_residuals(float((residuals**2).sum()), redundancy=redundancy)
+        if abs(sigma / before - 1) < _NOISE_TOLERANCE:
+            break
+    return max(LEAST_SIGMA, sigma)
+
+
 def align_shape(
-    shape: ObjectShape,
+    known: Known,
     wireframe: Wireframe,
     observation: Observation | None,
     points: Sequence[ModelKeypoint],
     uv: FloatArray,
     *,
-    anchors: Mapping[Any, ModelKeypoint],
-    assumed_focal: bool,
+    estimated: Callable[[Observation], JointEstimate],
 ) -> LiveShape:
-    """Align a shape with the complete pairs.
+    """Align with the complete pairs, and with all evidence beside them.
 
     Parameters
     ----------
-    shape : ObjectShape
+    known : Known
     wireframe : Wireframe
         That of the model.
     observation : Observation, optional
-        The pairs that the shape knows; None if there are none.
+        The pairs that count, with the evidence beside them; None if there are none.
     points, uv
         Model points and photo points (n, 2) [px] of all complete pairs.
-    anchors : mapping
-        The model's keypoints that the shape knows, by their ids there.
-    assumed_focal : bool
-        Whether the focal length is neither measured nor chosen.
+    estimated : callable
+        The estimate from an observation, which is the same for all photos of an object.
     """
-    counts = np.array([shape.id_of(point) is not None for point in points], dtype=bool)
+    counts = known.counts(points)
     missing = LEAST_SHAPE_PAIRS - int(counts.sum())
+    further = known.further
     if observation is None or missing > 0:
-        return LiveShape(None, _missing(missing, shape, all_count=bool(counts.all())))
-    mesh = wireframe.scene.mesh
+        all_count = bool(counts.all())
+        text = _missing(missing, known.shape, all_count=all_count)
+        return LiveShape(None, f"{text} of this photo" if further.others else text)
     try:
-        model = shape.model_with(anchors.values(), mesh)
-        (view,) = views_of(observation, model)
-        result = align(model, view)
+        estimate = estimated(observation)
     except CadalignError as error:
         return LiveShape(None, f"No alignment: {error}.")
+    model, result = estimate.model, estimate.result
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
-    warped = _warp(wireframe, result, anchors, free)
+    warped = _warp(wireframe, result, model, known, free)
+    photo = observation.views[further.place]
     residuals = np.empty((len(points), 2))
-    residuals[counts] = result.residuals[0]
-    seen = observation.camera.project(result.alignment.apply(warped.carried))
+    residuals[counts] = result.residuals[further.place]
+    seen = photo.camera.project(result.poses[further.place].apply(warped.carried))
     residuals[~counts] = seen - uv[~counts]
     rows = np.flatnonzero(counts)
-    message = ""
-    if assumed_focal:
-        message = (
-            f"The focal length is assumed, {observation.camera.fx:.0f} px. Choose 'known' to "
-            "accept or correct it; until then the alignment is not saved."
-        )
+    contradicting = _contradicting(model, estimate.views[further.place])
     return LiveShape(
         shown=result,
-        message=message,
-        provisional=assumed_focal,
-        camera=observation.camera,
+        message=_assumption(known.assumed_focal, photo.camera),
+        provisional=bool(known.assumed_focal),
+        camera=photo.camera,
         counts=counts,
         residuals=residuals,
-        outliers={
-            int(rows[row]): off for row, off in _contradicting(model, view, observation).items()
-        },
+        outliers={int(rows[row]): off for row, off in contradicting.items()},
         warped=warped,
-        prior_lengths=shape.length_sigmas(model),
+        prior_lengths=known.prior_lengths(model),
+        place=further.place,
+        also_used=further.labels(observation),
+        sigma=estimate.sigma or LEAST_SIGMA,
+        fit_options={} if estimate.sigma is None else {"sigma": estimate.sigma},
     )
 
 
-def _missing(missing: int, shape: ObjectShape, *, all_count: bool) -> str:
+def _assumption(photos: tuple[str, ...], camera: Camera) -> str:
+    """Say whose focal length is assumed; empty if none is."""
+    if not photos:
+        return ""
+    if "" in photos:
+        return (
+            f"The focal length is assumed, {camera.fx:.0f} px. Choose 'known' to "
+            "accept or correct it; until then the alignment is not saved."
+        )
+    return (
+        f"The focal length of {' and '.join(photos)} is assumed. Choose 'known' in that photo to "
+        "accept or correct it; until then the alignment is not saved."
+    )
+
+
+def _missing(missing: int, shape: ObjectShape | None, *, all_count: bool) -> str:
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
-    if all_count or shape.learned is None:
+    if all_count or shape is None or shape.learned is None:
         return text
     return f"{text}: keypoints that {shape.learned.category} has, marked by rings on the model"
 
@@ -147,25 +272,31 @@ def _missing(missing: int, shape: ObjectShape, *, all_count: bool) -> str:
 def _warp(
     wireframe: Wireframe,
     result: AlignResult,
-    anchors: Mapping[Any, ModelKeypoint],
+    model: Model | ShapeModel,
+    known: Known,
     free: FloatArray,
 ) -> WarpedModel:
     """Warp the model such that its known keypoints come to the estimated ones."""
-    rows = [row for row, label in enumerate(result.ids) if label in anchors]
-    source = np.array([anchors[result.ids[row]].xyz for row in rows])
-    warped = wireframe.warped(source, result.points_3d[rows], result.bounds, carried=free)
-    return WarpedModel(*warped)
+    if known.shape is None:
+        return WarpedModel(wireframe, free)
+    if isinstance(model, Model):
+        source, target = np.asarray(model.points_3d), result.points_3d
+    else:
+        rows = [row for row, label in enumerate(result.ids) if label in known.anchors]
+        source = np.array([known.anchors[result.ids[row]].xyz for row in rows])
+        target = result.points_3d[rows]
+    return WarpedModel(*wireframe.warped(source, target, result.bounds, carried=free))
 
 
-def _contradicting(
-    model: Model | ShapeModel, view: View, observation: Observation
-) -> dict[int, float]:
-    """Distances [px] of pairs that a robust search leaves out, by their rows."""
-    if len(observation.points_2d) < _LEAST_JUDGED:
+def _contradicting(model: Model | ShapeModel, view: View) -> dict[int, float]:
+    """Distances [px] of pairs that a robust search among them leaves out, by their rows."""
+    if len(view.keypoint_ids) < _LEAST_JUDGED:
         return {}
+    pairs = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
     try:
-        robust = align(model, view, ransac=RansacOptions(max_reproj_error=_CONTRADICTS))
+        robust = align(model, pairs, ransac=RansacOptions(max_reproj_error=_CONTRADICTS))
     except CadalignError:
         return {}
-    lengths = np.linalg.norm(robust.residuals[0], axis=1)
-    return {int(row): float(lengths[row]) for row in np.flatnonzero(~robust.inliers[0])}
+    (residuals,), (inliers,) = robust.residuals, robust.inliers
+    lengths = np.linalg.norm(residuals, axis=1)
+    return {int(row): float(lengths[row]) for row in np.flatnonzero(~inliers)}

@@ -44,6 +44,25 @@ class Unmarked:
     deviation: float
 
 
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """An estimate as far as a suggestion follows from it, its covariance as `FitResult` has it."""
+
+    camera: Camera
+    alignment: Alignment
+    covariance: FloatArray
+    sigma: float
+
+    @classmethod
+    def of(cls, live: LiveAlignment) -> Estimate | None:
+        """That of the pairs; None without one."""
+        result = live.cautious
+        covariance = None if result is None else result.posterior_covariance
+        if result is None or covariance is None:
+            return None
+        return cls(result.camera, result.alignment, covariance, live.sigma)
+
+
 @dataclass(frozen=True)
 class Suggestion:
     """The next-best keypoint of the model, or a corner of the surface without a semantic id."""
@@ -54,14 +73,10 @@ class Suggestion:
 
 
 def suggest(
-    model: CadModel, registry: KeypointRegistry, used: Collection[int], live: LiveAlignment
+    model: CadModel, registry: KeypointRegistry, used: Collection[int], estimate: Estimate
 ) -> Suggestion | None:
     """Choose among the visible keypoints that are not used; if none is left, among corners."""
-    result = live.cautious
-    covariance = None if result is None else result.posterior_covariance
-    if result is None or covariance is None:
-        return None
-    camera, alignment = result.camera, result.alignment
+    camera, alignment = estimate.camera, estimate.alignment
     own = [point for number, point in registry if number not in used]
     gaps = np.linalg.norm(model.sample_points[:, None] - registry.xyz(used), axis=2)
     apart = (gaps > _APART * model.diagonal).all(axis=1)
@@ -71,7 +86,9 @@ def suggest(
             continue
         points = np.array([point.xyz for point in candidates])
         seen = np.flatnonzero(visible_keypoints(model.scene, points, camera, alignment))
-        next_best = find_next_best(points[seen], camera, alignment, covariance, live.sigma)
+        next_best = find_next_best(
+            points[seen], camera, alignment, estimate.covariance, estimate.sigma
+        )
         if next_best is not None:
             chosen = seen[next_best.row]
             ((u, v),) = camera.project(alignment.apply(points[chosen : chosen + 1])).tolist()
@@ -88,7 +105,7 @@ def suggest_of_shape(
     covariance C of its place in the photo.
     """
     result, camera, warped = live.shown, live.camera, live.warped
-    if result is None or camera is None or warped is None:
+    if result is None or camera is None or warped is None or live.place:
         return None
     own = {
         shape.id_of(point): point

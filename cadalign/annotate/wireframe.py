@@ -14,6 +14,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, simplify
+from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.scene import Scene
 from cadalign.render.views.visibility import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
@@ -54,8 +55,16 @@ class Wireframe:
         small = simplify(model.scene.mesh, max_faces=_MOST_FACES)
         # Faces of real models seldom share vertices: weld those in one place.
         welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
-        mesh = Mesh(welded.vertices, welded.faces)
+        # A face that is written twice would make a crease of each of its sides.
+        alike, opposite = coincident_faces(welded.vertices, welded.faces)
+        single = np.minimum(alike, opposite) == np.arange(len(alike))
+        mesh = Mesh(welded.vertices, welded.faces[single])
         return cls(model.scene, mesh, _find_edges(mesh), _LONGEST * model.diagonal)
+
+    @property
+    def creases(self) -> FloatArray:
+        """The lines that always show, (k, 2, 3) float [model units]."""
+        return self._mesh.vertices[self._edges.creases]
 
     def warped(
         self, source: FloatArray, target: FloatArray, bounds: FloatArray, *, carried: FloatArray

@@ -11,13 +11,16 @@ export class Api {
     this.onTrouble = onTrouble;
     this.queue = Promise.resolve();
     this.waiting = 0;
-    this.image = 0;
+    this.place = { image: 0, object: null };
   }
 
-  /** Do an action on the photo; resolves to the state, or to null if it was refused. */
-  act(action) {
-    return this.enqueue((image) => ({
-      url: `act/${image}`,
+  /**
+   * Do an action on the object, or another one of the photo; resolves to the state, or to null if
+   * it was refused.
+   */
+  act(action, object = this.place.object) {
+    return this.enqueue(({ image }) => ({
+      url: addressOf("act", { image, object }),
       options: {
         method: "POST",
         headers: { "Content-Type": "application/json" },
@@ -28,22 +31,32 @@ export class Api {
 
   /** Fetch the state anew. */
   refresh() {
-    return this.enqueue((image) => ({ url: `state/${image}`, options: {} }));
+    return this.enqueue((place) => ({ url: addressOf("state", place), options: {} }));
   }
 
   /** What could be added to a photo's pairs, ranked; null if it cannot be told. Nothing waits for it. */
-  async advice(image) {
+  async advice(place) {
     try {
-      const response = await fetch(`advice/${image}`);
+      const response = await fetch(addressOf("advice", place));
       return response.ok ? await response.json() : null;
     } catch {
       return null; // the next action tells that the server is gone
     }
   }
 
-  /** Go on to another photo. */
-  open(image) {
-    this.image = image;
+  /** A library's models, ranked by an object's pairs; null if the server does not answer. */
+  async models() {
+    try {
+      const response = await fetch(addressOf("models", this.place));
+      return response.ok ? await response.json() : { note: await this.reason(response), none: null, models: [] };
+    } catch {
+      return null;
+    }
+  }
+
+  /** Go on to another photo, or to an object of one; without a number to its first object. */
+  open(image, object = null) {
+    this.place = { image, object };
     return this.refresh();
   }
 
@@ -53,16 +66,17 @@ export class Api {
   }
 
   enqueue(makeRequest) {
-    const image = this.image;
+    const { place } = this;
+    const request = makeRequest(place);
     this.waiting += 1;
-    const answer = this.queue.then(() => this.send(makeRequest(image), image));
+    const answer = this.queue.then(() => this.send(request, place));
     this.queue = answer.catch(() => null);
     return answer.finally(() => {
       this.waiting -= 1;
     });
   }
 
-  async send({ url, options }, image) {
+  async send({ url, options }, place) {
     let response;
     try {
       response = await fetch(url, options);
@@ -76,7 +90,13 @@ export class Api {
     }
     const state = await response.json();
     this.onTrouble("");
-    if (image === this.image) this.onState(state);
+    if (place === this.place) {
+      const { number: image, object } = state.image;
+      if (place.image === image && place.object === null) place.object = object;
+      // What still waits is of the place before: its answers are not shown any more.
+      else if (place.image !== image || place.object !== object) this.place = { image, object };
+      this.onState(state);
+    }
     return state;
   }
 
@@ -88,4 +108,9 @@ export class Api {
       return text || `refused (${response.status})`;
     }
   }
+}
+
+/** The address of what concerns an object of a photo. */
+export function addressOf(name, { image, object }, ending = "") {
+  return `${name}/${image}${ending}${object === null ? "" : `?object=${object}`}`;
 }

@@ -1,18 +1,26 @@
 // The keyboard. Keys that a view understands by itself when it has the focus are the view's.
 
+import { TOOLS } from "./marking.js";
+
+const TOOL_KEYS = Object.fromEntries(Object.entries(TOOLS).map(([name, { key }]) => [key, name]));
 const NUDGE = 0.25;
 const COARSE = 10;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const PAN = 40;
+const SIDES = { 1: "front", 2: "right", 3: "back", 4: "left", 5: "top", 6: "bottom" };
+const HELD = { h: (app, held) => app.hide(held), s: (app, held) => app.snap({ held }) };
 
 /** @param {object} app - what the keys do; see main.js */
 export function listen(app) {
   document.addEventListener("keydown", (event) => {
     if (event.defaultPrevented || document.querySelector("dialog[open]")) return;
-    if (event.target.closest("input, select, textarea")) return;
-    const done = event.ctrlKey || event.metaKey ? withControl(app, event) : plain(app, event);
+    if (event.target.closest("input:not([type=checkbox]), select, textarea")) return;
+    const held = !event.ctrlKey && !event.metaKey && !event.altKey && HELD[event.key.toLowerCase()];
+    const done = held ? held(app, true) : event.ctrlKey || event.metaKey ? withControl(app, event) : plain(app, event);
     if (done) event.preventDefault();
   });
+  document.addEventListener("keyup", (event) => HELD[event.key.toLowerCase()]?.(app, false));
+  window.addEventListener("blur", () => Object.values(HELD).forEach((act) => act(app, false)));
 }
 
 function withControl(app, event) {
@@ -42,7 +50,7 @@ function plain(app, event) {
     case "Backspace":
       return app.deleteSelected();
     case "Escape":
-      return app.select(null);
+      return app.escape();
     case "[":
       return app.step(-1);
     case "]":
@@ -53,9 +61,48 @@ function plain(app, event) {
     case "f":
     case "F":
       return app.fit();
+    case "l":
+    case "L":
+      return app.magnify();
+    case "m":
+    case "M":
+      return app.mirror();
+    case "o":
+    case "O":
+      return app.nextMode();
     case "v":
     case "V":
       return app.asPhoto();
+    case "c":
+    case "C":
+      return app.closePolygon();
+    case "a":
+    case "A":
+      return app.accept();
+    case "r":
+    case "R":
+      return app.showResult();
+    case "q":
+    case "Q":
+      return app.showModels();
+    case "e":
+    case "E":
+      return app.nextObject();
+    case "t":
+    case "T":
+      return app.showObjects();
+    case "y":
+    case "Y":
+      return app.nextView();
+    case "w":
+    case "W":
+      return app.showPhotos();
+    case "d":
+    case "D":
+      return app.mark("done") && true;
+    case "k":
+    case "K":
+      return app.mark("skipped") && true;
     case "?":
       return app.showHelp();
     case "PageUp":
@@ -63,7 +110,8 @@ function plain(app, event) {
     case "PageDown":
       return app.go(1);
     default:
-      return false;
+      if (TOOL_KEYS[event.key.toLowerCase()]) return app.choose(TOOL_KEYS[event.key.toLowerCase()]);
+      return SIDES[event.key] ? app.lookFrom(SIDES[event.key]) : false;
   }
 }
 

@@ -1,41 +1,72 @@
 // The page around the views: bar, messages, help.
 import { button, h } from "../common/dom.js";
+import { TOOLS } from "./marking.js";
 
 const KEYS = [
   ["Click, then click", "the photo and the model at the same place, in either order: a pair"],
-  ["Drag a point", "moves it in the photo"],
+  ["Drag a point", "moves it, in the photo and on the model"],
   ["Drag beside points", "pans the photo, turns the model"],
   ["Wheel, pinch, + and −", "zoom"],
   ["Arrow keys", "nudge the selected point by 0.25 px, with Shift by 2.5 px; in the model they turn it"],
   ["Enter", "places a point at the middle of the view that has the focus"],
+  ["A", "takes all keypoints that a detector proposes"],
   ["[ and ]", "select the pair before and after"],
   ["N", "uses the suggested model point"],
   ["Delete", "deletes the selected pair"],
   ["Ctrl+Z, Ctrl+Y", "undo, redo"],
   ["F", "shows all of the photo and the model"],
   ["V", "looks at the model from where the photo was taken"],
-  ["Page up, Page down", "the photo before and after"],
-  ["Escape", "selects nothing"],
+  ["1 to 6", "look at the model from its front, right, back, left, top, bottom"],
+  ["S held", "snaps clicks and drags: on the model to corners, creases and silhouette, in the photo to corners"],
+  ["L", "a loupe beside the pointer, or none"],
+  ["M", "begins a pair at the mirror image of the selected one, on a symmetric model"],
+  ["P B G X U", "what a click in the photo marks: points; the mask by brush, polygon, box; a vertical edge"],
+  ["Shift while marking", "takes away from the mask"],
+  ["C", "closes the polygon"],
+  ["Right button", "pans the photo while the mask is drawn"],
+  ["H held", "hides the alignment over the photo"],
+  ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
+  ["O", "draws the alignment as edges, shaded, as a box, or not"],
+  ["Page up, Page down", "the photo before and after, of those that the list shows"],
+  ["Q", "the library's models by how well they explain the pairs: there 1 to 9 choose one, 0 none of them"],
+  ["E", "the next object of the photo"],
+  ["T", "the objects of the photo: add, rename, delete; and the photos of the object"],
+  ["Y", "the next photo of the object"],
+  ["W", "the list of photos with their states"],
+  ["D, K", "marks the photo as done or skipped, and goes on"],
+  ["Escape", "gives up what is begun, goes back to points, selects nothing"],
   ["?", "this help"],
 ];
 
 export class Layout {
   /** @param {object} handlers - undo, redo, previous, next */
-  constructor(handlers, panel) {
+  constructor(handlers, panel, objects) {
     this.title = h("h1");
-    this.place = h("span", { class: "soft" });
+    this.place = h("span", { class: "soft count" });
     this.saved = h("span", { class: "saved", role: "status" });
     this.previous = button("‹ Previous", handlers.previous, { title: "Page up" });
     this.next = button("Next ›", handlers.next, { title: "Page down" });
     this.undo = button("Undo", handlers.undo, { title: "Ctrl+Z" });
     this.redo = button("Redo", handlers.redo, { title: "Ctrl+Y" });
-    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next);
-    this.help = helpDialog();
+    this.list = button("Photos…", handlers.list, { title: "All photos with their states (W)", "aria-haspopup": "dialog" });
+    this.done = toggle("Done", () => handlers.mark("done"), { title: "This photo is done: go on (D)" });
+    this.skip = toggle("Skip", () => handlers.mark("skipped"), { title: "Leave this photo out: go on (K)" });
+    this.photos = h("nav", { "aria-label": "Photos" }, this.previous, this.place, this.next, this.done, this.skip, this.list);
+    this.help = helpDialog(handlers.tour);
     this.message = h("p", { class: "message", role: "alert", hidden: true });
     this.photo = h("div", { class: "host" });
     this.model = h("div", { class: "host" });
+    this.overlay = makeOverlay(handlers.overlay);
+    this.tools = makeTools(handlers);
     this.shown = h("span", { class: "soft" });
+    this.snapping = toggle("Snap", handlers.snap, { title: "Clicks go to corners, creases and silhouette (hold S)" });
+    this.loupe = toggle("Loupe", handlers.loupe, { title: "Magnify about the pointer (L)" });
+    this.result = toggle("Result", handlers.result, { title: "The aligned model before the photo, in 3D (R)" });
+    this.models = button("Models…", handlers.models, {
+      title: "Models of the library, by the pairs marked so far (Q)", "aria-haspopup": "dialog", class: "library",
+    });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
+    document.body.classList.add("waiting"); // for the first state, which says what there is
     document.body.append(
       h(
         "header",
@@ -46,6 +77,8 @@ export class Layout {
         h(
           "div",
           { class: "tools" },
+          this.snapping,
+          this.loupe,
           this.undo,
           this.redo,
           button("Help", () => this.help.showModal(), { title: "?", "aria-haspopup": "dialog" }),
@@ -55,8 +88,11 @@ export class Layout {
       h(
         "main",
         {},
-        view("Photo", this.photo, handlers.photo),
-        view("Model", this.model, handlers.model, this.shown, this.asPhoto),
+        view("Photo", this.photo, handlers.photo, {
+          above: [h("div", { class: "above" }, objects.open, this.tools.root), objects.strip],
+          below: this.overlay.root,
+        }),
+        view("Model", this.model, handlers.model, { below: [this.models, this.shown, this.result, this.asPhoto] }),
         panel,
       ),
       this.help,
@@ -65,18 +101,44 @@ export class Layout {
 
   show(state) {
     const { image, saved } = state;
+    document.body.classList.remove("waiting");
     document.title = `${image.name} · cadalign annotate`;
     this.title.textContent = image.name;
     this.photos.hidden = image.count < 2;
     this.place.textContent = `${image.number + 1} of ${image.count}`;
+    this.done.setAttribute("aria-pressed", String(image.state === "done"));
+    this.skip.setAttribute("aria-pressed", String(image.state === "skipped"));
     this.previous.disabled = image.number === 0;
     this.next.disabled = image.number === image.count - 1;
     this.undo.disabled = !state.can_undo;
     this.redo.disabled = !state.can_redo;
+    this.models.hidden = !image.has_library;
     this.asPhoto.hidden = state.alignment.status !== "done";
+    this.result.hidden = state.alignment.status !== "done" || state.alignment.camera_from_page === null;
     this.saved.classList.toggle("trouble", Boolean(saved.trouble));
     this.saved.textContent = savedText(saved);
     if (state.message) this.tell(state.message);
+  }
+
+  showTool(tool) {
+    this.tools.show(tool);
+  }
+
+  showSnapping(on, active) {
+    this.snapping.setAttribute("aria-pressed", String(on));
+    this.snapping.classList.toggle("active", active);
+  }
+
+  showResult(on) {
+    this.result.setAttribute("aria-pressed", String(on));
+  }
+
+  showLoupe(on) {
+    this.loupe.setAttribute("aria-pressed", String(on));
+  }
+
+  nextMode() {
+    this.overlay.next();
   }
 
   /** Say something, or with "" nothing any more. */
@@ -86,25 +148,74 @@ export class Layout {
   }
 }
 
+/** What clicks in the photo mark, and how wide the brush is. */
+function makeTools({ tool: onChoose, brush: onBrush }) {
+  const options = Object.entries(TOOLS).map(([name, { label, key }]) =>
+    h("option", { value: name }, `${label} (${key.toUpperCase()})`),
+  );
+  const choice = h("select", { "aria-label": "What a click in the photo marks", onchange: () => onChoose(choice.value) }, options);
+  const size = h("input", {
+    type: "range", min: "2", max: "60", value: "14", "aria-label": "Size of the brush", oninput: () => onBrush(Number(size.value)),
+  });
+  let how = h("span", { class: "soft" });
+  const root = h("div", { class: "marking" }, choice, size, how);
+  const show = (name) => {
+    choice.value = name;
+    const told = h("span", { class: "soft" }, TOOLS[name].how);
+    how.replaceWith(told);
+    how = told;
+    size.hidden = name !== "brush";
+  };
+  show("points");
+  return { root, show };
+}
+
+/** How the alignment is drawn over the photo: a choice and a slider. */
+function makeOverlay(onChange) {
+  const modes = ["edges", "shaded", "box", "off"];
+  const mode = h(
+    "select",
+    { "aria-label": "Alignment over the photo", title: "O", onchange: () => onChange({ mode: mode.value }) },
+    modes.map((name) => h("option", { value: name }, name)),
+  );
+  const opacity = h("input", {
+    type: "range", min: "0.1", max: "1", step: "0.05", value: "1",
+    "aria-label": "Opacity of the alignment", title: "Opacity; H hides while held",
+    oninput: () => onChange({ opacity: Number(opacity.value) }),
+  });
+  const next = () => {
+    mode.value = modes[(modes.indexOf(mode.value) + 1) % modes.length];
+    onChange({ mode: mode.value });
+  };
+  return { root: h("span", { class: "overlay" }, mode, opacity), next };
+}
+
+/** A button that is on or off. */
+function toggle(text, onChange, attributes) {
+  const made = button(text, () => onChange(made.getAttribute("aria-pressed") !== "true"), attributes);
+  made.setAttribute("aria-pressed", "false");
+  return made;
+}
+
 function savedText({ path, at, trouble }) {
   if (trouble) return `Not saved: ${trouble}`;
   if (at === null) return `Saves to ${path}`;
   return `Saved to ${path} at ${new Date(1000 * at).toLocaleTimeString()}`;
 }
 
-function view(name, host, { zoom, fit }, ...extra) {
+function view(name, host, { zoom, fit }, { above = null, below }) {
   const tools = h(
     "div",
     { class: "zoom", role: "group", "aria-label": `Zoom of the ${name.toLowerCase()}` },
-    extra,
+    below,
     button("−", () => zoom(1 / 1.4), { "aria-label": "Zoom out" }),
     button("+", () => zoom(1.4), { "aria-label": "Zoom in" }),
-    button("Fit", fit, { "aria-label": `Show the whole ${name.toLowerCase()}` }),
+    button("Fit", fit, { "aria-label": `Fit the whole ${name.toLowerCase()}` }),
   );
-  return h("section", { class: "view", "aria-label": name }, h("h2", {}, name), tools, host);
+  return h("section", { class: "view", "aria-label": name }, h("h2", {}, name), above, tools, host);
 }
 
-function helpDialog() {
+function helpDialog(onTour) {
   const rows = KEYS.map(([key, text]) => h("div", {}, h("dt", {}, key), h("dd", {}, text)));
   const dialog = h("dialog", { "aria-labelledby": "help-title" });
   dialog.append(
@@ -113,9 +224,14 @@ function helpDialog() {
     h(
       "p",
       {},
-      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
+      "Red is the model's box, blue its edges, white the boxes of the photo's other objects, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
     ),
     button("Close", () => dialog.close()),
+    " ",
+    button("Show the tour", () => {
+      dialog.close();
+      onTour();
+    }),
   );
   return dialog;
 }

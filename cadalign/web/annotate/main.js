@@ -4,59 +4,111 @@ import "./annotate.css";
 import { debounced } from "../common/dom.js";
 import { Api } from "./api.js";
 import { listen } from "./keys.js";
+import { ModelLibrary } from "./library.js";
 import { Layout } from "./layout.js";
 import { ModelView } from "./model_view.js";
+import { Mover } from "./mover.js";
+import { Objects } from "./objects.js";
 import { Panel } from "./panel.js";
+import { ShadedOverlay } from "./overlay.js";
+import { Tour } from "./tour.js";
+import { WorkList } from "./worklist.js";
 import { PhotoView } from "./photo_view.js";
 
 const POLL = 400; // while the solvers are being prepared [ms]
-const PAUSE = 800; // nudges that follow each other faster are undone together [ms]
+// ShapeNet's models face -z, with y up; none is looked at straight along y, where left is undefined.
+const SIDES = {
+  front: [0, 0, -1], back: [0, 0, 1], left: [1, 0, 0], right: [-1, 0, 0],
+  top: [0, 1, -0.001], bottom: [0, -1, -0.001],
+};
+const SNAP = 14; // reach of snapping clicks on the screen [px]
 const REST = 300; // without a change, until what to add next is ranked [ms]
 
 class App {
   constructor() {
     this.state = null;
     this.selected = null;
-    this.gesture = Math.floor(Math.random() * 2 ** 40); // another than in other tabs
+    this.snapping = { held: false, on: false };
+    this.mover = new Mover(this);
     this.api = new Api({
       onState: (state) => this.show(state),
       onTrouble: (text) => this.layout.tell(text),
     });
     const act = (action, select) => this.act(action, select);
     this.askSoon = debounced(() => this.ask(), REST);
-    this.panel = new Panel({ act, select: (pair) => this.select(pair), suggested: () => this.suggested() });
+    this.panel = new Panel({
+      act,
+      select: (pair) => this.select(pair),
+      suggested: () => this.suggested(),
+      accept: () => this.accept(),
+      mirror: (pair) => this.mirror(pair),
+      tell: (text) => this.layout.tell(text),
+    });
+    this.objects = new Objects({
+      act: (action, object) => this.api.act(action, object),
+      go: ({ image, object }) => this.goTo(image, object),
+      tell: (text) => this.layout.tell(text),
+    });
+    this.worklist = new WorkList({ go: (number) => this.goTo(number), tell: (text) => this.layout.tell(text) });
     this.layout = new Layout(
       {
         undo: () => this.undo(),
         redo: () => this.redo(),
         previous: () => this.go(-1),
         next: () => this.go(1),
+        tour: () => this.tour.start(),
+        list: () => this.showPhotos(),
+        mark: (mark) => this.mark(mark),
         asPhoto: () => this.asPhoto(),
+        result: (on) => this.showResult(on),
+        models: () => this.showModels(),
+        tool: (tool) => this.choose(tool),
+        brush: (radius) => (this.photo.marking.radius = radius),
+        snap: (on) => this.snap({ on }),
+        loupe: (on) => this.magnify(on),
+        overlay: (changed) => this.photo.setOverlay(changed),
         photo: { zoom: (factor) => this.photo.zoom(factor), fit: () => this.photo.fit() },
         model: { zoom: (factor) => this.model.zoom(factor), fit: () => this.model.frame() },
       },
       this.panel.root,
+      this.objects,
     );
     this.photo = new PhotoView(this.layout.photo, {
-      onPlace: (uv) => this.act({ do: "place_uv", uv, pair: this.selected }),
+      onPlace: (uv) => this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach }),
+      onAccept: (keypoint) => this.act({ do: "accept", keypoints: [keypoint] }),
+      onMark: (action) => this.act(action),
       onSelect: (pair) => this.select(pair),
-      onMove: (pair, uv, done) => this.drag(pair, uv, done),
+      onMove: (pair, uv, done) => this.mover.drag(pair, uv, done),
       onTrouble: (text) => this.layout.tell(text),
     });
     this.model = new ModelView(this.layout.model, {
-      onPick: (ray) => this.act({ do: "pick", ...ray, pair: this.selected }),
+      onPick: (aim) => this.act({ do: "pick", ...aim, pair: this.selected, snap: this.modelReach }),
+      onRepick: (pair, aim) => this.repick(pair, aim),
+      onMirrored: (pair) => this.mirror(pair),
       onSelect: (pair) => this.select(pair),
       onSuggested: () => this.suggested(),
     });
+    this.library = new ModelLibrary({ act, rank: () => this.api.models() });
+    this.tour = new Tour();
     listen(this);
     window.addEventListener("hashchange", () => this.open());
     window.addEventListener("focus", () => this.api.idle && this.state && this.api.refresh());
   }
 
   async start() {
-    const opened = this.open();
+    await this.open();
+    if (!navigator.webdriver) this.tour.startOnce(); // programs know what to do
+  }
+
+  /** Show the model of a number. */
+  async useModel(number) {
     try {
-      const { shown, all } = await this.model.load();
+      const header = await this.model.load(number);
+      if (!header) return; // another one is wanted by now
+      this.photo.shaded ??= new ShadedOverlay();
+      this.photo.shaded.use(this.model.group);
+      this.photo.invalidate();
+      const { shown, all } = header;
       const some = shown < all;
       this.layout.shown.textContent = some
         ? `${shown.toLocaleString()} of ${all.toLocaleString()} faces shown, clicks are exact`
@@ -64,17 +116,18 @@ class App {
     } catch (error) {
       this.layout.tell(`The model cannot be shown: ${error.message}`);
     }
-    await opened;
   }
 
-  /** Show the photo that the address names. */
+  /** Show the photo, or the object of one, that the address names: #3 or #3.2, counted from 1. */
   open() {
-    const number = Math.max(0, (parseInt(location.hash.slice(1), 10) || 1) - 1);
+    const [photo, part] = location.hash.slice(1).split(".").map((text) => parseInt(text, 10));
+    const number = Math.max(0, (photo || 1) - 1);
     this.selected = null;
-    this.opened = null;
+    if (number !== this.state?.image.number) this.opened = null; // another object keeps the zoom
+    if (this.model?.result) this.showResult(false);
     // The token has done its work: it stays out of the history and of what is copied.
     history.replaceState(null, "", `/${location.hash}`);
-    return this.api.open(number);
+    return this.api.open(number, part > 0 ? part - 1 : null);
   }
 
   /** Show a new state. */
@@ -85,9 +138,19 @@ class App {
       this.opened = image.number;
       this.photo.open(image.number, image);
     }
+    const object = `${image.number}.${image.object}`;
+    if (this.object !== object) {
+      if (this.object !== undefined) this.selected = null;
+      if (this.model.result) this.showResult(false);
+      this.photo.marking.cancel();
+      this.object = object;
+      this.showAddress(image);
+    }
+    if (this.model.number !== image.model_number) this.useModel(image.model_number);
     if (state.selected !== null) this.selected = state.selected;
     if (!state.pairs.some((pair) => pair.pair === this.selected)) this.selected = null;
     this.layout.show(state);
+    this.objects.show(state);
     this.draw();
     if (state.alignment.status === "done") this.askSoon();
     if (state.alignment.status === "preparing") setTimeout(() => this.api.refresh(), POLL);
@@ -96,6 +159,7 @@ class App {
   draw() {
     this.photo.show(this.state, this.selected);
     this.model.show(this.state, this.selected);
+    if (this.model.result) this.showResult(true);
     this.panel.show(this.state, this.selected);
     this.panel.showRanking(this.ranked, this.isCurrent(this.ranked));
   }
@@ -103,9 +167,9 @@ class App {
   /** Ask what to add next, unless that is known; an answer that comes too late is dropped. */
   async ask() {
     if (this.isCurrent(this.ranked)) return;
-    const { number } = this.state.image;
-    const answer = await this.api.advice(number);
-    const ranked = answer && { ...answer, number };
+    const { number, object } = this.state.image;
+    const answer = await this.api.advice({ image: number, object });
+    const ranked = answer && { ...answer, number, object };
     if (!this.isCurrent(ranked)) return;
     this.ranked = ranked;
     this.panel.showRanking(ranked, true);
@@ -114,7 +178,8 @@ class App {
   /** Whether a ranking is that of the annotation that is shown. */
   isCurrent(ranked) {
     const { image, revision } = this.state;
-    return ranked?.number === image.number && ranked.revision === revision;
+    const isOfThis = ranked?.number === image.number && ranked.object === image.object;
+    return isOfThis && ranked.revision === revision;
   }
 
   /** Do an action; the time until its result is drawn is kept in `redrawn` [ms]. */
@@ -143,48 +208,8 @@ class App {
     return this.select(pairs[next].pair);
   }
 
-  /** Follow a point that is dragged: one request under way at a time, the last place wins. */
-  async drag(pair, uv, done) {
-    if (!this.dragging) this.gesture += 1;
-    this.dragging = !done;
-    this.selected = pair;
-    this.draggedTo = { pair, uv, done };
-    if (this.following) return;
-    this.following = true;
-    while (this.draggedTo) {
-      const { done: last, ...move } = this.draggedTo;
-      this.draggedTo = null;
-      await this.api.act({ do: "move", gesture: this.gesture, ...move });
-      if (last) this.photo.dragged = null;
-      this.photo.invalidate();
-    }
-    this.following = false;
-  }
-
   nudge(x, y) {
-    const pair = this.state?.pairs.find((one) => one.pair === this.selected);
-    if (!pair?.uv) return false;
-    const now = performance.now();
-    if (!(now - this.nudgedAt < PAUSE) || this.nudged?.pair !== pair.pair) this.gesture += 1;
-    this.nudgedAt = now;
-    // Answers to earlier nudges may still be on their way: go on from where the last one led.
-    const under = this.nudged?.pair === pair.pair && this.nudged.waiting > 0;
-    const from = under ? this.nudged.uv : pair.uv;
-    this.nudged = {
-      pair: pair.pair,
-      uv: this.photo.clamp([from[0] + x, from[1] + y]),
-      waiting: (under ? this.nudged.waiting : 0) + 1,
-    };
-    const { uv } = this.nudged;
-    this.photo.dragged = { pair: pair.pair, uv };
-    this.photo.invalidate();
-    this.act({ do: "move", pair: pair.pair, uv, gesture: this.gesture }).then(() => {
-      if (this.nudged?.pair !== pair.pair) return;
-      this.nudged.waiting -= 1;
-      if (this.nudged.waiting === 0) this.photo.dragged = null;
-      this.photo.invalidate();
-    });
-    return true;
+    return this.mover.nudge(x, y);
   }
 
   deleteSelected() {
@@ -195,7 +220,72 @@ class App {
 
   placeMiddle() {
     const uv = this.photo.toPixel(this.photo.middle);
-    if (this.photo.contains(uv)) this.act({ do: "place_uv", uv, pair: this.selected });
+    if (this.photo.marking.active) this.photo.marking.confirm(this.photo.clamp(uv));
+    else if (this.photo.contains(uv)) this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
+    return true;
+  }
+
+  /** Choose what clicks in the photo mark. */
+  choose(tool) {
+    this.photo.marking.choose(tool);
+    this.layout.showTool(tool);
+    return true;
+  }
+
+  closePolygon() {
+    if (!this.photo.marking.active) return false;
+    this.photo.marking.finish();
+    return true;
+  }
+
+  /** Give up what is begun, else the tool, else the selection. */
+  escape() {
+    if (this.photo.marking.cancel()) return true;
+    if (this.photo.marking.active) return this.choose("points");
+    return this.select(null);
+  }
+
+  /** How far clicks snap in the photo [its px], and on the model [tangent]; 0 if they don't. */
+  get photoReach() {
+    return this.isSnapping ? SNAP / this.photo.scale : 0;
+  }
+
+  get modelReach() {
+    return this.isSnapping ? this.model.tangent(SNAP) : 0;
+  }
+
+  get isSnapping() {
+    return this.snapping.held !== this.snapping.on;
+  }
+
+  /** Snap while a key is held, or until switched off; the key undoes what is switched on. */
+  snap(changed) {
+    Object.assign(this.snapping, changed);
+    this.layout.showSnapping(this.snapping.on, this.isSnapping);
+    return true;
+  }
+
+  /** Magnify about the pointer, or no more. */
+  magnify(on = !this.photo.loupe.on) {
+    this.photo.loupe.on = this.model.loupe.on = on;
+    this.layout.showLoupe(on);
+    this.photo.invalidate();
+    this.model.stage.invalidate();
+    return true;
+  }
+
+  async repick(pair, aim) {
+    await this.act({ do: "repick", pair, ...aim, snap: this.modelReach }, pair);
+    this.model.drop();
+    this.model.stage.invalidate();
+  }
+
+  /** Begin a pair at the mirror image of another, by default the selected or last one. */
+  mirror(pair) {
+    const having = this.state?.pairs.filter((each) => each.mirrored) ?? [];
+    const chosen = pair ?? (having.find((each) => each.pair === this.selected) ?? having.at(-1))?.pair;
+    if (chosen === undefined) this.layout.tell("No pair has a mirror image that is not marked.");
+    else this.act({ do: "mirrored", pair: chosen });
     return true;
   }
 
@@ -225,17 +315,99 @@ class App {
     return true;
   }
 
+  /** Show the aligned model before the photo in 3D, or the model to click on again. */
+  showResult(on = !this.model.result) {
+    const shown = this.model.showResult(on, this.photo.picture);
+    this.layout.showResult(shown);
+    if (on && !shown) this.layout.tell("There is no stretched model to show yet.");
+    return true;
+  }
+
+  /** Look at the model from its front, back, left, right, top or bottom, as most models lie. */
+  lookFrom(side) {
+    this.model.frameFrom(SIDES[side]);
+    return true;
+  }
+
+  /** Hide the alignment over the photo while a key is held. */
+  hide(hidden) {
+    this.photo.setOverlay({ hidden });
+    return true;
+  }
+
+  /** Go on to the next way to draw the alignment. */
+  nextMode() {
+    this.layout.nextMode();
+    return true;
+  }
+
   showHelp() {
     this.layout.help.showModal();
     return true;
   }
 
-  /** Go to the photo some places on. */
+  /** Go to the photo some places on, among those of the work list's filter. */
   go(by) {
     const { image } = this.state ?? { image: { number: 0, count: 1 } };
-    const number = image.number + by;
-    if (number < 0 || number >= image.count) return false;
-    location.hash = String(number + 1);
+    if (!this.worklist.filter.value) {
+      const number = image.number + by;
+      return number >= 0 && number < image.count && this.goTo(number);
+    }
+    this.worklist.next(image.number, by).then((number) => {
+      if (number === null) this.layout.tell(`No other photo is "${this.worklist.filter.value}" in this direction.`);
+      else this.goTo(number);
+    });
+    return true;
+  }
+
+  goTo(number, object = null) {
+    location.hash = object === null ? String(number + 1) : `${number + 1}.${object + 1}`;
+    return true;
+  }
+
+  /** Let the address name the object that is shown, so that reloading the page shows it again. */
+  showAddress({ number, object }) {
+    const part = object === 0 ? "" : `.${object + 1}`;
+    const isNamed = location.hash || number || object;
+    if (isNamed) history.replaceState(null, "", `/#${number + 1}${part}`);
+  }
+
+  nextObject() {
+    return this.objects.nextObject();
+  }
+
+  nextView() {
+    return this.objects.nextView();
+  }
+
+  showObjects() {
+    return this.objects.showDialog();
+  }
+
+  /** Take all that a detector proposes. */
+  accept() {
+    if (!this.state?.proposals.length) return false;
+    this.act({ do: "accept" });
+    return true;
+  }
+
+  showPhotos() {
+    if (this.state?.image.count > 1) this.worklist.open(this.state.image.number);
+    return true;
+  }
+
+  /** Show the models of the library, if there is one, by how well they explain the pairs. */
+  showModels() {
+    if (this.state?.image.has_library) this.library.open();
+    return true;
+  }
+
+  /** Mark the photo as done or skipped and go on, or take the mark back. */
+  async mark(mark) {
+    const { state, count, number } = this.state.image;
+    const isNew = state !== mark;
+    const answer = await this.act({ do: "mark", mark: isNew ? mark : null });
+    if (answer && isNew && number < count - 1) this.go(1);
     return true;
   }
 }

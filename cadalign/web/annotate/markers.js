@@ -28,12 +28,20 @@ export class Markers {
       const common = { map, sizeAttenuation: false, transparent: true, depthWrite: false };
       for (const [depthTest, opacity] of [[false, HIDDEN_OPACITY], [true, 1]]) {
         const sprite = new Sprite(new SpriteMaterial({ ...common, depthTest, opacity }));
-        sprite.userData.place = new Vector3(...marker.xyz);
+        sprite.userData = { place: new Vector3(...marker.xyz), marker };
         sprite.renderOrder = marker.kind === "free" ? 1 : 2;
         this.group.add(sprite);
       }
     }
     return true;
+  }
+
+  /** Draw the marker of a pair elsewhere while it is dragged; all are put back without a place. */
+  moveTo(pair, xyz) {
+    for (const { userData } of this.group.children) {
+      const { marker, place } = userData;
+      place.set(...(xyz && marker.pair === pair ? xyz : marker.xyz));
+    }
   }
 
   /** Put the sprites a little before the surface and give them their size; before each drawing. */

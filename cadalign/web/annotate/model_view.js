@@ -1,34 +1,22 @@
 // The model: orbited, clicked on, and marked with numbered points.
-import {
-  BufferAttribute,
-  BufferGeometry,
-  Color,
-  DoubleSide,
-  EdgesGeometry,
-  LineBasicMaterial,
-  LineSegments,
-  Mesh,
-  MeshLambertMaterial,
-  Raycaster,
-  SRGBColorSpace,
-  Vector2,
-  Vector3,
-} from "three";
+import { Box3, Raycaster, Vector2, Vector3 } from "three";
 import { Stage } from "../common/stage.js";
+import { Loupe, renderLoupe } from "./loupe.js";
 import { kindOf } from "./marker.js";
 import { Markers } from "./markers.js";
+import { fetchModel, makeAxes } from "./model_mesh.js";
+import { ASIDE, disposeResult, makeResult } from "./result_view.js";
 
 const CLICK_REACH = 4;
 const MARKER_REACH = 14;
 const HIDDEN_BY = 0.02; // diagonals that a marker may lie behind the surface
-const EDGES_UP_TO = 30000;
-const FOLD = 30;
 const FRONT = new Vector3(0.8, 0.6, -1.4); // ShapeNet's models face -z
 
 export class ModelView {
   /**
    * @param {HTMLElement} host - the element to fill
-   * @param {object} handlers - onPick({origin, direction, near}), onSelect(pair)
+   * @param {object} handlers - onPick(aim), onRepick(pair, aim), onSelect(pair), onMirrored(pair),
+   *   onSuggested(), where an aim has origin, direction and near
    */
   constructor(host, handlers) {
     this.handlers = handlers;
@@ -37,54 +25,74 @@ export class ModelView {
         "The model. Arrow keys turn it, plus and minus zoom, Enter places a point at the middle of the view.",
     });
     this.stage.canvas.setAttribute("role", "application");
+    this.stage.controls.zoomToCursor = true;
     this.markers = new Markers(this.stage);
+    this.loupe = new Loupe(host);
     this.stage.beforeDraw = () => this.markers.face();
+    this.stage.afterDraw = () => {
+      const loupe = this.loupe.place();
+      if (loupe) renderLoupe(this.stage, this.markers.group, loupe);
+    };
     this.state = null;
+    this.models = new Map();
     this.raycaster = new Raycaster();
     const { canvas } = this.stage;
-    canvas.addEventListener("pointerdown", (event) => {
-      this.press = event.button === 0 && event.isPrimary ? { x: event.clientX, y: event.clientY } : null;
-    });
+    // Before the controls, which would turn the model while a point is dragged.
+    host.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointerup", (event) => this.release(event));
-    canvas.addEventListener("pointermove", (event) => this.hover(event));
+    canvas.addEventListener("pointermove", (event) => this.move(event));
+    canvas.addEventListener("pointerleave", () => this.point(null));
+    canvas.addEventListener("pointercancel", () => this.drop());
   }
 
-  /** Fetch the triangles; resolves to what is shown of how many. */
-  async load() {
-    const response = await fetch("model");
-    if (!response.ok) throw new Error(await response.text());
-    const buffer = await response.arrayBuffer();
-    const length = new DataView(buffer).getUint32(0, true);
-    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-    const corners = 9 * header.shown;
-    const start = 4 + length;
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(new Float32Array(buffer, start, corners), 3));
-    geometry.setAttribute(
-      "normal",
-      new BufferAttribute(new Float32Array(buffer, start + 4 * corners, corners), 3),
-    );
-    const bytes = new Uint8Array(buffer, start + 8 * corners, 3 * header.shown);
-    geometry.setAttribute("color", new BufferAttribute(cornerColors(bytes), 3));
-    this.mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, side: DoubleSide }));
-    this.stage.scene.add(this.mesh);
-    if (header.shown <= EDGES_UP_TO) {
-      const material = new LineBasicMaterial({ color: 0x10151c, transparent: true, opacity: 0.45 });
-      this.stage.scene.add(new LineSegments(new EdgesGeometry(geometry, FOLD), material));
-    }
+  /** Show the model of a number, fetched once; resolves to what is shown of how many faces. */
+  async load(number) {
+    this.number = number;
+    if (this.mesh) this.stage.scene.remove(this.group, this.axes);
+    this.mesh = null; // until it is there, nothing can be clicked on
+    if (!this.models.has(number)) this.models.set(number, fetchModel(number));
+    const { header, mesh, group } = await this.models.get(number);
+    if (this.number !== number) return null;
+    this.mesh = mesh;
+    this.group = group;
+    this.axes = makeAxes(new Box3().setFromObject(mesh));
+    this.stage.scene.add(group, this.axes);
     this.frame();
     return header;
   }
 
-  /** See the whole model, from its front as most models have it. */
+  /** Show the aligned model before the photo in place of the model to click on, or no more. */
+  showResult(on, picture) {
+    const { alignment, image } = this.state ?? {};
+    const isThere = on && this.mesh && alignment?.status === "done" && alignment.camera_from_page !== null;
+    if (this.result) {
+      this.stage.scene.remove(this.result);
+      disposeResult(this.result);
+    }
+    const wasShown = Boolean(this.result);
+    this.result = isThere ? makeResult(this.group, alignment, image, picture) : null;
+    if (this.result) this.stage.scene.add(this.result);
+    if (this.mesh) this.group.visible = this.axes.visible = this.markers.group.visible = !this.result;
+    if (Boolean(this.result) !== wasShown) this.frame();
+    this.stage.invalidate();
+    return Boolean(this.result);
+  }
+
+  /** See the whole model, from its front as most models have it, or the whole result. */
   frame() {
-    if (this.mesh) this.stage.frame(this.mesh, FRONT);
+    if (this.result) this.stage.frame(this.result, ASIDE);
+    else if (this.mesh) this.stage.frame(this.mesh, FRONT);
   }
 
   /** Look at the model from where the photo was taken. */
   frameAsPhoto() {
     const eye = this.state?.alignment.eye;
-    if (eye && this.mesh) this.stage.frame(this.mesh, new Vector3(...eye));
+    if (eye && !this.result && this.mesh) this.stage.frame(this.mesh, new Vector3(...eye));
+  }
+
+  /** Look at the model along one of its axes. */
+  frameFrom(direction) {
+    if (this.mesh && !this.result) this.stage.frame(this.mesh, new Vector3(...direction));
   }
 
   zoom(factor) {
@@ -102,7 +110,10 @@ export class ModelView {
     }
     for (const pair of state.pairs) {
       if (pair.xyz) {
-        shown.push({ kind: kindOf(pair, selected), label: String(pair.position), xyz: pair.xyz, pair: pair.pair, name: pair.name });
+        if (pair.pair === selected && pair.mirrored) {
+          shown.push({ kind: "suggested", label: "⇋", xyz: pair.mirrored, mirrored: pair.pair, name: "its mirror image" });
+        }
+        shown.push({ kind: kindOf(pair, selected), label: String(pair.pair), xyz: pair.xyz, pair: pair.pair, name: pair.name });
       }
     }
     const { suggestion } = state;
@@ -120,9 +131,58 @@ export class ModelView {
     return { x: left + ((point.x + 1) / 2) * width, y: top + ((1 - point.y) / 2) * height };
   }
 
+  down(event) {
+    if (event.button !== 0 || !event.isPrimary || event.target !== this.stage.canvas) {
+      this.drop();
+      return;
+    }
+    if (this.result) return;
+    const place = { x: event.clientX, y: event.clientY };
+    const pair = this.markerAt(place)?.pair;
+    this.press = { ...place, pair, moved: false };
+    this.stage.controls.enabled = pair === undefined;
+    if (pair !== undefined) this.stage.canvas.setPointerCapture(event.pointerId);
+  }
+
+  /** End a drag without a change. */
+  drop() {
+    this.press = null;
+    this.stage.controls.enabled = true;
+    this.markers.moveTo(undefined, null);
+  }
+
+  move(event) {
+    const { left, top } = this.stage.canvas.getBoundingClientRect();
+    this.point({ x: event.clientX - left, y: event.clientY - top });
+    const { press } = this;
+    if (press?.pair === undefined) {
+      this.hover(event);
+      return;
+    }
+    const place = { x: event.clientX, y: event.clientY };
+    press.moved ||= Math.hypot(place.x - press.x, place.y - press.y) > CLICK_REACH;
+    if (!press.moved || !this.mesh) return;
+    this.aim(place);
+    const [hit] = this.raycaster.intersectObject(this.mesh);
+    if (!hit) return;
+    this.markers.moveTo(press.pair, hit.point.toArray());
+    this.stage.invalidate();
+  }
+
+  /** Tell the loupe where the pointer is in the view. */
+  point(place) {
+    this.loupe.pointer = place;
+    if (this.loupe.on) this.stage.invalidate();
+  }
+
   release(event) {
     const { press } = this;
     this.press = null;
+    this.stage.controls.enabled = true;
+    if (press?.pair !== undefined && press.moved) {
+      this.handlers.onRepick(press.pair, this.target({ x: event.clientX, y: event.clientY }, press.pair));
+      return;
+    }
     if (!press || Math.hypot(event.clientX - press.x, event.clientY - press.y) > CLICK_REACH) return;
     this.pick({ x: event.clientX, y: event.clientY });
   }
@@ -135,19 +195,34 @@ export class ModelView {
 
   /** Pick at a place on the page. */
   pick(place) {
+    if (this.result) return;
     const marker = this.markerAt(place);
     if (marker?.pair !== undefined) {
       this.handlers.onSelect(marker.pair);
     } else if (marker?.suggested) {
       this.handlers.onSuggested();
+    } else if (marker?.mirrored !== undefined) {
+      this.handlers.onMirrored(marker.mirrored);
     } else {
-      const { origin, direction } = this.aim(place);
-      this.handlers.onPick({
-        origin: origin.toArray(),
-        direction: direction.toArray(),
-        near: marker?.keypoint ?? null,
-      });
+      this.handlers.onPick(this.target(place));
     }
+  }
+
+  /** The ray through a place on the page, and the unused keypoint near it. */
+  target(place, dragged) {
+    const marker = this.markerAt(place, dragged);
+    const { origin, direction } = this.aim(place);
+    return {
+      origin: origin.toArray(),
+      direction: direction.toArray(),
+      near: marker?.pair === undefined ? (marker?.keypoint ?? null) : null,
+    };
+  }
+
+  /** The tangent of the angle that some pixels at the middle of the view make. */
+  tangent(pixels) {
+    const { camera, canvas } = this.stage;
+    return (pixels * 2 * Math.tan((camera.fov * Math.PI) / 360)) / Math.max(canvas.clientHeight, 1);
   }
 
   /** The ray through a place on the page. */
@@ -159,9 +234,10 @@ export class ModelView {
     return this.raycaster.ray;
   }
 
-  /** The marker at a place on the page that nothing hides, if any. */
-  markerAt(place) {
+  /** The marker at a place on the page that nothing hides, but for that of a dragged pair, if any. */
+  markerAt(place, dragged) {
     const near = this.markers.shown
+      .filter((marker) => dragged === undefined || marker.pair !== dragged)
       .map((marker) => ({ marker, at: this.toPage(marker.xyz) }))
       .map(({ marker, at }) => ({ marker, gap: Math.hypot(at.x - place.x, at.y - place.y) }))
       .filter(({ gap }) => gap < MARKER_REACH)
@@ -182,21 +258,9 @@ export class ModelView {
   }
 
   hover(event) {
-    if (event.buttons) return;
+    if (event.buttons || this.result) return;
     const marker = this.markerAt({ x: event.clientX, y: event.clientY });
     this.stage.canvas.title = marker?.name ?? "";
     this.stage.canvas.style.cursor = marker ? "pointer" : "crosshair";
   }
-}
-
-/** Linear colours of all corners from the triangles' sRGB bytes. */
-function cornerColors(bytes) {
-  const colors = new Float32Array(3 * bytes.length);
-  const linear = Float32Array.from({ length: 256 }, (_, level) =>
-    new Color().setRGB(level / 255, 0, 0, SRGBColorSpace).r,
-  );
-  for (let face = 0; face < bytes.length / 3; face += 1) {
-    for (let k = 0; k < 9; k += 1) colors[9 * face + k] = linear[bytes[3 * face + (k % 3)]];
-  }
-  return colors;
 }

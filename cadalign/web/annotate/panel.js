@@ -1,23 +1,31 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
 import { button, h } from "../common/dom.js";
+import { addressOf } from "./api.js";
+import { EvidencePanel } from "./evidence_panel.js";
+
+const FORMS = [
+  ["pix3d", "Pix3D"], ["bop", "BOP"], ["scan2cad", "Scan2CAD"], ["kitti", "KITTI"], ["objectron", "Objectron"],
+];
 
 export class Panel {
-  /** @param {object} handlers - act(action), select(pair), suggested() */
+  /** @param {object} handlers - act(action), select(pair), suggested(), mirror(pair), tell(text) */
   constructor(handlers) {
     this.handlers = handlers;
     this.alignment = h("div", { class: "alignment" });
     this.focal = this.makeFocal();
+    this.priors = this.makePriors();
+    this.evidence = new EvidencePanel(handlers);
     this.advice = h("div", { class: "advice" });
     this.ranking = h("div", { class: "ranking" });
     this.keypoints = h("ul", { class: "keypoints" });
     this.keypointsTitle = h("summary");
-    this.details = h("details", {}, this.keypointsTitle, this.keypoints);
+    this.details = h("details", { class: "keypoints-list" }, this.keypointsTitle, this.keypoints);
     this.rows = h("tbody");
     this.root = h(
       "section",
       { class: "panel", "aria-label": "Results" },
-      card("Alignment", this.alignment, this.focal),
-      card("Next keypoint", this.advice, this.ranking, this.details),
+      card("Alignment", this.focal, this.priors, this.evidence.root, this.alignment),
+      card("Next keypoint", this.details, this.advice, this.ranking),
       card("Pairs", this.makeTable()),
     );
     this.root.lastChild.classList.add("wide");
@@ -26,8 +34,10 @@ export class Panel {
   show(state, selected) {
     this.showAlignment(state.alignment);
     this.showFocal(state.focal, state.shape);
+    this.showPriors(state.priors);
+    this.evidence.show(state);
     this.showAdvice(state);
-    this.showKeypoints(state.keypoints);
+    this.showKeypoints(state.keypoints, state.image.model_number);
     this.showPairs(state, selected);
   }
 
@@ -45,8 +55,10 @@ export class Panel {
       ),
     );
     const notes = alignment.notes.map((note) => h("li", {}, note));
+    const { also_used: also } = alignment;
     this.alignment.replaceChildren(
       h("dl", { class: "facts" }, facts),
+      also ? h("p", { class: "also" }, `Also used: ${also}`) : "",
       notes.length ? h("ul", { class: "notes" }, notes) : "",
     );
   }
@@ -78,7 +90,7 @@ export class Panel {
   }
 
   showFocal({ known, pixels, typed, note }, shape) {
-    this.unknown.textContent = shape ? " unknown: assume it" : " unknown: estimate it";
+    this.unknown.textContent = shape ? " assume it" : " estimate it";
     this.known.checked = known;
     this.estimate.checked = !known;
     this.typedPixels = typed;
@@ -89,16 +101,67 @@ export class Panel {
     this.note.hidden = !note;
   }
 
-  showAdvice({ suggestion, alignment, shape }) {
+  makePriors() {
+    const choose = () => this.choosePriors();
+    this.hasStretch = h("input", { type: "checkbox", onchange: choose });
+    this.stretch = h("input", {
+      type: "number", min: "1", max: "200", step: "any", inputMode: "decimal",
+      "aria-label": "Standard deviation of the stretch about 1, in percent", onchange: choose,
+    });
+    this.hasFocal = h("input", { type: "checkbox", onchange: choose });
+    this.about = h("span");
+    this.ofStretch = h("label", {}, this.hasStretch, " stretch 1 ± ", this.stretch, " %");
+    this.ofFocal = h("label", {}, this.hasFocal, " focal length ", this.about);
+    return h(
+      "fieldset",
+      { class: "focal priors", title: "They hold the result near the model as it is, and near usual lenses, until the pairs say otherwise" },
+      h("legend", {}, "Assumed at first"),
+      this.ofStretch,
+      this.ofFocal,
+    );
+  }
+
+  choosePriors() {
+    const percent = Number(this.stretch.value) || this.likely;
+    const stretch = this.hasStretch.checked ? percent / 100 : null;
+    this.handlers.act({ do: "prior", stretch, focal: this.hasFocal.checked });
+  }
+
+  showPriors({ stretch, likely, focal, about, has_stretch: ofStretch, has_focal: ofFocal }) {
+    this.likely = likely;
+    this.hasStretch.checked = stretch !== null;
+    if (document.activeElement !== this.stretch) this.stretch.value = stretch ?? likely;
+    this.stretch.disabled = stretch === null;
+    this.hasFocal.checked = focal;
+    this.about.textContent = about;
+    this.ofStretch.hidden = !ofStretch;
+    this.ofFocal.hidden = !ofFocal;
+    this.priors.hidden = !ofStretch && !ofFocal;
+  }
+
+  /** What a detector proposes; nothing if it proposes nothing. */
+  proposed(proposals) {
+    if (!proposals.length) return "";
+    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} of a detector`;
+    return h(
+      "p",
+      {},
+      `${count}, dashed in the photo: click one to take it, then drag it if need be. `,
+      button("Take all", this.handlers.accept, { title: "A" }),
+    );
+  }
+
+  showAdvice({ suggestion, alignment, shape, proposals }) {
     if (!suggestion) {
       const text =
         alignment.status === "done"
           ? nothingLeft(shape)
           : `Mark the same place in the photo and on the model; either comes first. ${shape ? "Three" : "Four"} pairs give the first alignment.`;
-      this.advice.replaceChildren(h("p", { class: "soft" }, text));
+      this.advice.replaceChildren(this.proposed(proposals), h("p", { class: "soft" }, text));
       return;
     }
     this.advice.replaceChildren(
+      this.proposed(proposals),
       h("p", {}, suggestion.text),
       h(
         "p",
@@ -114,8 +177,15 @@ export class Panel {
     this.ranking.classList.toggle("stale", !current);
     if (!current) return;
     const { pieces, note, now } = ranked;
-    const rows = pieces.map(({ kind, what, left }) =>
-      h("li", { class: `piece-${kind}` }, h("span", {}, what), ": ", h("strong", {}, left)),
+    const rows = pieces.map(({ kind, what, left, how }) =>
+      h(
+        "li",
+        { class: `piece-${kind}` },
+        h("span", {}, what),
+        ": ",
+        h("strong", {}, left),
+        how ? h("details", { class: "how" }, h("summary", {}, "How to add it"), how) : null,
+      ),
     );
     this.ranking.replaceChildren(
       rows.length ? h("h3", {}, "What would help most") : "",
@@ -125,15 +195,20 @@ export class Panel {
     );
   }
 
-  showKeypoints(keypoints) {
+  /** The keypoints that can be marked; one that is marked keeps its place among them. */
+  showKeypoints(keypoints, revision) {
+    if (revision !== this.listedRevision) this.listed = new Set();
+    this.listedRevision = revision;
     const free = keypoints.filter((keypoint) => !keypoint.used);
-    this.details.hidden = free.length === 0;
+    for (const { keypoint } of free) this.listed.add(keypoint);
     this.keypointsTitle.textContent = `Keypoints of the model not yet marked (${free.length})`;
+    const focus = this.keypoints.contains(document.activeElement) ? document.activeElement.dataset.key : null;
     this.keypoints.replaceChildren(
-      ...free.map(({ keypoint, name }) =>
-        h("li", {}, button(name, () => this.handlers.act({ do: "place_keypoint", keypoint }))),
+      ...keypoints.filter(({ keypoint }) => this.listed.has(keypoint)).map(({ keypoint, name, used }) =>
+        h("li", {}, button(name, () => this.handlers.act({ do: "place_keypoint", keypoint }), { disabled: used, "data-key": keypoint })),
       ),
     );
+    if (focus) this.keypoints.querySelector(`[data-key="${focus}"]`)?.focus();
   }
 
   makeTable() {
@@ -142,10 +217,28 @@ export class Panel {
     );
     this.empty = h("p", { class: "soft" }, "No pairs yet.");
     this.table = h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows);
-    return h("div", { class: "scroll" }, this.empty, this.table);
+    this.glb = h("a", { download: true }, "Aligned model (GLB)");
+    const coco = h("a", { href: "export/coco.json", download: true }, "All keypoints (COCO)");
+    const exports = h("p", { class: "exports" }, "Export: ", coco, " ", this.glb, " ", this.makePhotoSet());
+    return h("div", { class: "scroll" }, exports, this.empty, this.table);
   }
 
-  showPairs({ pairs, shape }, selected) {
+  /** A choice among the forms of data sets, and the link to all photos in that form. */
+  makePhotoSet() {
+    const link = h("a", { download: true }, "Data set (ZIP)");
+    const form = h(
+      "select",
+      { "aria-label": "Form of the data set", onchange: () => (link.href = `export/${form.value}.zip`) },
+      FORMS.map(([value, name]) => h("option", { value }, name)),
+    );
+    link.href = `export/${form.value}.zip`;
+    this.photoSet = h("span", { class: "photo-set" }, link, " as", form);
+    return this.photoSet;
+  }
+
+  showPairs({ pairs, shape, image, alignment }, selected) {
+    this.glb.hidden = alignment.status !== "done";
+    this.glb.href = addressOf("export", { image: image.number, object: image.object }, ".glb");
     this.empty.hidden = pairs.length > 0;
     this.table.hidden = pairs.length === 0;
     const focus = this.rows.contains(document.activeElement) ? document.activeElement.dataset.key : null;
@@ -155,10 +248,10 @@ export class Panel {
 
   row(pair, shape, selected) {
     const { act, select } = this.handlers;
-    const number = button(String(pair.position), () => select(pair.pair), {
+    const number = button(String(pair.pair), () => select(pair.pair), {
       class: pair.off === null ? "badge" : "badge wrong",
       "aria-pressed": String(selected),
-      "aria-label": `Select pair ${pair.position}`,
+      "aria-label": `Select pair ${pair.pair}`,
       "data-key": `select ${pair.pair}`,
     });
     const row = h(
@@ -173,13 +266,19 @@ export class Panel {
         { class: "actions" },
         pair.keypoint !== null && pair.uv
           ? button("Repick", () => act({ do: "release", pair: pair.pair }, pair.pair), {
-              "aria-label": `Choose another model point for pair ${pair.position}`,
+              "aria-label": `Repick the model point of pair ${pair.pair}`,
               title: "Choose another model point",
               "data-key": `release ${pair.pair}`,
             })
           : null,
+        pair.mirrored
+          ? button("⇋", () => this.handlers.mirror(pair.pair), {
+              "aria-label": `Begin a pair at the mirror image of pair ${pair.pair}`,
+              title: "Mirror image (M)", "data-key": `mirror ${pair.pair}`,
+            })
+          : null,
         button("✕", () => act({ do: "delete", pair: pair.pair }), {
-          "aria-label": `Delete pair ${pair.position}`, title: "Delete", "data-key": `delete ${pair.pair}`,
+          "aria-label": `Delete pair ${pair.pair}`, title: "Delete", "data-key": `delete ${pair.pair}`,
         }),
       ),
     );
@@ -199,7 +298,7 @@ export class Panel {
       "select",
       {
         onchange: choose,
-        "aria-label": `Keypoint of ${category} that pair ${pair.position} is`,
+        "aria-label": `Keypoint of ${category} that pair ${pair.pair} is`,
         "data-key": `identify ${pair.pair}`,
       },
       option("choose one", ""),
@@ -216,7 +315,7 @@ export class Panel {
       value: pair.name,
       maxLength: 80,
       spellcheck: "false",
-      "aria-label": `Name of pair ${pair.position}`,
+      "aria-label": `Name of pair ${pair.pair}`,
       "data-key": `name ${pair.pair}`,
       onchange: (event) => this.handlers.act({ do: "rename", pair: pair.pair, name: event.target.value }),
     });
@@ -231,7 +330,7 @@ function nothingLeft(shape) {
 }
 
 function wrong(pair) {
-  const text = `Pair ${pair.position} contradicts the others: ${pair.off.toFixed(0)} px off`;
+  const text = `Pair ${pair.pair} contradicts the others: ${pair.off.toFixed(0)} px off`;
   return h("tr", { class: "wrong" }, h("td", { colSpan: 5 }, text));
 }
 

@@ -12,6 +12,7 @@ export class PhotoGestures {
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.move(event));
     canvas.addEventListener("pointerup", (event) => this.up(event));
+    canvas.addEventListener("pointerleave", () => this.point(null));
     canvas.addEventListener("pointercancel", (event) => this.cancel(event));
     canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -23,27 +24,45 @@ export class PhotoGestures {
     return { x: event.clientX - left, y: event.clientY - top };
   }
 
+  /** Tell the loupe where the pointer is. */
+  point(place) {
+    const { loupe } = this.view;
+    loupe.pointer = place;
+    if (loupe.on) this.view.invalidate();
+  }
+
+  /** The pixel of the photo at a place of the view, or the nearest one. */
+  pixel(place) {
+    return this.view.clamp(this.view.toPixel(place));
+  }
+
   down(event) {
     const place = this.place(event);
     this.view.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, place);
     if (this.pointers.size > 1) {
       this.view.dragged = null;
+      this.view.marking.cancel();
       this.press = null;
       return;
     }
-    const pair = event.button === 0 ? this.view.pairAt(place) : null;
+    const marks = event.button === 0 && this.view.marking.active;
+    if (marks) this.view.marking.press(this.pixel(place), event.shiftKey);
+    const pair = event.button === 0 && !marks ? this.view.pairAt(place) : null;
     // The point does not jump to the pointer: it keeps its distance.
     const own = pair && this.view.toView(pair.uv);
     const grip = own && { x: own.x - place.x, y: own.y - place.y };
-    this.press = { start: place, pair, grip, moved: false, button: event.button };
+    this.press = { start: place, marks, pair, grip, moved: false, button: event.button };
   }
 
   move(event) {
     const before = this.pointers.get(event.pointerId);
     const place = this.place(event);
+    this.point(place);
     if (!before) {
-      this.view.canvas.style.cursor = this.view.pairAt(place) ? "grab" : "crosshair";
+      const { marking } = this.view;
+      if (marking.active) marking.follow(this.pixel(place));
+      this.view.canvas.style.cursor = !marking.active && this.view.pairAt(place) ? "grab" : "crosshair";
       return;
     }
     if (this.pointers.size === 2) this.pinch(event.pointerId, before, place);
@@ -53,6 +72,10 @@ export class PhotoGestures {
     const gap = Math.hypot(place.x - press.start.x, place.y - press.start.y);
     press.moved ||= gap > CLICK_REACH;
     if (!press.moved) return;
+    if (press.marks) {
+      this.view.marking.drag(this.pixel(place));
+      return;
+    }
     if (press.pair) this.drag(place, false);
     else this.view.pan(place.x - before.x, place.y - before.y);
   }
@@ -63,7 +86,9 @@ export class PhotoGestures {
     const { press, view } = this;
     this.press = null;
     if (!press) return;
-    if (press.moved) {
+    if (press.marks) {
+      view.marking.release(this.pixel(place), press.moved);
+    } else if (press.moved) {
       if (press.pair) {
         this.press = press;
         this.drag(place, true);
@@ -72,8 +97,10 @@ export class PhotoGestures {
     } else if (press.pair) {
       view.handlers.onSelect(press.pair.pair);
     } else if (press.button === 0) {
+      const proposal = view.proposalAt(press.start);
       const uv = view.toPixel(press.start);
-      if (view.contains(uv)) view.handlers.onPlace(uv);
+      if (proposal) view.handlers.onAccept(proposal.keypoint);
+      else if (view.contains(uv)) view.handlers.onPlace(uv);
     }
   }
 

@@ -1,5 +1,8 @@
 // The photo: zoomed, panned, and drawn over with points and the alignment.
 import { drawBadge, kindOf } from "./marker.js";
+import { drawPhotoLoupe, Loupe } from "./loupe.js";
+import { Marking } from "./marking.js";
+import { drawObjects } from "./object_boxes.js";
 import { PhotoGestures } from "./photo_gestures.js";
 
 const MARGIN = 12;
@@ -25,6 +28,7 @@ export class PhotoView {
       "Photo. Enter places a point at the middle of the view; arrow keys nudge the selected point; plus and minus zoom.",
     );
     host.append(this.canvas);
+    this.loupe = new Loupe(host);
     this.context = this.canvas.getContext("2d");
     this.picture = null;
     this.size = { width: 1, height: 1 };
@@ -34,14 +38,25 @@ export class PhotoView {
     this.selected = null;
     this.dragged = null;
     this.onDrawn = null;
+    this.overlay = { mode: "edges", opacity: 1, hidden: false };
+    this.shaded = null;
+    this.marking = new Marking(this, (action) => this.handlers.onMark(action));
     this.gestures = new PhotoGestures(this);
     new ResizeObserver(() => this.resize()).observe(host);
     this.resize();
   }
 
+  /** Choose how the alignment is drawn: mode off, box, edges or shaded; opacity; hidden. */
+  setOverlay(changed) {
+    Object.assign(this.overlay, changed);
+    this.invalidate();
+  }
+
   /** Show another photo. */
   async open(number, { width, height }) {
+    this.number = number;
     this.size = { width, height };
+    this.marking.cancel();
     this.picture = null;
     this.state = null;
     this.fit();
@@ -172,17 +187,33 @@ export class PhotoView {
       context.drawImage(this.picture, corner.x, corner.y, width * this.scale, height * this.scale);
     }
     if (this.state) {
-      this.drawAlignment(this.state.alignment);
+      const { mode, opacity, hidden } = this.overlay;
+      if (!hidden) this.marking.draw(this.context, this.state.evidence);
+      if (mode !== "off" && !hidden) {
+        this.context.globalAlpha = opacity;
+        drawObjects(this, this.state.objects);
+        this.drawAlignment(this.state.alignment, mode);
+        this.context.globalAlpha = 1;
+      }
+      for (const proposal of this.state.proposals) this.drawProposal(proposal);
       this.drawSuggestion(this.state.suggestion);
       this.drawPairs(this.state.pairs);
     }
+    const loupe = this.loupe.place();
+    if (loupe && this.picture) drawPhotoLoupe(this, loupe);
     this.onDrawn?.();
   }
 
-  drawAlignment(alignment) {
+  drawAlignment(alignment, mode) {
     if (alignment.status !== "done") return;
+    const isShaded = mode === "shaded" && alignment.camera_from_page !== null && this.shaded;
+    if (isShaded) {
+      const { clientWidth: width, clientHeight: height } = this.canvas;
+      const seen = this.shaded.draw(alignment, { scale: this.scale, offset: this.offset, width, height });
+      this.context.drawImage(seen, 0, 0, width, height);
+    }
     for (const region of alignment.faint_regions) this.strokeRegion(region, "rgb(255 150 225 / 30%)", 0.8);
-    this.strokeLines(alignment.lines, "#35d0ff", 1.2);
+    if (mode === "edges" || (mode === "shaded" && !isShaded)) this.strokeLines(alignment.lines, "#35d0ff", 1.2);
     this.strokeLines(alignment.box, "#ff5a63", 2);
     for (const region of alignment.regions) this.strokeRegion(region, "rgb(0 0 0 / 35%)", 2.6);
     for (const region of alignment.regions) this.strokeRegion(region, UNCERTAIN, 1.2);
@@ -245,6 +276,7 @@ export class PhotoView {
 
   drawPairs(pairs) {
     for (const pair of pairs) {
+      if (pair.expected) this.drawExpected(pair);
       if (!pair.uv) continue;
       const uv = this.dragged?.pair === pair.pair ? this.dragged.uv : pair.uv;
       const place = this.toView(uv);
@@ -253,8 +285,34 @@ export class PhotoView {
       }
       this.drawCross(place, kindOf(pair, this.selected));
       const kind = kindOf(pair, this.selected);
-      drawBadge(this.context, kind, String(pair.position), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
+      drawBadge(this.context, kind, String(pair.pair), place.x + BADGE_OFFSET, place.y - BADGE_OFFSET);
     }
+  }
+
+  /** A keypoint that a detector has found. */
+  drawProposal({ uv }) {
+    const { x, y } = this.toView(uv);
+    this.context.setLineDash([3, 3]);
+    drawBadge(this.context, "proposed", "?", x, y);
+    this.context.setLineDash([]);
+  }
+
+  /** The detector's keypoint at a place of the view, if any. */
+  proposalAt(place) {
+    const gap = ({ uv }) => {
+      const own = this.toView(uv);
+      return Math.hypot(own.x - place.x, own.y - place.y);
+    };
+    const near = (this.state?.proposals ?? []).filter((each) => gap(each) < REACH);
+    return near.sort((a, b) => gap(a) - gap(b))[0] ?? null;
+  }
+
+  /** Where the alignment puts a model point that is not placed in the photo yet. */
+  drawExpected({ pair, expected }) {
+    const { x, y } = this.toView(expected);
+    this.context.setLineDash([4, 3]);
+    drawBadge(this.context, "suggested", String(pair), x, y);
+    this.context.setLineDash([]);
   }
 
   /** A cross that leaves the pixel itself free. */

@@ -88,6 +88,7 @@ export class Stage {
       this.pending = 0;
       this.beforeDraw?.();
       this.renderer.render(this.scene, this.camera);
+      this.afterDraw?.();
     });
   }
 

@@ -70,13 +70,18 @@ export function headline(report) {
       ` is the best of its ${given.group ?? "category"}. `,
       given.note,
     ),
-    failures(report, given.failures ?? []),
+    reasons(report, given.failures ?? [], "failed"),
+    reasons(report, given.skipped ?? [], "skipped"),
   );
 }
 
 function table(report, { columns, rows, paper = [], group = "category" }) {
   const several = report.runs.length > 1;
-  const names = [...new Set(rows.map((row) => row.category ?? ""))];
+  // What holds for all comes first.
+  const first = (name) => (name === "all" ? 0 : 1);
+  const names = [...new Set(rows.map((row) => row.category ?? ""))].sort(
+    (a, b) => first(a) - first(b),
+  );
   const bodies = names.map((name) =>
     h(
       "tbody",
@@ -169,7 +174,8 @@ function paperRow(columns, row, several) {
 const shown = ({ digits }, value) =>
   number(value, Number.isInteger(value) && !digits ? undefined : digits);
 
-function failures(report, list) {
+/** The reasons of what failed or was skipped, with their numbers. */
+function reasons(report, list, what) {
   if (!list.length) return null;
   const total = list.reduce((sum, failure) => sum + failure.count, 0);
   const several = report.runs.length > 1;
@@ -196,14 +202,14 @@ function failures(report, list) {
   return h(
     "details",
     { class: "failures" },
-    h("summary", {}, `${plural(total, "fit")} failed, by reason`),
+    h("summary", {}, `${plural(total, "fit")} ${what}, by reason`),
     h(
       "div",
-      { class: "scroller", tabindex: 0, role: "region", "aria-label": "failures by reason" },
+      { class: "scroller", tabindex: 0, role: "region", "aria-label": `${what}, by reason` },
       h(
         "table",
         {},
-        h("caption", { class: "visually-hidden" }, "Failures by reason"),
+        h("caption", { class: "visually-hidden" }, `Fits ${what}, by reason`),
         h(
           "thead",
           {},

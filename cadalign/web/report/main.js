@@ -27,7 +27,12 @@ const comparison =
   report.runs.length > 1 && report.rows.count ? new Comparison(report, state, { open }) : null;
 const plots = plotSection(report, state);
 
-const sections = [headline(report), plots, comparison?.element, gallery?.element].filter(Boolean);
+// A demonstration is looked at first, an evaluation read.
+const showsPictures = report.runs.every(({ what }) => what === "demo");
+const results = [headline(report), plots, comparison?.element];
+const sections = (
+  showsPictures ? [gallery?.element, ...results] : [...results, gallery?.element]
+).filter(Boolean);
 const links = sections
   .filter(({ id }) => id)
   .map((section) => {

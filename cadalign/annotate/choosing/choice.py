@@ -1,0 +1,134 @@
+"""`ModelChoice`: the library that a session's model is chosen from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from cadalign.annotate.names import named_model, observation_file
+from cadalign.annotate.options import FileOptions
+from cadalign.annotate.photos import find_photos
+from cadalign.datasets.models.categories import require_category
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.errors import InputError
+from cadalign.retrieval import Library, LibraryModel
+from cadalign.retrieval.models import ModelKey
+
+
+@dataclass(frozen=True, eq=False)
+class ModelChoice:
+    """A library of models, of which the session's is one, or one category of it.
+
+    Parameters
+    ----------
+    library : Library
+    category : str, optional
+        Name of the only category to choose from.
+    """
+
+    library: Library
+    category: str | None = None
+
+    @classmethod
+    def open(cls, options: FileOptions) -> ModelChoice | None:
+        """Open the library that the options name; None without one. Raises a CadalignError."""
+        if options.library is None:
+            if options.category is not None:
+                raise InputError(
+                    "names a category of a library, but none is given",
+                    where="--category",
+                    fix="give --library",
+                )
+            return None
+        library = Library.open(options.library)
+        if options.category is None:
+            return cls(library)
+        category = require_category(options.category, library.categories, where="--category")
+        return cls(library, category)
+
+    @cached_property
+    def keys(self) -> tuple[ModelKey, ...]:
+        """Category and model id of all models to choose from, sorted."""
+        return tuple(
+            key for key in self.library.keys if self.category is None or key[0] == self.category
+        )
+
+    @cached_property
+    def semantic_ids(self) -> frozenset[int]:
+        """Semantic ids of the models' keypoints."""
+        return frozenset(
+            number for model in self._models() for number in model.semantic_ids.tolist()
+        )
+
+    def model(self, key: ModelKey) -> LibraryModel:
+        """Find a model that can be chosen; raises InputError if there is none with a mesh."""
+        if key not in self.keys:
+            raise InputError(f"there is no model {key[1]!r} of {key[0]!r}", where="library")
+        model = self.library[key]
+        if model.mesh_path is None:
+            raise InputError(
+                f"the model {key[1]!r} has no mesh", where="library", fix="choose another model"
+            )
+        return model
+
+    def key_of(self, mesh: Path) -> ModelKey | None:
+        """The key of the model of a mesh file; None if the library has none."""
+        return self._keys_by_mesh.get(mesh.resolve())
+
+    def ids_on(self, mesh: Path) -> frozenset[int]:
+        """Semantic ids that are the library's on a mesh: all of them on one of another source."""
+        key = self.key_of(mesh)
+        if key is None:
+            return self.semantic_ids
+        return frozenset(self.library[key].semantic_ids.tolist())
+
+    def keypoints_of(self, mesh: Path) -> tuple[ModelKeypoint, ...]:
+        """The keypoints that the library has for a mesh file; none for another file."""
+        key = self.key_of(mesh)
+        if key is None:
+            return ()
+        model = self.library[key]
+        return tuple(
+            ModelKeypoint(f"keypoint {number}", (x, y, z), number)
+            for number, (x, y, z) in zip(
+                model.semantic_ids.tolist(), model.xyz.tolist(), strict=True
+            )
+        )
+
+    def first_model(self, observations: Iterable[Path]) -> Path:
+        """The mesh to begin with: that of an earlier session, else that of the most keypoints."""
+        for path in observations:
+            mesh = named_model(path)
+            if mesh is not None and self.key_of(mesh) is not None:
+                return mesh
+        having = [model for model in self._models() if model.mesh_path is not None]
+        if not having:
+            raise InputError("none of its models has a mesh", where="--library")
+        best = max(having, key=lambda model: len(model.semantic_ids))  # the first of several
+        assert best.mesh_path is not None
+        return best.mesh_path
+
+    def _models(self) -> Iterator[LibraryModel]:
+        return (self.library[key] for key in self.keys)
+
+    @cached_property
+    def _keys_by_mesh(self) -> dict[Path, ModelKey]:
+        return {
+            model.mesh_path.resolve(): model.key
+            for model in self._models()
+            if model.mesh_path is not None
+        }
+
+
+def starting_model(options: FileOptions, image: Path) -> Path:
+    """The model of a session for which only a library is given; raises a CadalignError."""
+    choice = ModelChoice.open(options)
+    if choice is None:
+        raise InputError("no model is given", where="--model", fix="give one, or a --library")
+    photos = find_photos(image)
+    if options.observation is not None:
+        return choice.first_model([options.observation])
+    out = options.out or photos[0].parent
+    return choice.first_model(observation_file(photo, out) for photo in photos)

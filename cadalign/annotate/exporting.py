@@ -1,0 +1,194 @@
+"""Annotations in other tools' formats: COCO, data sets of photos, a photo's object as GLB."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Hashable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.annotate.objects.listing import shown_objects
+from cadalign.annotate.objects.models import AnnotatedModel
+from cadalign.annotate.session import PhotoState, Session
+from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.errors import InputError
+from cadalign.export import AlignedObject, export_object
+from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
+from cadalign.fitting.exporting import object_of_align, object_of_fit
+from cadalign.fitting.joint.observed import own_ids, shape_ids
+from cadalign.fitting.joint.view import View
+from cadalign.io.files import write_text
+from cadalign.io.observation import Observation
+
+_MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
+
+
+def coco_of(session: Session) -> dict[str, Any]:
+    """All marked keypoints as COCO annotations, a category for each model.
+
+    What was not marked has the flag and the coordinates 0. Photos that are skipped are left out.
+    """
+    with session.lock:
+        photos = [shown_objects(states) for states in session.objects]
+        kept = [objects for objects in photos if session.work_state(objects[0]) != "skipped"]
+        used = [model for model in session.models.opened if _marked(session, model)]
+        models = used or [session.models[0]]
+        annotated = [
+            (row, state)
+            for row, objects in enumerate(kept)
+            for state in objects
+            if state.document.complete_pairs
+        ]
+        return {
+            "images": [
+                {
+                    "id": row,
+                    "file_name": objects[0].photo.path.name,
+                    "width": objects[0].photo.width,
+                    "height": objects[0].photo.height,
+                }
+                for row, objects in enumerate(kept)
+            ],
+            "categories": [
+                {
+                    "id": number,
+                    "name": model.path.stem,
+                    "keypoints": [model.registry[each].name for each in _marked(session, model)],
+                    "skeleton": [],
+                }
+                for number, model in enumerate(models, start=1)
+            ],
+            "annotations": [
+                {
+                    "id": number,
+                    "image_id": row,
+                    "category_id": 1 + models.index(state.model),
+                    **_annotation(state, _marked(session, state.model)),
+                }
+                for number, (row, state) in enumerate(annotated, start=1)
+            ],
+        }
+
+
+def _marked(session: Session, model: AnnotatedModel) -> list[int]:
+    """The keypoints of a model that are marked in any photo."""
+    return sorted(
+        {
+            pair.keypoint
+            for state in session.states
+            if state.model is model
+            for pair in state.document.complete_pairs
+            if pair.keypoint is not None
+        }
+    )
+
+
+def _annotation(state: PhotoState, numbers: list[int]) -> dict[str, Any]:
+    places = {pair.keypoint: pair.uv for pair in state.document.complete_pairs}
+    keypoints: list[float] = []
+    for number in numbers:
+        uv = places.get(number)
+        keypoints += (0.0, 0.0, 0) if uv is None else (*uv, _MARKED)
+    marked = np.array([uv for uv in places.values() if uv is not None])
+    low, size = marked.min(axis=0), np.ptp(marked, axis=0)
+    return {
+        "keypoints": keypoints,
+        "num_keypoints": len(places),
+        "bbox": [*low.tolist(), *size.tolist()],
+        "area": float(size.prod()),
+        "iscrowd": 0,
+    }
+
+
+def _ids(session: Session, observation: Observation) -> list[tuple[Hashable, ...]]:
+    learned = None if session.shape is None else session.shape.learned
+    if learned is None:
+        return [tuple(ids) for ids in own_ids(observation.views)]
+    return [tuple(shape_ids(view, learned)) for view in observation.views]
+
+
+def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:
+    """The aligned, textured model before its photo; raises InputError without an alignment."""
+    with session.lock:
+        exported = _aligned_object(session, session.photo_state(number, slot))
+    if exported is None:
+        raise InputError("there is no alignment yet", where="export", fix="place more pairs")
+    with tempfile.TemporaryDirectory() as folder:
+        return export_object(Path(folder) / "object.glb", exported).read_bytes()
+
+
+def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
+    """The photos with an alignment, but those that are skipped, as data sets have them."""
+    with session.lock:
+        choice = session.choice
+        found = []
+        for state in (each for each in session.states if each.is_shown):
+            exported = _aligned_object(session, state)
+            if exported is None or session.work_state(state) == "skipped":
+                continue
+            key = None if choice is None else choice.key_of(state.files.model)
+            image = session.further(state).image
+            photo = AnnotatedPhoto(
+                _named(session, state, exported),
+                state.photo.path,
+                "object" if key is None else key[0],
+                image.mask,
+                None if image.up is None else np.asarray(image.up, dtype=float),
+            )
+            found.append(photo)
+        return found
+
+
+def zipped_photo_set(session: Session, form: str) -> bytes:
+    """The photos as a data set of a form of `FORMS`, as a ZIP file.
+
+    It has a file ``LEFT_OUT.txt`` where the form cannot hold some of them.
+    """
+    photos = annotated_photos(session)
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "photos"
+        problems = write_photo_set(root, photos, form)
+        if problems:
+            write_text(root / "LEFT_OUT.txt", "".join(f"{problem}\n" for problem in problems))
+        archive = shutil.make_archive(str(Path(folder) / "set"), "zip", root)
+        return Path(archive).read_bytes()
+
+
+def _aligned_object(session: Session, state: PhotoState) -> AlignedObject | None:
+    """The model as it is aligned in a photo; None without an alignment."""
+    live, _ = session.live(state)
+    observation = session.observed(state)
+    if live.shown is None or observation is None:
+        return None
+    name = state.files.model.stem
+    if not isinstance(live, LiveShape):
+        mesh = state.model.cad.scene.mesh
+        return object_of_fit(live.shown, mesh=mesh, image=state.photo.path, name=name)
+    warped = live.warped.wireframe.scene.mesh if live.warped and session.shape else None
+    views = [
+        View(view.camera, view.points_2d, ids=ids)
+        for view, ids in zip(observation.views, _ids(session, observation), strict=True)
+    ]
+    images = [view.image for view in observation.views]
+    mesh = warped or state.model.cad.scene.mesh
+    return object_of_align(live.shown, views, mesh=mesh, images=images, name=name)
+
+
+def _named(session: Session, state: PhotoState, exported: AlignedObject) -> AlignedObject:
+    """The object in its photo alone, with its keypoints by name."""
+    live, _ = session.live(state)
+    names: dict[Hashable, Hashable] = {number: point.name for number, point in state.model.registry}
+    place = 0
+    if isinstance(live, LiveShape):
+        place = live.place
+    else:
+        pairs = state.document.complete_pairs
+        names = {row: names[pair.keypoint] for row, pair in enumerate(pairs)}
+    view = exported.views[place]
+    view = replace(view, ids=tuple(names.get(each, each) for each in view.ids))
+    ids = tuple(names.get(each, each) for each in exported.ids)
+    return replace(exported, views=(view,), ids=ids)

@@ -1,0 +1,140 @@
+"""Actions of the page on the objects of a photo, and on the photos of an object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from cadalign.annotate.action import Action, Outcome
+from cadalign.annotate.document import Document
+from cadalign.annotate.objects.adding import add_object, add_view
+from cadalign.annotate.objects.listing import label_of, shown_objects
+from cadalign.errors import InputError, quote
+from cadalign.io.documents import Index
+
+if TYPE_CHECKING:
+    from cadalign.annotate.objects.state import PhotoState
+    from cadalign.annotate.session import Session
+
+_LONGEST_NAME = 60
+
+
+class AddObject(Action):
+    """Add an object to the photo, with the model of a number; by default that of this object."""
+
+    name: str = ""
+    model: Index | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        photo, _ = session.place_of(state)
+        name = _free_name(self.name, session.objects[photo], None)
+        model = state.model if self.model is None else session.models[self.model]
+        return Outcome(shown=add_object(session, photo, model, name))
+
+
+class RenameObject(Action):
+    """Rename the object; an empty name gives it its number again."""
+
+    name: str
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        photo, _ = session.place_of(state)
+        name = _free_name(self.name, session.objects[photo], state)
+        state.history.record(replace(state.document, name=name))
+        return Outcome()
+
+
+class DeleteObject(Action):
+    """Delete the object with its files; it can be brought back while the program runs."""
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        label, owner = label_of(state), state.owner
+        kept = owner.document
+        empty = Document(focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True)
+        owner.history.record(empty)
+        for view in (owner, *owner.views):
+            view.drawn = None
+        for each in (owner, *owner.views):
+            session.deletions.add(session.place_of(each)[0], owner)
+        return Outcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
+
+
+class RestoreObject(Action):
+    """Bring back the object of the photo that was deleted last."""
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        deleted = session.deletions.last(session.place_of(state)[0])
+        if deleted is None:
+            raise InputError("no deleted object is left", where="restore", fix="add one")
+        return bring_back(deleted)
+
+
+class AddView(Action):
+    """Add another photo as a further view of the object."""
+
+    photo: Index
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        target = session.photo_state(self.photo)
+        if any(view.key == target.key for view in state.all_views):
+            raise InputError(
+                f"{target.photo.path.name} is a photo of this object already",
+                where="photo",
+                fix="choose another one",
+            )
+        if state.owner.is_rigid:
+            raise InputError(
+                "the cameras of this object's photos are known, the new one's is not",
+                where="photo",
+                fix="write its camera pose into the observation",
+            )
+        return Outcome(shown=add_view(session, state.owner, self.photo))
+
+
+class RemoveView(Action):
+    """Take the photo from the object, with its pairs; undo brings it back."""
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        if state.lead is None:
+            raise InputError(
+                "the object's first photo cannot be taken from it",
+                where="photo",
+                fix="delete the object, or take its other photos from it",
+            )
+        state.remove_view()
+        return Outcome(shown=state.owner, message=f"{state.photo.path.name} is no longer used.")
+
+
+OBJECT_ACTIONS: dict[str, type[Action]] = {
+    "add_object": AddObject,
+    "rename_object": RenameObject,
+    "delete_object": DeleteObject,
+    "restore_object": RestoreObject,
+    "add_view": AddView,
+    "remove_view": RemoveView,
+}
+"""Actions by the name that the page sends as ``do``."""
+
+
+def bring_back(deleted: PhotoState) -> Outcome:
+    """Undo the deletion of an object."""
+    deleted.history.undo()
+    return Outcome(shown=deleted, message=f"Brought back: {label_of(deleted)}.")
+
+
+def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> str:
+    """The name without superfluous blanks; refuses one that is too long or another object's."""
+    name = " ".join(name.split())
+    if len(name) > _LONGEST_NAME:
+        raise InputError(
+            f"{quote(name[:_LONGEST_NAME])}... is too long",
+            where="name",
+            fix=f"give at most {_LONGEST_NAME} characters",
+        )
+    if any(label_of(each) == name for each in shown_objects(states) if each is not own):
+        raise InputError(
+            f"another object of this photo is called {quote(name)}",
+            where="name",
+            fix="choose another name",
+        )
+    return name

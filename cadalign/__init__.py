@@ -1,21 +1,17 @@
 """Align CAD models to photos from keypoints: pose and stretch from one calibrated image."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from cadalign.errors import CadalignError
-from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.result import FitResult
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Material, Mesh
+from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign import datasets, errors, metrics, render, retrieval, solvers
+    from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
+    from cadalign.errors import CadalignError
     from cadalign.evaluation.api import evaluate, simulate
     from cadalign.fitting.batch import BatchResult
     from cadalign.fitting.fit import fit, fit_batch
+    from cadalign.fitting.focal.prior import FocalPrior
+    from cadalign.fitting.frames import to_dataframe
     from cadalign.fitting.joint.align import align, align_batch
     from cadalign.fitting.joint.model import Model
     from cadalign.fitting.joint.reconstruction import views_from
@@ -24,6 +20,13 @@ if TYPE_CHECKING:
     from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
     from cadalign.fitting.joint.view import View
     from cadalign.fitting.options import RansacOptions
+    from cadalign.fitting.result import FitResult
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.box import Box
+    from cadalign.geometry.camera import Camera
+    from cadalign.geometry.mesh import Material, Mesh
+    from cadalign.geometry.symmetry import Symmetry
+    from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
     from cadalign.shapes.model import ShapeModel
@@ -46,9 +49,11 @@ __all__ = [
     "Material",
     "Mesh",
     "Model",
+    "Observation",
     "RansacOptions",
     "ShapeModel",
     "Size",
+    "Symmetry",
     "View",
     "align",
     "align_batch",
@@ -57,46 +62,18 @@ __all__ = [
     "evaluate",
     "fit",
     "fit_batch",
+    "geometry",
     "metrics",
     "render",
     "retrieval",
+    "shapes",
     "simulate",
     "solvers",
+    "to_dataframe",
     "views_from",
 ]
 
-# Imported when first asked for, so that `import cadalign` stays quick.
-_NAMES = {
-    "AlignResult": "cadalign.fitting.joint.result",
-    "Model": "cadalign.fitting.joint.model",
-    "Contribution": "cadalign.fitting.joint.summary",
-    "EvidenceSummary": "cadalign.fitting.joint.summary",
-    "views_from": "cadalign.fitting.joint.reconstruction",
-    "Size": "cadalign.fitting.joint.size",
-    "View": "cadalign.fitting.joint.view",
-    "align": "cadalign.fitting.joint.align",
-    "align_batch": "cadalign.fitting.joint.align",
-    "RansacOptions": "cadalign.fitting.options",
-    "BatchResult": "cadalign.fitting.batch",
-    "Library": "cadalign.retrieval.library",
-    "Match": "cadalign.retrieval.match",
-    "ShapeModel": "cadalign.shapes.model",
-    "evaluate": "cadalign.evaluation.api",
-    "fit": "cadalign.fitting.fit",
-    "fit_batch": "cadalign.fitting.fit",
-    "simulate": "cadalign.evaluation.api",
-}
-_MODULES = ("datasets", "metrics", "render", "retrieval", "solvers")
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return import_module(f"cadalign.{name}")
-    if name in _NAMES:
-        value = getattr(import_module(_NAMES[name]), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(__name__)
 
 
 def __dir__() -> list[str]:

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+from cadalign.compile.files import can_write, kernel_folder
+from cadalign.compile.shipped import FOLDER as SHIPPED
+from cadalign.compile.shipped import usable_target
 from cadalign.datasets import PhotoSummary, open_photos
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 from cadalign.render.remedy import remedy
@@ -70,15 +73,16 @@ def examine_data(folder: Path, *, progress: Callable[[int], object] | None = Non
 
 def compiled_cache() -> str:
     """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(chosen) if chosen else Path(__file__).parent
+    folder = kernel_folder()
     count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
-    existing = next((place for place in (folder, *folder.parents) if place.is_dir()), Path("/"))
+    shipped = sum(1 for _ in SHIPPED.glob("*.nbi")) if usable_target(SHIPPED) else 0
+    came = f"{shipped} functions came with the installation; " if shipped else ""
     if count:
-        return f"{count} functions kept in {folder}"
-    if os.access(existing, os.W_OK):
-        return f"none yet; they will be kept in {folder}"
-    return f"{folder} cannot be written to; set NUMBA_CACHE_DIR, or every process compiles anew"
+        return f"{came}{count} functions kept in {folder}"
+    if can_write(folder):
+        return f"{came}none yet; they will be kept in {folder}"
+    fix = "set NUMBA_CACHE_DIR, or every process compiles anew"
+    return f"{came}{folder} cannot be written to; {fix}"
 
 
 def _usable_cores() -> int:

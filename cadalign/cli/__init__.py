@@ -4,39 +4,76 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import reduce
+from importlib import import_module
+from inspect import cleandoc
+from operator import or_
+from types import ModuleType
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from cadalign.cli.annotate import Annotate
-from cadalign.cli.demo import Demo
-from cadalign.cli.doctor import Doctor
-from cadalign.cli.evaluate import Evaluate
-from cadalign.cli.fit import Fit
-from cadalign.cli.library import LibraryCommand
-from cadalign.cli.observe import Observe
-from cadalign.cli.render import Render
-from cadalign.cli.report import Report
-from cadalign.cli.retrieve import Retrieve
-from cadalign.cli.shape import ShapeCommand
-from cadalign.cli.simulate import Simulate
+from cadalign import __version__
+from cadalign.cli.options import UsageError
 from cadalign.errors import CadalignError
 
-Command = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Fit, tyro.conf.subcommand("fit")]
-    | Annotated[Observe, tyro.conf.subcommand("observe")]
-    | Annotated[Annotate, tyro.conf.subcommand("annotate")]
-    | Annotated[Retrieve, tyro.conf.subcommand("retrieve")]
-    | Annotated[LibraryCommand, tyro.conf.subcommand("library")]
-    | Annotated[ShapeCommand, tyro.conf.subcommand("shape")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-)
+
+class _Command(NamedTuple):
+    """Module and class of a command, and the first sentence of its description."""
+
+    module: str
+    name: str
+    summary: str
+
+    def load(self) -> Any:
+        """The command's class; its module is imported when the command is called."""
+        return getattr(import_module(f"cadalign.cli.{self.module}"), self.name)
+
+
+COMMANDS = {
+    "demo": _Command(
+        "demo", "Demo", "Align stretched models to pictures of the originals and show the result."
+    ),
+    "fit": _Command(
+        "fit", "Fit", "Align a model to what an observation file holds, and draw the result."
+    ),
+    "observe": _Command(
+        "observe", "Observe", "Pair the keypoints of a detector in a photo with a model's."
+    ),
+    "annotate": _Command(
+        "annotate",
+        "Annotate",
+        "Mark keypoints on photos and a model in the browser, and see the alignment as you go.",
+    ),
+    "retrieve": _Command(
+        "retrieve",
+        "Retrieve",
+        "Find the models of a library that explain an image's keypoints best.",
+    ),
+    "library": _Command("library", "LibraryCommand", "Build and inspect libraries of CAD models."),
+    "shape": _Command("shape", "ShapeCommand", "Learn and inspect the shapes of categories."),
+    "evaluate": _Command("evaluate", "Evaluate", "Evaluate methods on a dataset."),
+    "simulate": _Command(
+        "simulate",
+        "Simulate",
+        "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
+    ),
+    "report": _Command("report", "Report", "Show the result of one or more runs."),
+    "export": _Command("export", "Export", "Write a fit for another tool."),
+    "render": _Command(
+        "render",
+        "Render",
+        "Draw a model: a still, a contact sheet of several views, or a turntable.",
+    ),
+    "doctor": _Command(
+        "doctor",
+        "Doctor",
+        "Check the renderers and their speed, and show how to enable missing ones.",
+    ),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,16 +85,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 on success, 1 if the input was refused; a wrong command line exits with 2. Runs (evaluate,
         simulate) exit with 3 if they finished with some failed rows.
     """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        sys.stdout.write(f"cadalign {__version__}\n")
+        return 0
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
-        command = tyro.cli(
-            Command,
-            prog="cadalign",
-            description="Align CAD models to photos from keypoints.",
-            args=arguments,
-            config=(tyro.conf.OmitSubcommandPrefixes,),
-        )
-        return command.run()
+        return int(_parse(given).run())
+    except UsageError as error:
+        sys.stderr.write(f"cadalign: {error}\n")
+        raise SystemExit(2) from None
     except CadalignError as error:
         sys.stderr.write(f"cadalign: {error}\n")
         return 1
@@ -66,3 +103,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:  # the reader of the output has closed it
         return 0
+
+
+def _parse(arguments: list[str]) -> Any:
+    """The called command with its options; any other line is answered by help or an error."""
+    config = (tyro.conf.OmitSubcommandPrefixes,)
+    name, *rest = arguments or [""]
+    if name in COMMANDS:
+        with _defaults_taken_as_typed():
+            command, prog = COMMANDS[name].load(), f"cadalign {name}"
+            text = cleandoc(str(command.__doc__))
+            return tyro.cli(command, prog=prog, description=text, args=rest, config=config)
+    stubs = [
+        Annotated[_Listed, tyro.conf.subcommand(name, description=each.summary)]
+        for name, each in COMMANDS.items()
+    ]
+    listed: Any = reduce(or_, stubs)
+    return tyro.cli(
+        listed,
+        prog="cadalign",
+        description="Align CAD models to photos from keypoints. --version prints the version. "
+        "`cadalign <command> --help` describes a command.",
+        args=arguments,
+        config=config,
+    )
+
+
+@contextmanager
+def _defaults_taken_as_typed() -> Iterator[None]:
+    """Spare tyro the import of typeguard, by which it compares each option's default to its type.
+
+    That import takes a tenth of a fit's time, and mypy has compared them.
+    """
+    if "typeguard" in sys.modules:
+        yield
+        return
+    module = ModuleType("typeguard")
+    vars(module).update(check_type=lambda value, _: value, TypeCheckError=TypeError)
+    sys.modules["typeguard"] = module
+    try:
+        yield
+    finally:
+        del sys.modules["typeguard"]
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """A command in the list of all, none of which is called."""

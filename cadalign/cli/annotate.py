@@ -6,23 +6,26 @@ import signal
 import tempfile
 import threading
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
+from cadalign.cli.options import UsageError, flag_of
 from cadalign.cli.output import make_folder, new_console
 from cadalign.io.files import writing
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import Session
 
+_FILES = tyro.conf.arg(metavar="PHOTO MODEL")
 
-@dataclass(frozen=True)
-class Annotate(SessionOptions):
+
+@dataclass(frozen=True, kw_only=True)
+class Annotate(FileOptions):
     """Mark keypoints on photos and a model in the browser, and see the alignment as you go.
 
     Serves a page on this machine only. Every change is saved at once: an observation beside each
@@ -30,10 +33,55 @@ class Annotate(SessionOptions):
     (model.keypoints.json).
     """
 
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, _FILES] = ()
+    """A photo, or a folder of photos; and the model, an OBJ, PLY, GLB, glTF, STL or OFF file."""
+    image: Path | None = None
+    """The photo or folder, in place of PHOTO."""
+    model: Path | None = None
+    """The model, in place of MODEL."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
+    host: str = "127.0.0.1"
+    """Address to listen on: this machine alone, or 0.0.0.0 for all of a network that you trust.
+    Whoever has the printed address with its token can see and change everything, and it is not
+    encrypted."""
+    export: Path | None = None
+    """Write what is marked so far to this file or folder, and serve no page. A single alignment is
+    exported by `cadalign export`."""
+    form: Literal["coco", "pix3d", "bop", "scan2cad", "kitti", "objectron"] = "coco"
+    """Form of --export: a file of COCO keypoints, or a new folder of a data set of photos as
+    `cadalign evaluate photos` reads it."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
+
+    @property
+    def session(self) -> SessionOptions:
+        """Options of the session.
+
+        Raises
+        ------
+        UsageError
+            If photo or model are missing, or given twice.
+        """
+        files = list(self.files)
+        found: dict[str, Path] = {}
+        for name, given in (("image", self.image), ("model", self.model)):
+            path = given if given is not None else (files.pop(0) if files else None)
+            if path is None and name == "model" and self.library is not None:
+                from cadalign.annotate.choosing.choice import starting_model
+
+                path = starting_model(self, found["image"])
+            if path is None:
+                what = "no photo is given" if name == "image" else "no model is given"
+                raise UsageError(what, where=flag_of(name), fix="cadalign annotate PHOTO MODEL")
+            found[name] = path
+        if files:
+            what = f"{files[0]} is one file too many"
+            raise UsageError(what, where="PHOTO MODEL", fix="give a folder for several photos")
+        rest: dict[str, Any] = {
+            field.name: getattr(self, field.name) for field in fields(FileOptions)
+        }
+        return SessionOptions(**(found | rest))
 
     def run(self) -> int:
         """Serve until interrupted; returns the exit code."""
@@ -44,8 +92,11 @@ class Annotate(SessionOptions):
         from cadalign.annotate.opening import find_session_files, open_session
         from cadalign.annotate.server import listen, make_app, serve
 
+        options = self.session
         console = new_console()
-        listener = listen(self.port)
+        if self.export is not None:
+            return _export(options, self.export, self.form, console)
+        listener = listen(self.port, self.host)
         with ExitStack() as opened:
             opened.enter_context(listener)
             if self.out is not None:
@@ -53,18 +104,21 @@ class Annotate(SessionOptions):
             if self.observation is not None:
                 with writing(self.observation):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
-            access = Access(listener.getsockname()[1])
-            files = find_session_files(self)
+            access = Access(listener.getsockname()[1], self.host)
+            files = find_session_files(options)
             locks = opened.enter_context(
-                WriterLocks(files.written, whole_folder=self.image.is_dir(), address=access.address)
+                WriterLocks(
+                    files.written, whole_folder=options.image.is_dir(), address=access.address
+                )
             )
             with console.status("reading photos and model"):
-                session = open_session(self, files, before_saving=locks.confirm)
+                session = open_session(
+                    options, files, before_saving=locks.confirm, reserve=locks.reserve
+                )
             threading.Thread(target=session.warm_up, daemon=True).start()
             new_console(stderr=False).print(access.url, markup=False, soft_wrap=True)
             console.print(
-                "Open this address in a browser; end with Ctrl+C. It works on this machine only, "
-                "and for this session.",
+                f"Open this address in a browser; end with Ctrl+C. {_reach(self.host)}",
                 markup=False,
             )
             if not self.no_open:
@@ -74,6 +128,39 @@ class Annotate(SessionOptions):
             with suppress(KeyboardInterrupt):
                 serve(make_app(session, access), listener)
             return _save_and_say_where(session, console)
+
+
+def _reach(host: str) -> str:
+    if host == LOOPBACK:
+        return "It works on this machine only, and for this session."
+    return (
+        "Whoever has it and reaches this machine can see and change everything, unencrypted: "
+        "give it to your team only."
+    )
+
+
+def _export(options: SessionOptions, to: Path, form: str, console: Console) -> int:
+    from cadalign.annotate.exporting import annotated_photos, coco_of
+    from cadalign.annotate.opening import open_session
+    from cadalign.export.photo_sets import write_photo_set
+    from cadalign.io.files import write_json
+
+    session = open_session(options)
+    if form == "coco":
+        data = coco_of(session)
+        write_json(to, data)
+        count = len(data["annotations"])
+        console.print(f"{to}: keypoints of {count} photos as COCO annotations", markup=False)
+        return 0
+    with console.status("aligning (the first time after an installation takes a minute)"):
+        session.ready = True  # the first alignment compiles what is not
+        photos = annotated_photos(session)
+    problems = write_photo_set(to, photos, form)
+    for problem in problems:
+        console.print(f"Left out: {problem}", markup=False)
+    count = len(photos) - len(problems)
+    console.print(f"{to}: {count} photos as {form} has them", markup=False)
+    return 0
 
 
 def _save_and_say_where(session: Session, console: Console) -> int:

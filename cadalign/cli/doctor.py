@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,16 +25,21 @@ class Doctor(JsonOption):
     """Check the renderers and their speed, and show how to enable missing ones.
 
     Also shows the processor cores and the cache of compiled solvers. With --data, lists what lies
-    in a folder of photos instead: its format, and how many photos and objects can be read.
+    in a folder of photos instead: its format, and how many photos and objects can be read. With
+    --compile, compiles the solvers ahead.
     """
 
     data: Path | None = None
     """Folder of a data set of photos, in any known format (see cadalign.datasets.open)."""
+    compile: bool = False
+    """Compile all solvers now, as for a Docker image, in place of when they are first called."""
 
     def run(self) -> int:
         """Run the checks; returns the exit code, 0 if ray casting works or photos can be read."""
         if self.data is not None:
             return self._check_data(self.data)
+        if self.compile:
+            return self._compile()
         from cadalign.health import examine
 
         with new_console().status("trying the renderers, each in a process of its own ..."):
@@ -43,6 +49,20 @@ class Doctor(JsonOption):
         else:
             _print(health)
         return 0 if health.renderers[-1].works else 1
+
+    def _compile(self) -> int:
+        from cadalign.cli.compile_ahead import compile_ahead
+        from cadalign.health import compiled_cache
+
+        began = time.perf_counter()
+        with new_console().status("compiling ...") as status:
+            compile_ahead(progress=lambda text: status.update(f"compiled: {text} ..."))
+        found = {"seconds": round(time.perf_counter() - began, 1), "cache": compiled_cache()}
+        if self.json:
+            sys.stdout.write(json.dumps(found, indent=2) + "\n")
+        else:
+            sys.stdout.write(f"Compiled in {found['seconds']} s: {found['cache']}\n")
+        return 0
 
     def _check_data(self, folder: Path) -> int:
         from cadalign.health import examine_data

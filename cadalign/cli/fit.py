@@ -1,30 +1,75 @@
-"""`cadalign fit`: align the model of one observation file."""
+"""`cadalign fit`: align the models of observation files."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
-from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.evidence import CameraOptions, EvidenceOptions
+from cadalign.cli.options import ObservationCommand, OptionError, UsageError, named_as_flags
+from cadalign.cli.output import make_folder, say, waiting
 from cadalign.errors import InputError
 from cadalign.fitting.focal.prior import FocalPrior
 from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.status import Status
-
     from cadalign.fitting.joint.result import AlignResult
     from cadalign.fitting.result import FitResult
     from cadalign.io.observation import Observation
     from cadalign.render.drawing.color import ByteImage
+
+_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFile:
+    """Result of a fit of one file, its JSON form, a table, and pictures of each view.
+
+    ``overlays`` are those of the model that were asked for.
+    """
+
+    result: FitResult | AlignResult
+    data: dict[str, Any]
+    table: str
+    pictures: tuple[ByteImage, ...]
+    overlays: tuple[ByteImage, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """The result as JSON text."""
+        return json.dumps(self.data, indent=2) + "\n"
+
+    def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
+        """Write fit.json and the pictures to a folder; returns the pictures' paths.
+
+        The ``overlays`` go to ``overlay``, those of further views beside it.
+        """
+        from cadalign.io.files import write_text
+
+        make_folder(out)
+        write_text(out / "fit.json", self.text)
+        paths = _write_pictures(out / "overlay.png", self.pictures)
+        return paths if overlay is None else paths + _write_pictures(overlay, self.overlays)
+
+
+def _write_pictures(path: Path, pictures: tuple[ByteImage, ...]) -> list[Path]:
+    """Write the first picture to a path, further ones to NAME_1 and so on; returns their paths."""
+    from cadalign.io.images import write_image
+
+    paths = [
+        path.with_name(f"{path.stem}_{row}{path.suffix}") if row else path
+        for row in range(len(pictures))
+    ]
+    for each, picture in zip(paths, pictures, strict=True):
+        write_image(each, picture)
+    return paths
 
 
 @dataclass(frozen=True)
@@ -50,17 +95,21 @@ class _RansacOptions(RansacOptions):
 
 
 @dataclass(frozen=True)
-class Fit(ObservationCommand):
+class Fit(ObservationCommand, CameraOptions, EvidenceOptions):
     """Align a model to what an observation file holds, and draw the result.
 
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
     known lengths. Prints the alignment and, where there is more than keypoints of one image, the
     deviations without each piece of evidence. Writes fit.json and overlay.png, overlay_1.png and so
-    on for further views.
+    on for further views. Of several files, or a folder of them, a folder each, results.csv, and
+    index.html with all pictures.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
-    """JSON file with camera and keypoints, optionally image, model and further evidence."""
+    observations: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION ...")
+    ]
+    """JSON files with camera and keypoints, optionally image, model and further evidence; or a
+    folder of such files."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
@@ -81,51 +130,78 @@ class Fit(ObservationCommand):
     """Focal length: known (the file's) or estimate; by default known, if the file has one."""
     exif: bool = True
     """Use the photo's EXIF data as a prior on an estimated focal length."""
+    picture: bool = True
+    """Draw box and keypoints over each photo, as overlay.png; of several files, on one page."""
+    overlay: Path | None = None
+    """Draw the aligned model over the photo, too, and write it to this picture; further views to
+    FILE_1 and so on. The observation names the model. Of several observations, to a picture of this
+    name in the folder of each."""
+    overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
+    """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
+    overlay_opacity: float = 0.6
+    """Of the shaded or translucent model, 0 to 1."""
     stored: bool = True
     """Take the options that the file stores, except for those that flags set to another value than
     their defaults; with --no-stored flags alone count."""
-    fitting: tyro.conf.OmitArgPrefixes[_FitOptions] = _FitOptions()
-    ransac: tyro.conf.OmitArgPrefixes[_RansacOptions] = _RansacOptions()
+    # A group's own text: without it, tyro reads the documentation of all options for every fit.
+    fitting: Annotated[
+        _FitOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_FitOptions.__doc__)
+    ] = _FitOptions()
+    ransac: Annotated[
+        _RansacOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RansacOptions.__doc__)
+    ] = _RansacOptions()
 
     def run(self) -> int:
-        """Run the fit; returns the exit code."""
-        from cadalign.io.files import write_text
-        from cadalign.io.images import write_image
+        """Run the fit, or the fits; returns the exit code."""
+        if not self.observations:
+            fix = "give a JSON file with camera and keypoints, or a folder of such files"
+            raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
+        if len(self.observations) > 1 or self.observation.is_dir():
+            from cadalign.cli.fit_many import fit_many
 
-        console = new_console()
-        status = console.status("fitting (the first time after an installation takes a minute)")
+            return fit_many(self)
+        fitted = self.fit_file(waiting("fitting"))
+        out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
+        paths = fitted.write(out, overlay=self.overlay)
+        if self.json:
+            sys.stdout.write(fitted.text)
+            return 0
+        sys.stdout.write(f"{fitted.result}{fitted.table}\n")
+        if paths:
+            listed = ", ".join(str(path) for path in paths)
+            say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
+        return 0
+
+    @property
+    def observation(self) -> Path:
+        """The first file."""
+        return self.observations[0]
+
+    def fit_file(self, status: AbstractContextManager[Any]) -> FittedFile:
+        """Fit what the first file holds; ``status`` is entered while a joint fit is computed."""
         result: FitResult | AlignResult
         observation = self._load()
         command = self._with_stored_sigma(observation)
-        is_joint = command.shape_of(observation) is not None or command.shape_sigma is not None
-        if observation.is_plain and not is_joint:
-            result, picture = self._fit(observation, console, status)
-            data, table, pictures = result.to_dict(), "", [picture]
+        learned = command.shape_of(observation)
+        style = None
+        if self.overlay is not None:
+            from cadalign.cli.overlays import draw_overlays, overlay_style
+
+            style = overlay_style(self, observation, is_learned=learned is not None)
+        if observation.is_plain and learned is None and command.shape_sigma is None:
+            result = self._fit(observation)
+            found = FittedFile(result, result.to_dict(), "", self._pictures(observation, result))
+            mesh = None
         else:
             from cadalign.cli.contributions import list_contributions, tabulate_contributions
             from cadalign.cli.fit_joint import fit_joint
 
-            result, pictures = fit_joint(command, observation, status)
+            result, pictures, mesh = fit_joint(command, observation, status)
             data = result.to_dict() | list_contributions(result)
-            table = tabulate_contributions(result)
-        out = self.out or self.observation.with_name(f"{self.observation.stem}_fit")
-        make_folder(out)
-        text = json.dumps(data, indent=2) + "\n"
-        write_text(out / "fit.json", text)
-        paths = [
-            out / (f"overlay_{number}.png" if number else "overlay.png")
-            for number in range(len(pictures))
-        ]
-        for path, picture in zip(paths, pictures, strict=True):
-            write_image(path, picture)
-        if self.json:
-            sys.stdout.write(text)
-        else:
-            new_console(stderr=False).print(f"{result}{table}", markup=False)
-            listed = ", ".join(str(path) for path in paths)
-            label = "Picture" if len(paths) == 1 else "Pictures"
-            console.print(f"{label}: {listed}", markup=False)
-        return 0
+            found = FittedFile(result, data, tabulate_contributions(result), tuple(pictures))
+        if style is None:
+            return found
+        return replace(found, overlays=draw_overlays(observation, result, mesh, style))
 
     def shape_of(self, observation: Observation) -> Path | None:
         """File of the learned shape to fit: the flag's, or else the file's."""
@@ -146,36 +222,55 @@ class Fit(ObservationCommand):
         return cast("Sigma | None", observation.fit_options.get("sigma"))
 
     def _load(self) -> Observation:
+        """Read the first file; camera and evidence of the options take the place of its own."""
         from cadalign.io.observation import Observation
 
+        _refuse_photo(self.observation)
         observation = Observation.load(self.observation, needs_xyz=False)
-        if self.shape_of(observation) is not None:
-            return observation
-        return Observation.load(self.observation)
+        if self.shape_of(observation) is None:
+            observation = Observation.load(self.observation)
+        previous = observation.camera
+        camera = self.read_camera((previous.width, previous.height))
+        changed = self.add_to(
+            observation if camera is None else replace(observation, camera=camera)
+        )
+        if observation.others and changed is not observation:
+            raise InputError(
+                f"the file has {len(observation.views)} views, the options are for one",
+                where=str(self.observation),
+                fix="write camera, masks and other evidence into its `views`",
+            )
+        return changed
 
-    def _fit(
-        self, observation: Observation, console: Console, status: Status
-    ) -> tuple[FitResult, ByteImage]:
-        """Fit the stretched model; returns the result and its picture."""
-        from cadalign.fitting.fit import fit
+    def _pictures(self, observation: Observation, result: FitResult) -> tuple[ByteImage, ...]:
+        """The result over the photo, unless --no-picture is given."""
+        if not self.picture:
+            return ()
         from cadalign.render.drawing.fit_overlay import draw_observation
+
+        return (draw_observation(observation, result),)
+
+    def _fit(self, observation: Observation) -> FitResult:
+        """Fit the stretched model."""
+        from cadalign.fitting.fit import fit
 
         options = self.options_for(observation)
         prior = options.focal_prior
         if prior is not None:
             share = 100 * prior.relative_sigma
-            text = f"Focal length from the photo's EXIF data: {prior.focal:.4g} px +-{share:.2g} %"
-            console.print(text, markup=False)
-        with status, named_as_flags(self, options):
-            result = fit(
+            is_stored = self.stored and "focal_prior" in observation.fit_options
+            source = "the file's prior" if is_stored else "the photo's EXIF data"
+            say(f"Focal length from {source}: {prior.focal:.4g} px +-{share:.2g} %")
+        with named_as_flags(self, options):
+            return fit(
                 observation.points_3d,
                 observation.points_2d,
                 observation.camera,
                 **vars(options),
                 ransac=self.ransac if self.robust else None,
                 confidences=observation.confidences if self.robust else None,
+                symmetry=observation.symmetry,
             )
-        return result, draw_observation(observation, result)
 
     def options_for(self, observation: Observation) -> FitOptions:
         """Options of the fit: those of the flags, otherwise those of the file."""
@@ -183,6 +278,7 @@ class Fit(ObservationCommand):
 
         given = dict(observation.fit_options) if self.stored else {}
         given.pop("shape_sigma", None)  # which is not an option of the plain fit
+        has_prior, stored_prior = "focal_prior" in given, given.pop("focal_prior", None)
         with in_file(self.observation), within("fit"):
             stored = FitOptions(**given)
         set_by_flags = {
@@ -193,7 +289,9 @@ class Fit(ObservationCommand):
         known = "known" if observation.camera.focal_known else "estimate"
         focal = self.focal or given.get("focal", known)
         prior = None
-        if focal == "estimate" and self.exif and observation.image is not None:
+        if focal == "estimate" and has_prior:
+            prior = None if stored_prior is None else FocalPrior(**stored_prior)
+        elif focal == "estimate" and self.exif and observation.image is not None:
             prior = FocalPrior.from_exif(observation.image)
         options = {**set_by_flags, "sigma": self._sigma(observation, given), "focal": focal}
         with named_as_flags(self.fitting):
@@ -228,3 +326,14 @@ class Fit(ObservationCommand):
         if self.sigma is None and "sigma" in stored:
             return cast("Sigma | None", stored["sigma"])
         return self.sigma_of(observation)
+
+
+def _refuse_photo(path: Path) -> None:
+    """Refuse an image in the place of an observation, and say what makes one."""
+    if path.suffix.lower() in _PHOTOS:
+        raise InputError(
+            "a photo, not an observation, which is a JSON file with camera and keypoints",
+            where=str(path),
+            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
+            "use a detector's with `cadalign observe`",
+        )

@@ -14,6 +14,7 @@ from cadalign.fitting.joint.model import Model
 from cadalign.fitting.joint.observed import model_of, size_of, views_of
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.fitting.options import FitOptions
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.align_overlay import draw_aligned, mesh_of
@@ -30,8 +31,8 @@ _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a
 
 def fit_joint(
     command: Fit, observation: Observation, status: AbstractContextManager[Any]
-) -> tuple[AlignResult, list[ByteImage]]:
-    """Align to all evidence of an observation; returns the result and a picture of every view.
+) -> tuple[AlignResult, list[ByteImage], Mesh | None]:
+    """Align to all evidence; returns the result, a picture of every view and the object's mesh.
 
     ``status`` is entered while the alignment is computed.
     """
@@ -54,16 +55,18 @@ def fit_joint(
             model,
             views,
             size=size,
+            init=observation.init,
             loss=options.loss,
             loss_scale=options.loss_scale,
             ransac=command.ransac if command.robust else None,
         )
     mesh = mesh_of(observation, views, result)
+    drawn = zip(observation.views, views, strict=True) if command.picture else ()
     pictures = [
         draw_aligned(image, view, result, mesh=mesh, number=number)
-        for number, (image, view) in enumerate(zip(observation.views, views, strict=True))
+        for number, (image, view) in enumerate(drawn)
     ]
-    return result, pictures
+    return result, pictures, mesh
 
 
 @contextmanager
@@ -85,12 +88,18 @@ def _evidence(observation: Observation) -> str:
         return "views"
     if observation.depths is not None:
         return "depth"
-    return next(iter(observation.evidence.given), "size")
+    return next(iter(observation.evidence.given), "size" if observation.size else "init")
 
 
 def _model(command: Fit, observation: Observation, options: FitOptions) -> Model | ShapeModel:
     shape = command.shape_of(observation)
     if shape is not None:
+        if observation.symmetry is not None:
+            raise InputError(
+                "has no effect together with a learned shape",
+                where=f"{command.observation}: symmetry",
+                fix="leave out one of the two",
+            )
         return ShapeModel.open(shape)
     from cadalign.datasets import load_mesh
 

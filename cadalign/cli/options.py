@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, DataError, InputError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -24,22 +25,51 @@ class OptionError(CadalignError):
     """
 
 
+class UsageError(CadalignError):
+    """The command line lacks an argument, or has one too many; it exits with 2."""
+
+
 @contextmanager
 def named_as_flags(
-    *options: DataclassInstance, kind: type[CadalignError] = InputError
+    *options: DataclassInstance,
+    kind: type[CadalignError] = InputError,
+    others: Mapping[str, str] | None = None,
 ) -> Iterator[None]:
     """Let errors about fields of dataclasses of options name the command line's options.
 
-    Their kind is `OptionError` while the command line is parsed.
+    ``others`` are flags of further arguments by name. Their kind is `OptionError` while the
+    command line is parsed.
     """
+    flags = {field.name: flag_of(field.name) for each in options for field in fields(each)}
+    flags |= others or {}
     try:
         yield
+    except DataError as error:
+        raise DataError(error.what, where=error.where, fix=_with_flags(error.fix, flags)) from None
     except InputError as error:
-        names = {field.name for each in options for field in fields(each)}
-        if error.where not in names:
+        if error.where not in flags:
             raise
-        flag = "--" + str(error.where).replace("_", "-")
-        raise kind(error.what, where=flag, fix=error.fix) from None
+        where = flags[str(error.where)]
+        raise kind(error.what, where=where, fix=_with_flags(error.fix, flags)) from None
+
+
+def _with_flags(fix: str | None, flags: Mapping[str, str]) -> str | None:
+    """A remedy that names flags in the place of arguments of several words."""
+    for name, flag in flags.items():
+        if fix is not None and "_" in name:
+            fix = re.sub(rf"(?<![\w-]){name}(?!\w)", flag, fix)
+    return fix
+
+
+def flag_of(name: str) -> str:
+    """The command line's option for a field.
+
+    Examples
+    --------
+    >>> flag_of("known_axis")
+    '--known-axis'
+    """
+    return "--" + name.replace("_", "-")
 
 
 @dataclass(frozen=True, kw_only=True)

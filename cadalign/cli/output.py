@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-
-from rich.console import Console
+from typing import TYPE_CHECKING
 
 from cadalign.errors import DataError
 from cadalign.io.files import printable
 
+if TYPE_CHECKING:
+    from rich.console import Console
+
 _PIPE_WIDTH = 120
+
+
+def say(text: str) -> None:
+    """Write a message to standard error."""
+    sys.stderr.write(f"{text}\n")
+
+
+@contextmanager
+def waiting(text: str) -> Iterator[None]:
+    """Show on a terminal what is waited for, and that it goes on; elsewhere show nothing."""
+    with new_console().status(text) if sys.stderr.isatty() else nullcontext():
+        yield
 
 
 def new_console(*, stderr: bool = True) -> Console:
@@ -18,6 +34,8 @@ def new_console(*, stderr: bool = True) -> Console:
 
     Output to a file or a pipe has lines of a fixed width that is enough for tables.
     """
+    from rich.console import Console  # only here: a fit is over before it is imported
+
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _PIPE_WIDTH
     return Console(stderr=stderr, highlight=False, soft_wrap=True, width=width)

@@ -16,14 +16,14 @@ from cadalign.cli.output import make_folder, new_console
 class Render:
     """Draw a model: a still, a contact sheet of several views, or a turntable.
 
-    One view gives a still, several give a contact sheet, and an --out that ends in .mp4 gives a
-    turntable.
+    One view gives a still, several give a contact sheet, and an --out that ends in .mp4,
+    .webm or .gif gives a turntable.
     """
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     out: Path = Path("render.png")
-    """File to write: .png or .mp4."""
+    """File to write: .png or .jpg; .mp4 (H.264), .webm (VP9) or .gif for a turntable."""
     view: tuple[str, ...] = ("iso",)
     """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
     degrees (write --view=-30,20 if it begins with a minus), all, or a camera file (Open3D's, or
@@ -57,12 +57,13 @@ class Render:
         from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
+        from cadalign.render.drawing.movie import MOVIES
 
         console = new_console()
         with named_as_flags(self):
             job = RenderJob.prepare(self)
         make_folder(self.out.absolute().parent)
-        if self.out.suffix.lower() == ".mp4":
+        if self.out.suffix.lower() in MOVIES:
             frames, count = draw_movie(job)
             shown = track(frames, "drawing", total=count, console=console, transient=True)
             write_movie(self.out, shown, fps=self.fps)

@@ -16,8 +16,9 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
+from cadalign.io.images import JPEG_ENDING
 from cadalign.render.drawing.color import ByteImage, composite
-from cadalign.render.drawing.movie import contact_sheet
+from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import keypoint_picture
 from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_view, turntable
 from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
@@ -28,6 +29,7 @@ from cadalign.render.views.visibility import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
 _MAX_FRAMES = 10_000
+STILLS = (".png", JPEG_ENDING)
 
 LabelledView = tuple[str, Angles | tuple[Camera, Alignment]]
 """A label, and angles or a whole camera."""
@@ -54,11 +56,11 @@ class RenderJob:
         camera = Camera.from_fov(width, height, fov_x=options.fov)
         check_image_size(camera)
         ending = options.out.suffix.lower()
-        if ending not in (".png", ".mp4"):
+        if ending not in (*STILLS, *MOVIES):
             raise InputError(
-                f"{options.out.name} is neither a PNG nor an MP4 file",
+                f"{options.out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
                 where="--out",
-                fix="give such a name",
+                fix=f"give a name that ends in {', '.join((*STILLS, *MOVIES))}",
             )
         background = parse_background(options.background)
         scale = as_floats(options.scale, name="--scale", shape=(3,))
@@ -68,9 +70,9 @@ class RenderJob:
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
         file = options.keypoints
-        if background is None and (ending == ".mp4" or len(views) > 1 or file is not None):
+        if background is None and (ending != ".png" or len(views) > 1 or file is not None):
             raise InputError(
-                "only a still without keypoints can be transparent", where="--background"
+                "only a PNG still without keypoints can be transparent", where="--background"
             )
         mesh = load_mesh(options.model)
         return cls(

@@ -25,8 +25,18 @@ class Report:
     run may be unfinished: the page shows what there is.
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
+    estimates: tuple[Path, ...] = ()
+    """Files of poses that other programs estimated, with --data: BOP's results (CSV) or
+    scene_gt.json, or JSON in the form of Scan2CAD's annotations. Each is a method; they are scored
+    by the data set's metrics, in the folder --run, and shown beside the runs given."""
+    data: Path | None = None
+    """Folder of the photos that the estimates are of."""
+    run_folder: Annotated[Path, tyro.conf.arg(name="run")] = Path("runs/estimates")
+    """Folder of the scored estimates."""
+    workers: int = 0
+    """Processes that score estimates; -1 for one for each core."""
     out: Path | None = None
     """File to write. By default report.html, in the run's folder if it is one run; a table goes to
     standard output."""
@@ -40,30 +50,51 @@ class Report:
         """Write the report; returns the exit code."""
         from cadalign.report import headline_text, write_report
 
+        runs, code = self.runs, 0
+        if self.estimates or self.data is not None:
+            code = self._score()
+            runs = (self.run_folder, *runs)
         if self.format == "html":
-            report = write_report(self.runs, self.out or self._page(), assets=self.assets)
+            report = write_report(runs, self.out or _page(runs), assets=self.assets)
             console = new_console()
             console.print(f"Report: {report.path}", markup=False)
             if report.assets is not None:
                 console.print(f"Its pictures: {report.assets}, to be kept beside it", markup=False)
-            return 0
+            return code
         if self.assets:
             raise InputError(
                 f"a table has no pictures (--format {self.format})",
                 where="--assets",
                 fix="leave one of them out",
             )
-        text = headline_text(self.runs, format=self.format)
+        text = headline_text(runs, format=self.format)
         if self.out is None:
             sys.stdout.write(text)
         else:
             from cadalign.io.files import write_text
 
             write_text(self.out, text)
-        return 0
+        return code
 
-    def _page(self) -> Path:
-        return self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
+    def _score(self) -> int:
+        """Score the estimates and print the table; returns the exit code."""
+        from cadalign.cli.evaluate import command_of
+        from cadalign.cli.runs import conclude
+        from cadalign.evaluation.estimates.options import EstimatesOptions
+
+        if self.data is None:
+            fix = "give --data, the folder of the data set"
+            raise InputError(
+                "the photos that they are of are not known", where="--estimates", fix=fix
+            )
+        command = command_of(EstimatesOptions)
+        given = {"root": self.data, "estimates": self.estimates}
+        spec, run = command(**given, out=self.run_folder, workers=self.workers).do_run()
+        return conclude(spec, run, json=False)
+
+
+def _page(runs: tuple[Path, ...]) -> Path:
+    return runs[0] / "report.html" if len(runs) == 1 else Path("report.html")
 
 
 def write_run_report(folder: RunFolder) -> None:

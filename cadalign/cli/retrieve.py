@@ -56,13 +56,15 @@ class Retrieve(ObservationCommand):
     """The same with the photo's opacity, or with what is segmented around the keypoints."""
     workers: int = -1
     """Number of threads; -1 for one per core."""
-    ranking: tyro.conf.OmitArgPrefixes[_RetrievalOptions] = _RetrievalOptions()
+    ranking: Annotated[
+        _RetrievalOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RetrievalOptions.__doc__)
+    ] = _RetrievalOptions()
 
     def run(self) -> int:
         """Run the retrieval; returns the exit code."""
         from cadalign.io.images import read_image
         from cadalign.retrieval import Library
-        from cadalign.retrieval.page import write_retrieval
+        from cadalign.retrieval.page import none_text, write_retrieval
         from cadalign.retrieval.query import read_mask, read_opacity, read_query
 
         if self.robust:
@@ -99,6 +101,9 @@ class Retrieve(ObservationCommand):
             print_json([match.to_dict() for match in matches])
         else:
             _print_table(matches)
+            absent = none_text(matches)
+            if absent is not None:
+                console.print(absent, markup=False, highlight=False)
         if self.out is not None:
             make_folder(self.out)
             page = write_retrieval(

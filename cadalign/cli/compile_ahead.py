@@ -1,0 +1,84 @@
+"""All solvers compiled ahead, in two processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+import numpy as np
+
+from cadalign.fitting.options import METHODS
+from cadalign.geometry.camera import Camera
+
+_CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+
+
+def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
+    """Compile what fits, alignments, retrieval and evaluations call, unless it is on disk.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with the name of each group of solvers that is ready.
+    """
+    # The longest first.
+    groups = (_shapes_in_several_views, _fits, _shapes_in_one_view, _retrieval_and_boxes)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=context) as pool:
+        jobs = {pool.submit(group): group.__name__ for group in groups}
+        for job in as_completed(jobs):
+            job.result()
+            if progress:
+                progress(jobs[job].strip("_").replace("_", " "))
+
+
+def _points() -> tuple[np.ndarray, np.ndarray]:
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 3))
+    return points, _CAMERA.project(points + [0.0, 0.0, 2.0])
+
+
+def _fits() -> None:
+    from cadalign.fitting.fit import fit
+    from cadalign.fitting.options import RansacOptions
+
+    points, pixels = _points()
+    for method in METHODS:
+        fit(points, pixels, _CAMERA, method=method)
+    fit(points, pixels, _CAMERA, ransac=RansacOptions(max_iterations=10), sigma=1.0)
+    fit(points, pixels, _CAMERA, focal="estimate")
+
+
+def _shapes_in_one_view() -> None:
+    _align_shape(views=1)
+
+
+def _shapes_in_several_views() -> None:
+    _align_shape(views=2)
+
+
+def _align_shape(*, views: int) -> None:
+    from cadalign.fitting.joint.align import align
+    from cadalign.fitting.joint.view import View
+    from cadalign.shapes.model import ShapeModel
+
+    points, pixels = _points()
+    directions = np.random.default_rng(0).normal(size=(2, 12, 3))
+    shape = ShapeModel.from_basis(points, directions, [0.1, 0.1])
+    align(shape, [View(_CAMERA, pixels, sigma=1.0)] * views)
+
+
+def _retrieval_and_boxes() -> None:
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.box import Box
+    from cadalign.geometry.metrics import box_iou
+    from cadalign.retrieval import Library, LibraryModel
+
+    points, pixels = _points()
+    bounds = np.array([[-0.3, -0.3, -0.3], [0.3, 0.3, 0.3]])
+    models = [
+        LibraryModel("box", str(k), points * (1.0 + k), np.arange(12), bounds) for k in range(3)
+    ]
+    Library.from_models(models).retrieve(pixels, np.arange(12), _CAMERA)
+    box = Box.from_model(bounds, Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3)))
+    box_iou(est=box, gt=box)

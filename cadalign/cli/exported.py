@@ -1,0 +1,153 @@
+"""The aligned object of a fit's file and the observation that it was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets import load_mesh
+from cadalign.errors import DataError, InputError
+from cadalign.export import AlignedObject
+from cadalign.fitting.exporting import object_of_align, object_of_fit
+from cadalign.fitting.joint.observed import model_of, own_ids, shape_ids
+from cadalign.fitting.joint.result import AlignResult
+from cadalign.fitting.joint.view import View
+from cadalign.fitting.options import FitOptions
+from cadalign.fitting.result import FitResult
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.documents import in_file, read_json
+from cadalign.io.observation import Observation
+from cadalign.render.drawing.align_overlay import mesh_of
+from cadalign.shapes.model import ShapeModel
+
+_FOLDER_ENDING = "_fit"
+_ANY_SIGMA = 1.0
+_SAME = 1e-9  # of the model's size
+
+
+def read_exported(
+    fit: Path,
+    *,
+    observation: Path | None = None,
+    shape: Path | None = None,
+    world_from_cam: FloatArray | None = None,
+    metres: float = 1.0,
+) -> AlignedObject:
+    """Read the result of `cadalign fit` and what it was fitted to.
+
+    Parameters
+    ----------
+    fit : Path
+        The file ``fit.json``.
+    observation : Path, optional
+        The observation; by default ``photo.json`` beside the folder ``photo_fit`` of the fit.
+    shape : Path, optional
+        The learned shape that was fitted; by default the observation's, if it names one.
+    world_from_cam, metres
+        As for `AlignedObject`.
+
+    Raises
+    ------
+    DataError
+        If a file is missing or invalid, or the observation is not the one that was fitted.
+    """
+    data = read_json(fit)
+    if not isinstance(data, Mapping):
+        raise DataError("is not a fit's result", where=str(fit), fix="give a fit.json")
+    path = observation or _observation_of(fit)
+    seen = Observation.load(path, needs_xyz=False)
+    known: dict[str, Any] = {
+        "world_from_cam": world_from_cam,
+        "metres": metres,
+        "name": "model" if seen.model is None else seen.model.stem,
+    }
+    if data.get("method") != "align":
+        with in_file(fit):
+            result = FitResult.from_dict(data)
+        _require_same(len(result.points_3d), len(seen.points_3d), path, "keypoints")
+        mesh = None if seen.model is None else load_mesh(seen.model)
+        return object_of_fit(result, mesh=mesh, image=seen.image, **known)
+    with in_file(fit):
+        aligned = AlignResult.from_dict(data)
+    _require_same(len(aligned.poses), len(seen.views), path, "views")
+    opened = _shape(aligned, seen, shape)
+    with in_file(path):
+        views = _views(seen, opened)
+    mesh = _warped(aligned, seen, views, opened, path)
+    images = [view.image for view in seen.views]
+    return object_of_align(aligned, views, mesh=mesh, images=images, **known)
+
+
+def _observation_of(fit: Path) -> Path:
+    """The observation whose fit lies where `cadalign fit` and `cadalign annotate` write it."""
+    folder = fit.resolve().parent
+    if folder.name.endswith(_FOLDER_ENDING):
+        path = folder.with_name(f"{folder.name.removesuffix(_FOLDER_ENDING)}.json")
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{fit} does not tell which observation it is the fit of",
+        where="--observation",
+        fix="give the observation file that was fitted",
+    )
+
+
+def _shape(aligned: AlignResult, seen: Observation, shape: Path | None) -> ShapeModel | None:
+    """The learned shape that was fitted, None where the model's own keypoints were."""
+    path = shape or seen.shape
+    if path is None:
+        return None
+    opened = ShapeModel.open(path)
+    if tuple(opened.ids) != aligned.ids:
+        if shape is None:  # the file's shape was left out by a flag
+            return None
+        what = f"{len(opened.ids)} keypoints that are not the fit's {len(aligned.ids)}"
+        raise DataError(what, where=str(path), fix="give the shape that was fitted")
+    return opened
+
+
+def _views(seen: Observation, shape: ShapeModel | None) -> list[View]:
+    own = own_ids(seen.views)
+    return [
+        View(image.camera, image.points_2d, ids=names if shape is None else shape_ids(image, shape))
+        for image, names in zip(seen.views, own, strict=True)
+    ]
+
+
+def _warped(
+    aligned: AlignResult,
+    seen: Observation,
+    views: list[View],
+    shape: ShapeModel | None,
+    path: Path,
+) -> Mesh | None:
+    if shape is not None:
+        return mesh_of(seen, views, replace(aligned, model=shape))
+    if seen.model is None:
+        return None
+    mesh = load_mesh(seen.model)
+    with in_file(path):
+        model = model_of(seen, options=FitOptions(), shape_sigma=_ANY_SIGMA, mesh=mesh)
+    if tuple(model.ids or ()) != aligned.ids:
+        what = "its keypoints are not those of the fit"
+        fix = "give the observation that was fitted, with the shape that was (--shape)"
+        raise DataError(what, where=str(path), fix=fix)
+    source = np.asarray(model.points_3d)
+    size = float(np.ptp(source, axis=0).max()) or 1.0
+    if np.abs(source - aligned.points_3d).max() <= _SAME * size:
+        return mesh
+    return replace(aligned, model=model).mesh()
+
+
+def _require_same(count: int, expected: int, path: Path, what: str) -> None:
+    if count != expected:
+        raise DataError(
+            f"{expected} {what}, but the fit has {count}",
+            where=str(path),
+            fix="give the observation that was fitted, as it was then",
+        )

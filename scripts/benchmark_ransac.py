@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import poselib
 import tyro
-from common import Benchmark, new_table, write_results
+from common import Benchmark, figure, new_table, write_figures, write_results
 from rich.console import Console
 
 import cadalign
@@ -36,6 +36,8 @@ class Arguments(Benchmark):
     """Folder of a COLMAP model."""
     bundler: Path
     """Folder of a Bundler model."""
+    json: Path | None = None
+    """File for the times over PoseLib's, as `compare_ratios.py` reads them."""
     draws: int = 20
     """Draws of scales and outliers for each image."""
     outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
@@ -64,6 +66,15 @@ def main(arguments: Arguments) -> None:
             )
     console.print(table)
     write_results(arguments.out, rows)
+    write_figures(
+        arguments.json,
+        {
+            f"robust, {row['model']}, {row['outliers']:.0%} outliers": figure(
+                1e3 * row["seconds"], "ms", row["over_poselib"]
+            )
+            for row in rows
+        },
+    )
 
 
 def _measure(images: list[Correspondences], share: float, draws: int) -> dict[str, float]:

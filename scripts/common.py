@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, getrusage
 from typing import Any
 
 import cv2
@@ -78,6 +82,42 @@ def write_results(path: Path, results: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, results)
     print(f"written to {path}")
+
+
+def figure(value: float, unit: str, ratio: float) -> dict[str, Any]:
+    """A measured figure, and its ratio to a time that was measured in turns with it."""
+    return {"value": value, "unit": unit, "ratio": ratio}
+
+
+def write_figures(path: Path | None, figures: dict[str, dict[str, Any]]) -> None:
+    """Write figures by name for `compare_ratios.py`, if there is a path."""
+    if path is not None:
+        write_results(path, figures)
+
+
+def processor_seconds(call: Callable[[], object]) -> float:
+    """Processor time of a call in this process, of all its threads."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def seconds_of_process(
+    command: list[str], *, environment: Mapping[str, str] | None = None
+) -> tuple[float, float]:
+    """Wall clock and processor time of a command that keeps byte code, as installed packages do."""
+    environment = {**(environment or os.environ), "PYTHONDONTWRITEBYTECODE": ""}
+    began, before = time.perf_counter(), getrusage(RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, capture_output=True, env=environment)
+    after = getrusage(RUSAGE_CHILDREN)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.perf_counter() - began, used
+
+
+def reference_seconds() -> float:
+    """Processor time of 50,000 eigenvalue problems in NumPy, a measure of the machine's speed."""
+    matrices = np.random.default_rng(0).standard_normal((50_000, 4, 4))
+    return processor_seconds(lambda: np.linalg.eigvalsh(matrices))
 
 
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:

@@ -10,8 +10,8 @@ ROOT = Path(__file__).resolve().parents[1]
 WIDTH, ROW, TOP = 1080, 34, 56
 # Layers by kind, and the kind's colour.
 KINDS = {
-    "#e8e8ec": "errors arrays seeding compile",
-    "#d9e8f7": "geometry metrics io solvers shapes fitting",
+    "#e8e8ec": "errors lazy arrays notebook seeding compile",
+    "#d9e8f7": "geometry metrics io solvers shapes export fitting",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation report annotate health cli scripts",
 }

@@ -1,0 +1,466 @@
+"""Measure the annotator's page in a real Chromium, and take pictures of it with ten models.
+
+- ``times``: from the mouse event to the painted frame, with 20 pairs, without and with a mask;
+- ``list``: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
+- ``panels``: a session by keys alone through every panel: layout shifts, and what axe-core finds;
+- ``kills``: annotators killed at random moments, and what the next ones had lost;
+- ``pictures``: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
+  light and dark, on desktop, laptop and phone, as contact sheets.
+
+Prints the figures and writes them to a JSON file. It needs the tests' packages and Chromium.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from common import SeededBenchmark, write_results
+from PIL import Image, ImageDraw
+from playwright.sync_api import Browser, Page, sync_playwright
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support.annotating import Case, make_case, place, place_of_pixel, place_twenty, served
+from support.killing import kill_at_random
+from support.panels import (
+    AXE,
+    IDLE,
+    MODEL,
+    PHOTO,
+    WATCH_SHIFTS,
+    Keyboard,
+    open_page,
+    prepare,
+    shifts,
+)
+from support.web import axe_script
+
+from cadalign import Camera, Mesh
+from cadalign.annotate.masks import encode_runs
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.session import Session
+from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
+from cadalign.export import AlignedObject, ExportView, export_object
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.mesh import Material
+from cadalign.io.images import write_image
+from cadalign.render import RaycastRenderer, Scene, cast_geometry, visible_keypoints
+from cadalign.render.views.viewpoints import frame_object, look_at
+
+PARTS = ("times", "list", "panels", "kills", "pictures")
+SCREENS = {"desktop": (1600, 1000), "laptop": (1366, 768), "phone": (390, 844)}
+SCHEMES = ("light", "dark")
+SERIOUS = ("serious", "critical")
+CAMERA = Camera(1024, 768, 1100.0, 1100.0, 511.5, 383.5)
+PICTURED_PAIRS = 8
+
+# From the event of the mouse to the task after the frame in which its answer is painted.
+WATCH_PAINT = """
+window.painted = [];
+window.pressed = null;
+addEventListener("pointerup", (event) => { window.pressed = event.timeStamp; }, { capture: true });
+window.watchPaint = () => {
+    const show = annotator.show.bind(annotator);
+    annotator.show = (state) => {
+        show(state);
+        const { pressed } = window;
+        window.pressed = null;
+        if (pressed === null) return;
+        requestAnimationFrame(() => {
+            const after = new MessageChannel();
+            after.port1.onmessage = () => window.painted.push(performance.now() - pressed);
+            after.port2.postMessage(0);
+        });
+    };
+};
+"""
+THUMBNAILS = """[...document.querySelectorAll(".thumbs img")].filter((image) => {
+    const { top, bottom } = image.getBoundingClientRect();
+    return bottom > 0 && top < innerHeight;
+}).every((image) => image.complete && image.naturalWidth > 0)"""
+
+
+@dataclass
+class Arguments(SeededBenchmark):
+    """Arguments of the benchmark."""
+
+    parts: tuple[str, ...] = PARTS
+    """What to measure."""
+    keypointnet: Path | None = None
+    """KeypointNet beside ShapeNet's models; by default the sample dataset alone."""
+    pictures: Path = Path("bench", "annotator")
+    """Folder for the contact sheets."""
+    clicks: int = 30
+    """Clicks that are timed."""
+    photos: int = 200
+    """Photos in the folder."""
+    kills: int = 100
+    """Annotators to kill."""
+
+
+def main(arguments: Arguments) -> None:
+    """Measure, print and write."""
+    measures: dict[str, Callable[[Arguments, Browser, Path], dict[str, Any]]] = {
+        "times": measure_times,
+        "list": measure_list,
+        "panels": measure_panels,
+        "kills": measure_kills,
+        "pictures": take_pictures,
+    }
+    results: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, launched() as browser:
+        os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
+        for part in arguments.parts:
+            place = Path(folder) / part
+            place.mkdir()
+            before = os.getloadavg()[0]
+            results[part] = measures[part](arguments, browser, place)
+            results[part]["load"] = [round(before, 1), round(os.getloadavg()[0], 1)]
+            print(part, results[part], flush=True)
+    write_results(arguments.out, results)
+
+
+@contextmanager
+def launched() -> Iterator[Browser]:
+    """A headless Chromium that draws WebGL in software."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    program = next(filter(None, map(shutil.which, names)), None)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=program,
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+        )
+        yield browser
+        browser.close()
+
+
+# --- times -----------------------------------------------------------------------------------
+
+
+def measure_times(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+    """Clicks that complete the twentieth pair, without and with a mask [ms]."""
+    case = case_of(arguments, folder)
+    found: dict[str, Any] = {}
+    for kind in ("pairs", "mask"):
+        own = case.copied_to(folder / kind)
+        session = own.open()
+        place_twenty(session, own)
+        if kind == "mask":
+            pose = own.instance.cam_from_model
+            mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
+            session.act(0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+        last = session.photos[0].document.pairs[-1]
+        session.act(0, {"do": "delete", "pair": last.number})
+        with served(session) as access:
+            page = open_page(
+                browser, access.url, width=1366, height=768, scheme="light", scripts=(WATCH_PAINT,)
+            )
+            page.evaluate("window.watchPaint()")
+            milliseconds = _timed_clicks(page, session, last.uv, arguments.clicks)
+            page.context.close()
+        median, late = np.percentile(milliseconds, [50, 95])
+        found[kind] = {"median_ms": round(float(median), 1), "p95_ms": round(float(late), 1)}
+    return found | {"clicks": arguments.clicks}
+
+
+def _timed_clicks(
+    page: Page, session: Session, uv: tuple[float, float] | None, count: int
+) -> list[float]:
+    """Times of clicks on the model that complete a pair, each then undone [ms]."""
+    box = page.locator(MODEL).bounding_box()
+    assert box is not None
+    photo = place_of_pixel(page, uv or (0, 0))
+    times = []
+    wait = Keyboard(page).wait
+    full = len(session.photos[0].document.pairs) + 1
+    for click in range(count + 3):
+        page.evaluate("window.painted = []; annotator.select(null)")
+        page.mouse.click(*photo)
+        wait(f"{IDLE} && annotator.state.pairs.length === {full} && window.painted.length === 1")
+        page.wait_for_timeout(350)  # a person's hand; meanwhile the next keypoint is ranked
+        place_on_model = page.evaluate(
+            "annotator.model.toPage(annotator.state.keypoints.find((each) => !each.used).xyz)"
+        )
+        page.mouse.click(place_on_model["x"], place_on_model["y"])
+        wait(
+            f"{IDLE} && window.painted.length === 2"
+            f" && annotator.state.pairs.filter((each) => each.residual).length === {full}"
+        )
+        if click >= 3:  # the first ones warm up
+            times.append(page.evaluate("window.painted[1]"))
+        page.evaluate("annotator.undo(), annotator.undo()")
+        wait(f"{IDLE} && annotator.state.pairs.length === {full - 1}")
+    return times
+
+
+def case_of(arguments: Arguments, folder: Path) -> Case:
+    """A photo of a chair: ShapeNet's if it is here, else the sample's."""
+    root = arguments.keypointnet
+    if root is None:
+        root = write_sample_dataset(folder / "sample", per_category=1)
+        return make_case(root, _new(folder / "case"))
+    return make_case(root, _new(folder / "case"), model_id="88382b877be91b2a572f8e1c1caad99e")
+
+
+def _new(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+# --- list ------------------------------------------------------------------------------------
+
+
+def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+    """The list of a folder of photos, and going from one to the next."""
+    case = case_of(arguments, folder)
+    with Image.open(case.photo) as image:
+        large = image.convert("RGB").resize((2000, 1500))
+    case.photo.unlink()
+    for number in range(arguments.photos):
+        large.save(case.folder / f"photo_{number}.jpg", quality=90)
+    start = time.perf_counter()
+    session = case.open(image=case.folder, camera=None, prepared=False)
+    opened = time.perf_counter() - start
+    session.warm_up()
+    for number in range(0, arguments.photos, 5):
+        for keypoint, (u, v) in case.clicks[:5]:
+            scale = 2000 / case.instance.camera.width
+            place(session, keypoint, [u * scale, v * scale], image=number)
+    listed, pictured, switched = [], [], []
+    with served(session) as access:
+        page = open_page(browser, access.url, width=1366, height=768, scheme="light", scripts=())
+        wait = Keyboard(page).wait
+        for _ in range(5):
+            listed.append(
+                page.evaluate(
+                    """async () => {
+                        const begin = performance.now();
+                        await annotator.worklist.open(annotator.state.image.number);
+                        await new Promise((drawn) =>
+                            requestAnimationFrame(() => requestAnimationFrame(drawn)));
+                        return performance.now() - begin;
+                    }"""
+                )
+            )
+            start = time.perf_counter()
+            wait(THUMBNAILS)
+            pictured.append(1000 * (time.perf_counter() - start))
+            page.keyboard.press("Escape")
+            wait("!annotator.worklist.dialog.isConnected")
+        page.locator(PHOTO).focus()
+        for number in range(1, 21):
+            start = time.perf_counter()
+            page.keyboard.press("PageDown")
+            wait(
+                f"{IDLE} && annotator.state.image.number === {number}"
+                " && annotator.photo.wanted === annotator.photo.picture"
+            )
+            switched.append(1000 * (time.perf_counter() - start))
+        page.context.close()
+    return {
+        "photos": arguments.photos,
+        "opened_s": round(opened, 2),
+        "list_ms": round(float(np.median(listed)), 1),
+        "first_thumbnails_ms": round(pictured[0], 1),
+        "switch_ms": round(float(np.median(switched)), 1),
+        "switch_p95_ms": round(float(np.percentile(switched, 95)), 1),
+    }
+
+
+# --- panels ----------------------------------------------------------------------------------
+
+
+def measure_panels(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+    """Layout shifts and what axe-core finds, over a session through every panel."""
+    root = write_sample_dataset(folder / "sample", per_category=3)
+    original = make_case(root, _new(folder / "case"))
+    axe = axe_script(folder)
+    found: dict[str, Any] = {}
+    for screen, (width, height) in SCREENS.items():
+        for scheme in SCHEMES:
+            case = original.copied_to(folder / f"{screen} {scheme}")
+            shift, panels, serious = 0.0, 0, set[str]()
+            for with_axe in (False, True):
+                own = case.copied_to(folder / f"{screen} {scheme} {with_axe}")
+                with served(prepare(own, root)) as access:
+                    page = open_page(
+                        browser,
+                        access.url,
+                        width=width,
+                        height=height,
+                        scheme=scheme,
+                        scripts=(WATCH_SHIFTS,),
+                    )
+                    keyboard = Keyboard(page)
+                    if with_axe:
+                        page.evaluate(axe)
+                        keyboard.seen = lambda name, p=page, s=serious: s.update(_serious(p))
+                    keyboard.session()
+                    if not with_axe:
+                        shift = sum(each["value"] for each in shifts(page, also_after_input=False))
+                    panels = len(keyboard.visited)
+                    page.context.close()
+            found[f"{screen} {scheme}"] = {
+                "cumulative_layout_shift": shift,
+                "panels": panels,
+                "axe_serious": sorted(serious),
+            }
+    return found
+
+
+def _serious(page: Page) -> set[str]:
+    return {each["id"] for each in page.evaluate(AXE) if each["impact"] in SERIOUS}
+
+
+# --- kills -----------------------------------------------------------------------------------
+
+
+def measure_kills(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+    """Annotators killed at random moments."""
+    case = case_of(arguments, folder)
+    rounds = []
+    for each in kill_at_random(case, rounds=arguments.kills, seed=arguments.seed):
+        rounds.append(each)
+        if each.lost:
+            print("lost", each.action, each.differences, flush=True)
+        if len(rounds) % 10 == 0:
+            print(f"killed {len(rounds)} of {arguments.kills}", flush=True)
+    return {
+        "kills": len(rounds),
+        "during_an_action": sum(each.was_busy for each in rounds),
+        "answered_actions": sum(each.answered for each in rounds),
+        "lost": sum(each.lost for each in rounds),
+    }
+
+
+# --- pictures --------------------------------------------------------------------------------
+
+
+def take_pictures(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+    """Contact sheets of ten models on every screen, light and dark."""
+    sessions = {
+        name: pictured_session(mesh, _new(folder / name))
+        for name, mesh in pictured_models(arguments.keypointnet)
+    }
+    arguments.pictures.mkdir(parents=True, exist_ok=True)
+    for screen, (width, height) in SCREENS.items():
+        for scheme in SCHEMES:
+            shots = []
+            for name, session in sessions.items():
+                path = folder / f"{screen} {scheme} {name}.png"
+                with served(session) as access:
+                    page = open_page(
+                        browser, access.url, width=width, height=height, scheme=scheme, scripts=()
+                    )
+                    page.evaluate("annotator.photo.setOverlay({ mode: 'edges' })")
+                    page.wait_for_timeout(300)
+                    page.screenshot(path=path)
+                    page.context.close()
+                shots.append((name, path))
+            write_sheet(arguments.pictures / f"{screen}_{scheme}.png", shots)
+    return {"models": list(sessions), "screens": list(SCREENS)}
+
+
+def pictured_models(root: Path | None) -> Iterator[tuple[str, Mesh]]:
+    """Ten models that are hard to see: ShapeNet's where they are here."""
+    with tempfile.TemporaryDirectory() as folder:
+        sample = KeypointNet(write_sample_dataset(Path(folder), per_category=1))
+        own = {model.category: load_mesh(model.mesh_path) for model in sample if model.mesh_path}
+    real: dict[str, Mesh] = {}
+    if root is not None:
+        for path in sorted(root.glob("models/*/*/models/model_normalized.obj")):
+            real[path.parts[-3][:6]] = load_mesh(path)
+    chair, bottle = own["chair"], own["bottle"]
+    yield "white, doubled faces", real.get("341c9b", painted(chair, 1.0))
+    yield "black", painted(real.get("1eaf8d", chair), 0.0)
+    yield "doubled faces, cup", real.get("1ea9ea", chair)
+    yield "thin", thinned(real.get("341e24", chair))
+    yield "transparent", real.get("437678", painted(bottle, 0.9, opacity=0.3))
+    yield "glass", painted(bottle, 0.9, opacity=0.25)
+    yield "textured", real.get("88382b", chair)
+    yield "many faces", real.get("4e2769", own["vessel"])
+    yield "huge", scaled(real.get("b08727", own["car"]), 1e5)
+    yield "tiny", scaled(real.get("1cf98e", bottle), 1e-5)
+
+
+def painted(mesh: Mesh, grey: float, *, opacity: float = 1.0) -> Mesh:
+    """The mesh in one grey."""
+    material = Material("grey", (grey, grey, grey, opacity))
+    return Mesh(mesh.vertices, mesh.faces, polygon=mesh.polygon, materials=(material,))
+
+
+def thinned(mesh: Mesh) -> Mesh:
+    """The mesh, as thin as a board."""
+    return replace(mesh, vertices=mesh.vertices * [1.0, 1.0, 0.01])
+
+
+def scaled(mesh: Mesh, factor: float) -> Mesh:
+    """The mesh in another unit."""
+    return replace(mesh, vertices=mesh.vertices * factor)
+
+
+def pictured_session(mesh: Mesh, folder: Path) -> Session:
+    """A session on a drawing of the mesh, with pairs at visible corners."""
+    scene = Scene(mesh)
+    turned = look_at(azimuth=215, elevation=25, distance=1.0)
+    pose = frame_object(scene.bounds, CAMERA, rotation=turned.rotation, fill=0.8)
+    frame = RaycastRenderer().render(scene, CAMERA, pose)
+    write_image(folder / "photo.png", frame.composite((196, 200, 190)))
+    export_object(
+        folder / "model.obj",
+        AlignedObject((ExportView(CAMERA, _at_rest(pose)),), mesh=mesh),
+        format="obj",
+    )
+    session = open_session(
+        SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
+    )
+    session.act(0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
+    model = session.model
+    seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
+    shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]
+    rng = np.random.default_rng(0)
+    for point in shown[:PICTURED_PAIRS]:
+        ((u, v),) = CAMERA.project(pose.apply([point.xyz])) + rng.normal(size=(1, 2))
+        place(session, session.registry.add(point), [float(u), float(v)])
+    session.warm_up()
+    return session
+
+
+def _at_rest(pose: Alignment) -> Alignment:
+    """The pose before which a mesh is written as it is: camera and model frame are one."""
+    return Alignment(np.eye(3), np.zeros(3), pose.scale)
+
+
+def write_sheet(path: Path, shots: list[tuple[str, Path]], *, columns: int = 2) -> None:
+    """Write pictures with their names as one, ``columns`` wide."""
+    with Image.open(shots[0][1]) as first:
+        width, height = first.size
+    if width < 600:
+        columns = 5
+    share = min(1.0, 900 / width)
+    size = int(width * share), int(height * share)
+    rows = -(-len(shots) // columns)
+    sheet = Image.new("RGB", (columns * size[0], rows * (size[1] + 20)), "white")
+    draw = ImageDraw.Draw(sheet)
+    for number, (name, shot) in enumerate(shots):
+        x, y = number % columns * size[0], number // columns * (size[1] + 20)
+        draw.text((x + 4, y + 4), name, fill="black")
+        with Image.open(shot) as image:
+            sheet.paste(image.convert("RGB").resize(size), (x, y + 20))
+    sheet.save(path)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

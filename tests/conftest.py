@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ settings.register_profile(
 )
 settings.load_profile("cadalign")
 
+# Undo histories of the annotator are kept there.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cadalign-tests-")
+
 # What a page shows is waited for; how soon it does is a matter for the tests of times.
 expect.set_options(timeout=30_000)
 
@@ -35,16 +39,16 @@ REQUIRED = os.environ.get("CADALIGN_REQUIRED", "").split()
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the usual kernels before xdist starts the processes that run the tests."""
     if session.config.getoption("numprocesses", None):
-        from support.kernels import compile_usual_kernels
+        from cadalign.cli.compile_ahead import compile_ahead
 
-        compile_usual_kernels()
+        compile_ahead()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let the processes of xdist begin with slow modules: in the end none works on one alone."""
+    """Let the processes of xdist begin with long modules: in the end none works on one alone."""
     if hasattr(config, "workerinput"):
-        slow = {item.path for item in items if item.get_closest_marker("slow")}
-        items.sort(key=lambda item: item.path not in slow)
+        long = {item.path for item in items if item.get_closest_marker("long")}
+        items.sort(key=lambda item: item.path not in long)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import io
+import json
+import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from llvmlite import binding
+
+from cadalign.compile import sources
+from cadalign.compile.progress import kernels_needed
+
+pytestmark = pytest.mark.slow
+
+inner: Any = None
 
 MODULE = """
 import os
@@ -47,10 +60,157 @@ def hits(process: subprocess.Popen[str]) -> int:
     return int(out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_that_compile_at_the_same_time_keep_each_others_code(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(MODULE)
     values = ["1,", "1.5,", "1j,", "np.float32(2),"]
     for process in [use(tmp_path, value) for value in values]:
         hits(process)
     assert hits(use(tmp_path, "".join(values))) == len(values)
+
+
+SOURCES = """
+from cadalign.compile import kernel
+{imports}
+
+@kernel
+def one(x):
+    return x + {term}
+"""
+CALL = """
+import sys
+sys.path.insert(0, {folder!r})
+import importlib
+one = importlib.import_module({module!r}).one
+assert one(1.0) == {value}
+print(sum(one.stats.cache_hits.values()))
+"""
+
+
+def call(folder: Path, module: str, value: float, **environment: str) -> int:
+    code = CALL.format(folder=str(folder), module=module, value=value)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout)
+
+
+def write(folder: Path, term: str) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / "kernels.py").write_text(SOURCES.format(imports="", term=term))
+
+
+@pytest.mark.long
+def test_code_is_found_by_the_content_of_its_sources(tmp_path: Path) -> None:
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    write(tmp_path / "a", "1.0")
+    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 0
+    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 1
+    write(tmp_path / "b", "1.0")  # another checkout of the same
+    assert call(tmp_path / "b", "kernels", 2.0, **cache) == 1
+    write(tmp_path / "a", "2.0")
+    assert call(tmp_path / "a", "kernels", 3.0, **cache) == 0
+    write(tmp_path / "a", "1.0")  # back to the older version
+    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 1
+
+
+def test_a_hash_changes_with_whatever_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sources, "_PACKAGE", tmp_path)
+    files = {
+        "top.py": "from cadalign.inner.middle import (\n    f,\n)\n",
+        "inner/__init__.py": "",
+        "inner/middle.py": "from cadalign.inner import leaf\nfrom cadalign import inner\n",
+        "inner/leaf.py": "import cadalign.last\nVALUE = 1\n",
+        "last.py": "",
+        "unused.py": "",
+    }
+
+    def hashed(**changed: str) -> str:
+        for name, text in {**files, **changed}.items():
+            path = tmp_path / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+        sources.source_hash.cache_clear()
+        sources._content.cache_clear()
+        return sources.source_hash(tmp_path / "top.py")
+
+    before = hashed()
+    assert hashed() == before
+    assert hashed(**{"unused.py": "1"}) == before
+    for name in ("inner/__init__.py", "inner/middle.py", "inner/leaf.py", "last.py"):
+        assert hashed(**{name: files[name] + "# changed"}) != before, name
+
+
+@pytest.mark.long
+def test_nothing_is_lost_where_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    write(tmp_path / "a", "1.0")
+    assert call(tmp_path / "a", "kernels", 2.0, NUMBA_CACHE_DIR=str(tmp_path / "file")) == 0
+
+
+SHIPPED = """
+import pathlib, shutil, sys
+from cadalign.compile import shipped
+shipped.FOLDER = pathlib.Path({shipped!r})
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("needs", "hits"), [("fma", 1), ("feature-of-2099", 0)])
+def test_shipped_code_is_used_by_any_processor_that_can(
+    tmp_path: Path, needs: str, hits: int
+) -> None:
+    built = {"NUMBA_CACHE_DIR": str(tmp_path / "built"), "NUMBA_CPU_FEATURES": ""}
+    name = "x86-64-v3" if platform.machine() in ("x86_64", "AMD64") else "generic"
+    write(tmp_path / "a", "1.0")
+    assert call(tmp_path / "a", "kernels", 2.0, **built, NUMBA_CPU_NAME=name) == 0
+    features = [needs] if needs in binding.get_host_cpu_features() or not hits else []
+    target = {
+        "triple": binding.get_process_triple(),
+        "cpu": name,
+        "features": "",
+        "needs": features,
+    }
+    (tmp_path / "built" / "target.json").write_text(json.dumps(target))
+    write(tmp_path / "b", "1.0")
+    source = tmp_path / "b" / "kernels.py"
+    top = SHIPPED.format(shipped=str(tmp_path / "built"))
+    (tmp_path / "b" / "main.py").write_text(f"{top}from kernels import one\n")
+    empty = {"NUMBA_CACHE_DIR": str(tmp_path / "empty")}
+    assert source.is_file()
+    assert call(tmp_path / "b", "main", 2.0, **empty) == hits
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_is_told_how_far_compiling_is(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import numba
+
+    monkeypatch.setitem(globals(), "inner", numba.njit(lambda x: x + 1.0))
+    outer = numba.njit(lambda x: inner(x) * 2.0)
+    stream = Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert len(kernels_needed(outer)) == 2
+    assert outer(1.0) == 4.0
+    assert not kernels_needed(outer)
+    lines = [line.rstrip() for line in stream.getvalue().split("\r")]
+    if not terminal:
+        assert lines == [""]
+        return
+    for count in ("0 of 2", "1 of 2"):
+        assert any(f"Compiling solvers, once for this version: {count}," in line for line in lines)
+    assert lines[-2:] == ["", ""]  # the line is left empty

@@ -38,6 +38,7 @@ def test_examples_are_looked_for_in_every_package() -> None:
     } <= set(MODULES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_run(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

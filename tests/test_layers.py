@@ -66,6 +66,7 @@ def test_the_root_holds_at_most_eight_modules() -> None:
     assert len(list(PACKAGE.glob("*.py"))) <= 8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layer", layers())
 def test_a_layer_imports_only_what_stands_above_it(layer: str) -> None:
     found = [

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pytest
 from support.timing import ratio, timed_process
+from support.wheels import build_wheel, source_files
+
+import cadalign
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {
@@ -45,69 +47,46 @@ def python(code: str) -> str:
     return done.stdout
 
 
+def test_version_is_the_same_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert project["version"] == cadalign.__version__
+    assert f"\nversion: {cadalign.__version__}\n" in citation
+    assert project["urls"]
+
+
+def test_dir_lists_public_names_and_nothing_else() -> None:
+    names = dir(cadalign)
+    assert names == sorted({*cadalign.__all__, "__version__"})
+    assert {"fit", "align", "Library", "Observation", "View", "Model", "shapes"} <= set(names)
+    for name in names:
+        getattr(cadalign, name)
+
+
 # --- the wheel -------------------------------------------------------------------------------
-
-
-def build_command(source: Path, out: Path) -> list[str]:
-    """Build with the setuptools at hand if it is new enough, otherwise fetch one."""
-    try:
-        recent = int(version("setuptools").split(".")[0]) >= 77
-        version("build")
-    except PackageNotFoundError:
-        recent = False
-    if recent:
-        options = ["build", "--wheel", "--no-isolation", "--outdir", str(out)]
-    else:
-        options = ["pip", "wheel", "--no-deps", "--quiet", "--wheel-dir", str(out)]
-    return [sys.executable, "-m", *options, str(source)]
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """A wheel built from a copy of the source, so that nothing old in `build/` gets into it."""
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
-    source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    ignore = shutil.ignore_patterns("__pycache__", "node_modules")
-    for name in ("cadalign", "datasets", "render"):
-        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=ignore)
-    done = subprocess.run(
-        build_command(source, folder / "out"), capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    (path,) = (folder / "out").glob("*.whl")
-    return zipfile.ZipFile(path)
+    return zipfile.ZipFile(build_wheel(tmp_path_factory.mktemp("wheel")))
 
 
-def source_files() -> set[str]:
-    """Every Python file, named as it is to be installed."""
-    files = set()
-    for folder, prefix in (("cadalign", ""), ("datasets", "cadalign/"), ("render", "cadalign/")):
-        for path in (ROOT / folder).rglob("*.py"):
-            name = path.relative_to(ROOT).as_posix()
-            if not name.startswith(("cadalign/datasets/", "cadalign/render/")):
-                files.add(prefix + name)
-    return files
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_only_top_level_name_of_the_wheel_is_cadalign(wheel: zipfile.ZipFile) -> None:
     names = {name.split("/")[0] for name in wheel.namelist()}
     assert {name for name in names if not name.endswith(".dist-info")} == {"cadalign"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wheel_holds_every_module_and_nothing_twice(wheel: zipfile.ZipFile) -> None:
     names = [name for name in wheel.namelist() if name.endswith(".py")]
     assert len(names) == len(set(names))
-    assert set(names) == source_files()
+    assert set(names) == set(source_files())
     packages = {"", "cli/", "datasets/", "datasets/sample/", "evaluation/", "render/", "solvers/"}
     assert {f"cadalign/{package}__init__.py" for package in packages} <= set(names)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wheel_is_typed_and_brings_the_command(wheel: zipfile.ZipFile) -> None:
     names = wheel.namelist()
     assert "cadalign/py.typed" in names
@@ -115,7 +94,7 @@ def test_wheel_is_typed_and_brings_the_command(wheel: zipfile.ZipFile) -> None:
     assert "cadalign = cadalign.cli:main" in wheel.read(entry_points).decode()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wheel_works_without_the_source_tree(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     wheel.extractall(tmp_path)
     code = (
@@ -141,6 +120,16 @@ def test_command_line_brings_nothing_heavy_before_it_runs() -> None:
     assert (HEAVY - {"rich", "tyro"}) & loaded == set()
 
 
+def test_align_brings_none_of_scipys_large_packages() -> None:
+    code = (
+        "import json, sys, cadalign; cadalign.align, cadalign.Model, cadalign.ShapeModel, "
+        "cadalign.View; print(json.dumps(sorted(sys.modules)))"
+    )
+    loaded = {".".join(name.split(".")[:2]) for name in json.loads(python(code))}
+    large = ("interpolate", "linalg", "optimize", "sparse", "spatial", "special", "stats")
+    assert loaded & {f"scipy.{name}" for name in large} == set()
+
+
 @pytest.mark.timing
 def test_import_is_quick() -> None:
     # NumPy is two thirds of it; SciPy would make it 5 times NumPy.
@@ -156,7 +145,7 @@ FIRST_FIT = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timing
 def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled(tmp_path: Path) -> None:
     # What no code with a compiled function can avoid: to import Numba and to read one from disk.
@@ -171,6 +160,7 @@ def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled(tmp_path:
     assert ratio(timed_process(FIRST_FIT), timed_process(plain), below=1.5) < 1.5
 
 
+@pytest.mark.long
 def test_everything_that_is_promised_is_there() -> None:
     code = "import cadalign; print([hasattr(cadalign, name) for name in cadalign.__all__])"
     assert "False" not in python(code)
@@ -178,6 +168,7 @@ def test_everything_that_is_promised_is_there() -> None:
     assert "function fit" in python(code)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     ["datasets.KeypointNet", "solvers.aepnp", "render.RaycastRenderer", "metrics.rotation_error"],
@@ -187,6 +178,7 @@ def test_names_resolve_after_a_bare_import(name: str) -> None:
     assert python(code).strip() == name.partition(".")[2]
 
 
+@pytest.mark.long
 def test_listing_names_what_is_public_and_nothing_foreign() -> None:
     code = """
 import json, cadalign

@@ -14,7 +14,7 @@ import cadalign
 from cadalign.cli import main
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+DOCUMENTS = [*ROOT.glob("*.md")]  # those in docs: tests/docs/test_site.py
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
@@ -22,6 +22,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.long
 def test_python_snippets_run_and_find_the_stretch() -> None:
     names: dict[str, Any] = {}
     for block in blocks("python"):
@@ -33,6 +34,7 @@ def test_python_snippets_run_and_find_the_stretch() -> None:
     assert not result.warnings
 
 
+@pytest.mark.slow
 def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
     assert {"demo", "fit"} <= commands

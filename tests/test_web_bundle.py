@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from support.web import QUIET, WEB, copy_with_modules, npm_or_skip
 
-import cadalign.web
 from cadalign.web import asset
 
-WEB = Path(cadalign.web.__file__).parent
 PAGES = ("report", "annotate")
 
 
 @pytest.fixture(scope="module")
 def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of bundles made anew from a copy of the sources."""
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm here; on Debian: apt-get install npm")
-    copy = tmp_path_factory.mktemp("web") / "web"
-    shutil.copytree(WEB, copy, ignore=shutil.ignore_patterns("node_modules", "dist", "__pycache__"))
-    quiet = {**os.environ, "npm_config_update_notifier": "false"}
-    if (WEB / "node_modules").is_dir():
-        (copy / "node_modules").symlink_to(WEB / "node_modules")
-    else:
-        command = [npm, "ci", "--no-audit", "--no-fund"]
-        installed = subprocess.run(command, cwd=copy, env=quiet, capture_output=True, text=True)
-        if installed.returncode:
-            pytest.skip(f"npm ci cannot get the packages here: {installed.stderr.strip()[-300:]}")
-    built = subprocess.run(
-        [npm, "run", "build"], cwd=copy, env=quiet, capture_output=True, text=True
-    )
+    copy = copy_with_modules(tmp_path_factory.mktemp("web"))
+    command = [npm_or_skip(), "run", "build"]
+    built = subprocess.run(command, cwd=copy, env=QUIET, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
     return copy / "dist"
 
 
+@pytest.mark.long
 def test_bundles_are_those_of_the_sources(rebuilt: Path) -> None:
     committed = {path.name: path.read_bytes() for path in (WEB / "dist").iterdir()}
     made = {path.name: path.read_bytes() for path in rebuilt.iterdir()}

@@ -23,6 +23,7 @@ process.stdout.write(JSON.stringify(warpOf(warp, bounds)(points)));
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 20])
 def test_page_warps_as_python_does(count: int) -> None:
     node = shutil.which("node")

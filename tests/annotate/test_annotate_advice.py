@@ -14,13 +14,15 @@ from support.annotating import Case, place_all, served
 
 from cadalign import Camera, Model, View
 from cadalign.annotate.advice import Marked, rank
-from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.result_text import evidence_text, left_text
 from cadalign.annotate.session import Session
 from cadalign.fitting.joint.advice import Advice, rank_evidence
 from cadalign.render import cast_geometry
+
+pytestmark = pytest.mark.long
 
 
 def asked(session: Session) -> dict[str, Any]:
@@ -51,6 +53,7 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
             points_3d=np.vstack([session.registry.xyz(keypoints), suggestion.point.xyz]),
             ids=[*keypoints, "next"],
             mesh=session.model.scene.mesh,
+            scale_prior_sigma=LIKELY_STRETCH,
         ),
         View(camera, uv, ids=keypoints, sigma=sigma),
         alignment,

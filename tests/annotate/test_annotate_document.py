@@ -90,6 +90,7 @@ def edited(document: Document, edit: int, which: int) -> Document:
     return replace(document, focal=FocalChoice(known=which % 2 == 0, pixels=100.0 + which))
 
 
+@pytest.mark.long
 @given(EDITS)
 def test_undo_leads_back_through_every_document_and_redo_forth(
     edits: list[tuple[int, int]],

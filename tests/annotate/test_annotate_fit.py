@@ -152,6 +152,7 @@ def test_wrong_pairs_are_named_with_how_far_they_are_off(wrong: tuple[int, ...])
         assert live.outliers[row] == pytest.approx(true[row], abs=12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("choice", [KNOWN, UNKNOWN])
 def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
     suspected = 0
@@ -163,6 +164,7 @@ def test_pairs_that_agree_are_not_suspected(choice: FocalChoice) -> None:
     assert suspected <= 0.005 * seeds * 36
 
 
+@pytest.mark.long
 def test_one_wrong_pair_is_found_among_few() -> None:
     found = alone = 0
     for seed in range(40):
@@ -198,6 +200,7 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
     return again.covariance
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("focal", ["known", "estimate"])
 @given(st.integers(0, 10_000))
 @settings(max_examples=15)
@@ -255,6 +258,7 @@ def test_equally_good_candidates_give_the_first() -> None:
 # --- derivatives -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 @settings(max_examples=20)
 def test_projection_jacobian_matches_differences(seed: int) -> None:

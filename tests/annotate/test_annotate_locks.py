@@ -24,6 +24,8 @@ from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.io.observation import Observation
 
+pytestmark = pytest.mark.long
+
 PROGRAM = "import sys; from cadalign.cli import main; sys.exit(main())"
 LOCK = "*annotate-lock"
 
@@ -157,13 +159,15 @@ def locks_of(case: Case, **options: Any) -> WriterLocks:
 def test_other_photos_and_other_models_are_free(case: Case) -> None:
     model = case.folder / "table.ply"
     shutil.copy(case.model, model)
-    options = SessionOptions(case.photo, model, observation=case.folder / "table of photo.json")
+    options = SessionOptions(
+        image=case.photo, model=model, observation=case.folder / "table of photo.json"
+    )
     files = find_session_files(options)
     with locks_of(case), WriterLocks(files.written, whole_folder=False, address=""):
         pass
     # The same model's keypoints are one file, whatever the photo.
     shutil.copy(case.photo, case.folder / "other.png")
-    options = SessionOptions(case.folder / "other.png", case.model)
+    options = SessionOptions(image=case.folder / "other.png", model=case.model)
     files = find_session_files(options)
     locks = WriterLocks(files.written, whole_folder=False, address="")
     with locks_of(case):

@@ -70,6 +70,7 @@ def test_pick_on_a_polygon_counts_its_first_triangle() -> None:
     assert point.face_index is None  # no weights of the first triangle name it
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**31))
 def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -158,7 +159,7 @@ def test_display_bytes_hold_triangles_normals_and_colours() -> None:
     assert set(data[-36:]) == {round(0.7 * 255)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_million_faces_are_shown_decimated_and_picked_exactly() -> None:
     mesh = sphere(1000, dent=0.1)
     assert len(mesh.faces) == 2_000_000
@@ -170,7 +171,7 @@ def test_two_million_faces_are_shown_decimated_and_picked_exactly() -> None:
     assert 75_000 < header["shown"] <= 150_000
     rng = np.random.default_rng(1)
     for face in rng.integers(0, 2_000_000, 50).tolist():
-        target = mesh.triangles[face].mean(axis=0)
+        target = mesh.vertices[mesh.faces[face]].mean(axis=0)
         outwards = target - model.center
         point = model.pick(model.center + 4 * outwards, -outwards)
         assert point is not None
@@ -220,6 +221,7 @@ def test_lines_behind_the_camera_are_left_out() -> None:
 # --- the keypoints that come with a model ----------------------------------------------------
 
 
+@pytest.mark.long
 def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> None:
     annotated = KeypointNet(sample_root)["chair", "sample_chair_000"]
     assert annotated.mesh_path is not None

@@ -33,6 +33,7 @@ def write_observation(path: Path, case: Case, image: Path | None) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_every_photo_of_a_folder_keeps_its_own_pairs(case: Case) -> None:
     folder = case.folder / "awkward"
     folder.mkdir()
@@ -63,6 +64,7 @@ def test_longest_names_are_shortened_apart_and_others_kept() -> None:
     assert file_name("b" * 250, ".json") == "b" * 250 + ".json"
 
 
+@pytest.mark.long
 def test_model_of_a_long_name(case: Case) -> None:
     model = case.folder / f"{'m' * 248}.ply"
     shutil.copy(case.model, model)
@@ -90,6 +92,7 @@ def test_photo_alone_or_among_others_has_its_usual_name(tmp_path: Path) -> None:
     assert observation_file(photo, tmp_path).name == "x.json"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["x.unfinished", "x.keypoints", "x.jpg", "x"])
 def test_file_of_an_earlier_session_is_found_under_its_name(case: Case, name: str) -> None:
     photo = case.folder / f"{name}.jpg"
@@ -104,6 +107,7 @@ def test_file_of_an_earlier_session_is_found_under_its_name(case: Case, name: st
     assert page_state(other, 0)["pairs"] == []
 
 
+@pytest.mark.long
 def test_photos_of_one_name_in_two_folders_do_not_share_a_file(case: Case) -> None:
     second, third = (case.folder / name / case.photo.name for name in ("second", "third"))
     for copy in (second, third):
@@ -121,6 +125,7 @@ def test_photos_of_one_name_in_two_folders_do_not_share_a_file(case: Case) -> No
     assert message.endswith("give another --observation or --out")
 
 
+@pytest.mark.long
 def test_observation_whose_photo_was_renamed_with_it_is_kept(case: Case) -> None:
     write_observation(case.observation, case, case.folder / "former name.png")
     assert len(page_state(case.open(), 0)["pairs"]) == len(case.clicks)
@@ -137,6 +142,7 @@ def test_observation_in_another_files_place_is_refused(case: Case, name: str) ->
     assert (path.read_bytes() if path.exists() else None) == before
 
 
+@pytest.mark.long
 def test_earlier_observation_in_the_keypoints_place_is_kept(case: Case) -> None:
     photo = case.folder / "sample_chair_000.keypoints.png"
     shutil.copy(case.photo, photo)

@@ -16,6 +16,8 @@ from cadalign.annotate.page_state import page_state
 from cadalign.cli import main
 from cadalign.io.observation import Observation
 
+pytestmark = pytest.mark.long
+
 
 def with_exif(case: Case) -> None:
     """Give the photo a focal length of 35 mm in its EXIF data."""

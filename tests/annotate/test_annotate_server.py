@@ -53,6 +53,7 @@ def act(access: Access, body: str = UNDO, **options: str) -> int:
 PATHS = ["/", "/annotate.js", "/annotate.css", "/model", "/photo/0", "/state/0", "/advice/0"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", PATHS)
 def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
     status, headers, body = ask(access, path)
@@ -202,6 +203,7 @@ def test_a_body_of_100_mb_is_refused_without_reading_it(access: Access) -> None:
     assert sent < 10
 
 
+@pytest.mark.slow
 def test_an_endless_body_is_cut_off(access: Access) -> None:
     chunk = b"4000\r\n" + 0x4000 * b"x" + b"\r\n"
     status, sent = answer_to(access, post_head(access, "Transfer-Encoding: chunked"), chunk, 200)

@@ -25,6 +25,8 @@ from cadalign.datasets import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.io.observation import Observation
 
+pytestmark = pytest.mark.long
+
 # Down onto the seat, in the page's coordinates.
 FROM_ABOVE = {"origin": [0.02, 3, 0.03], "direction": [0, -1, 0]}
 

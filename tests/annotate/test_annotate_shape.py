@@ -19,8 +19,9 @@ from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ImageEvidence
 from cadalign.shapes.examples import Example
+
+pytestmark = pytest.mark.long
 
 LACKING = 2  # keypoints of the model that the learned shape does not know
 
@@ -263,15 +264,3 @@ def test_a_stored_shape_is_named_where_it_is_not_used(
         caplog.clear()
         for file in case.folder.glob("photo*.json"):
             file.unlink()
-
-
-def test_evidence_that_would_be_lost_is_refused(case: Case) -> None:
-    instance = case.instance
-    Observation(
-        instance.points_3d,
-        instance.points_2d,
-        instance.camera,
-        evidence=ImageEvidence(up=np.array([0.0, -1.0, 0.0])),
-    ).save(case.observation)
-    with pytest.raises(CadalignError, match="evidence beyond keypoints"):
-        case.open()

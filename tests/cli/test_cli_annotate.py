@@ -26,6 +26,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return refusal_line(capsys, "annotate", *arguments, "--no-open")
 
 
+@pytest.mark.long
 def test_it_serves_until_interrupted(case: Case) -> None:
     program = "import sys; from cadalign.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "annotate", "--no-open"]

@@ -117,6 +117,7 @@ def test_options_stored_in_the_file_are_used(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flags", "stored", "prior"),
     [
@@ -507,6 +508,7 @@ def run_process(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
+@pytest.mark.long
 def test_installed_command_runs_and_refuses(tmp_path: Path) -> None:
     path = write_observation(tmp_path / "chair.json")
     done = run_process("fit", str(path), "--json")

@@ -13,11 +13,13 @@ import pytest
 from support.refusals import refusal_line
 from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
 
-from cadalign import AlignResult, Model, Size, View, align
+from cadalign import Alignment, AlignResult, Model, Size, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.overlay import EST_COLOR
 
@@ -81,6 +83,7 @@ def test_json_lists_the_contributions(tmp_path: Path, capsys: pytest.CaptureFixt
     assert data["contributions"][0]["std_without"]["rotation_deg"] is None
 
 
+@pytest.mark.slow
 def test_views_of_a_rig_share_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     places = (0.0, 20.0, 40.0)
     rows = (slice(0, 6), slice(3, 9), slice(9, 10))
@@ -146,15 +149,49 @@ def test_depths_of_keypoints_are_used(tmp_path: Path) -> None:
     assert found == expected.alignment
 
 
-def test_mask_sharpens_the_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def write_box(folder: Path, truth: Alignment) -> np.ndarray:
+    """Write box.obj and the mask.png of its pose; returns its corners (8, 3)."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
     quads = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
     lines = [f"v {x} {y} {z}" for x, y, z in corners]
     lines += [f"f {a} {b} {c} {d}" for a, b, c, d in quads]
-    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    (folder / "box.obj").write_text("\n".join(lines) + "\n")
+    mask = cast_geometry(Scene(load_mesh(folder / "box.obj")), CAMERA, truth).mask
+    cv2.imwrite(str(folder / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+    return corners
+
+
+@pytest.mark.long
+def test_mask_alone_is_fitted_from_the_start_in_the_file(tmp_path: Path) -> None:
     truth = truth_of((1.0, 0.7, 1.5))
-    mask = cast_geometry(Scene(load_mesh(tmp_path / "box.obj")), CAMERA, truth).mask
-    cv2.imwrite(str(tmp_path / "mask.png"), np.where(mask, 255, 0).astype(np.uint8))
+    write_box(tmp_path, truth)
+    turn = rotation_from_vector(np.radians([1.5, -2.0, 1.0]))
+    start = Alignment(turn @ truth.rotation, truth.translation * 1.01, truth.scale * [1, 1.03, 1])
+    image = ObservedImage(
+        np.empty((0, 3)),
+        np.empty((0, 2)),
+        CAMERA,
+        evidence=ImageEvidence(mask=tmp_path / "mask.png"),
+    )
+    path = write(tmp_path, image, model=tmp_path / "box.obj", init=start)
+    assert main(["fit", str(path)]) == 0
+    found = result_in(tmp_path).alignment
+    assert rotation_error(est=found, gt=truth) < 0.5 * rotation_error(est=start, gt=truth)
+    np.testing.assert_allclose(found.scale, truth.scale, rtol=0.02)
+
+
+def test_start_is_where_keypoints_are_aligned_from(tmp_path: Path) -> None:
+    path = write(tmp_path, observed(), init=TRUTH)
+    assert main(["fit", str(path)]) == 0
+    found = result_in(tmp_path).alignment
+    expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d), init=TRUTH)
+    assert found == expected.alignment
+
+
+@pytest.mark.slow
+def test_mask_sharpens_the_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = truth_of((1.0, 0.7, 1.5))
+    corners = write_box(tmp_path, truth)
     noise = np.random.default_rng(0).normal(0, 1, (7, 2))
     pixels = CAMERA.project(truth.apply(corners[:7])) + noise
     evidence = ImageEvidence(mask=tmp_path / "mask.png")

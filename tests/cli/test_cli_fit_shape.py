@@ -68,6 +68,7 @@ def has_color(path: Path, color: tuple[int, int, int]) -> bool:
 # --- what it does ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_learned_shape_gives_the_numbers_of_align(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
@@ -99,6 +100,7 @@ def test_json_is_that_of_the_file(
     assert data["method"] == "align"
 
 
+@pytest.mark.long
 def test_keypoints_are_found_by_name_and_need_no_xyz(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +165,7 @@ def test_robust_search_works_with_shapes(
     assert expected.inliers[0].tolist() == [k != 2 for k in range(8)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("source", ["observation", "training"])
 def test_warped_mesh_is_drawn(tmp_path: Path, source: str) -> None:
     (tmp_path / "model.obj").write_text(TETRAHEDRON)
@@ -182,6 +185,7 @@ def test_warped_mesh_is_drawn(tmp_path: Path, source: str) -> None:
     assert (bare != drawn).any(axis=2).mean() > 0.01  # the box takes 0.07 of the image
 
 
+@pytest.mark.long
 def test_training_mesh_that_is_gone_is_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -278,6 +282,7 @@ def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "flags",
     [

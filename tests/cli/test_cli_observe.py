@@ -80,6 +80,7 @@ def test_photo_and_detection_become_an_observation(
     assert json.loads(out.read_text())["image"] == "photo.jpg"
 
 
+@pytest.mark.slow
 def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,7 +193,7 @@ def test_csv_goes_the_same_way(folder: Path) -> None:
             ["--camera", "{folder}/found.json"],
             "{folder}/found.json: camera: expected an object, got list",
         ),
-        (["--image", "{folder}/photo.jpg", "--object", "3"], "number: object 3 of 1; "),
+        (["--image", "{folder}/photo.jpg", "--object", "3"], "--object: object 3 of 1; "),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(

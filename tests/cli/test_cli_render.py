@@ -40,6 +40,7 @@ def _run(model, *arguments, renderer="raycast"):
     return command.run()
 
 
+@pytest.mark.long
 def test_the_renderer_that_really_drew_is_named(tmp_path, capsys):
     if not probe_renderer("pyrender").works:
         pytest.skip("pyrender does not work here")
@@ -101,6 +102,20 @@ def test_an_mp4_is_a_turntable(model, tmp_path):
     assert np.abs(frames[0] - frames[1]).max() > 40
 
 
+@pytest.mark.parametrize("ending", [".webm", ".gif"])
+def test_other_movies_are_turntables_too(model, tmp_path, ending):
+    out = tmp_path / f"t{ending}"
+    _run(model, "--out", out, "--size", "80x60", "--seconds", 0.3, "--fps", 10)
+    assert out.stat().st_size > 100
+
+
+def test_a_jpg_is_a_still(model, tmp_path):
+    out = tmp_path / "s.jpg"
+    _run(model, "--out", out, "--size", "80x60")
+    assert out.read_bytes()[:2] == b"\xff\xd8"
+    assert _pixels(out).shape[:2] == (60, 80)
+
+
 def test_a_camera_file_gives_the_view(model, tmp_path):
     camera = Camera.from_fov(120, 90, fov_x=40)
     view = CameraView(camera, look_at(azimuth=90, elevation=0, distance=2))
@@ -116,6 +131,7 @@ def test_a_camera_file_gives_the_view(model, tmp_path):
     assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
 
 
+@pytest.mark.long
 def test_the_stretch_shows(model, tmp_path):
     extents = []
     for scale in ((1, 1, 1), (1, 0.5, 1)):
@@ -126,6 +142,7 @@ def test_the_stretch_shows(model, tmp_path):
     assert extents[0] / extents[1] == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.long
 def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
     corner = [0.2, 0.4, -0.3]
     (tmp_path / "points.json").write_text(json.dumps([corner]))
@@ -214,7 +231,7 @@ def test_bad_meshes_are_refused_by_name(tmp_path, text, message):
     assert "bad.obj" in str(caught.value)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_million_faces_are_drawn(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=8)
     assert len(ball.faces) > 1_000_000
@@ -281,7 +298,7 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
         assert "set NUMBA_CACHE_DIR" in compiled_cache()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_doctor_runs_for_real():
     code = "from cadalign.cli.doctor import Doctor; raise SystemExit(Doctor(json=True).run())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

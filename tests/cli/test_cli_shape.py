@@ -14,6 +14,7 @@ from cadalign.cli import main
 from cadalign.datasets import write_sample_dataset
 
 
+@pytest.mark.long
 def test_learn_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sample_root = write_sample_dataset(tmp_path / "sample", per_category=5, categories=["chair"])
     out = tmp_path / "shapes" / "chair.shape"

@@ -28,6 +28,7 @@ def random_mask(seed: int) -> np.ndarray:
     return mask
 
 
+@pytest.mark.long
 @given(st.integers(0, 10**6))
 def test_run_lengths_are_those_of_pycocotools(seed: int) -> None:
     mask = random_mask(seed)

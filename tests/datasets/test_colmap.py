@@ -254,6 +254,7 @@ def test_unknown_binary_model_number_is_refused(tmp_path):
         Colmap(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_binary_file_cut_anywhere_names_itself_and_the_offset(tmp_path, name):
     folder = Model(["PINHOLE", "RADIAL"], points=8).write_binary(tmp_path)

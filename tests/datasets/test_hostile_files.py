@@ -125,6 +125,7 @@ def test_texture_options_without_a_file_are_passed_over(tmp_path: Path, options:
     assert load_mesh(tmp_path / "a.obj").materials[0].texture is None
 
 
+@pytest.mark.long
 def test_texture_that_is_far_larger_than_its_file_is_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -175,6 +176,7 @@ PICKLES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PICKLES)
 def test_hostile_pickles_are_refused_quickly(tmp_path: Path, name: str) -> None:
     (tmp_path / "a.pkl").write_bytes(PICKLES[name])

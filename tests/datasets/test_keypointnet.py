@@ -338,6 +338,7 @@ def test_real_annotations_load_quickly(real):
     assert reference_seconds(loading, below=2) < 2
 
 
+@pytest.mark.long
 def test_real_annotations_load_whole(real):
     count = len(real)
     assert count == 3234
@@ -345,6 +346,7 @@ def test_real_annotations_load_whole(real):
     assert len(real.subset(split="train")) + len(real.subset(split="val")) == count
 
 
+@pytest.mark.long
 def test_real_keypoints_lie_where_their_faces_say(real):
     paths = [path for key in real.ids() for path in real.mesh_paths(*key)]
     assert sorted({path.suffix for path in paths}) == [".obj", ".ply"]

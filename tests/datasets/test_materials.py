@@ -136,6 +136,7 @@ def _color_at(frame, pose, point):
     return part[:, :, :3].reshape(-1, 3).mean(axis=0)
 
 
+@pytest.mark.long
 def test_nodes_of_a_glb_stand_where_their_transforms_put_them(renderer, tmp_path):
     _, pose, frame = _drawn(renderer, write_table_glb(tmp_path / "table.glb"))
     red = _color_at(frame, pose, (0, 0.62, 0))
@@ -145,6 +146,7 @@ def test_nodes_of_a_glb_stand_where_their_transforms_put_them(renderer, tmp_path
         assert blue[2] > blue[:2].max() + 40
 
 
+@pytest.mark.slow
 def test_vertex_colours_of_a_ply_blend(renderer, tmp_path):
     _, pose, frame = _drawn(renderer, write_painted_ply(tmp_path / "ball.ply"), azimuth=0)
     left = _color_at(frame, pose, (-0.7, 0, 0.7))
@@ -153,6 +155,7 @@ def test_vertex_colours_of_a_ply_blend(renderer, tmp_path):
     assert right[2] > right[0] + 60
 
 
+@pytest.mark.slow
 def test_an_obj_with_several_textures_shows_each_on_its_faces(renderer, tmp_path):
     _, pose, frame = _drawn(renderer, write_crate_obj(tmp_path))
     stripe = _color_at(frame, pose, (-1 + 1.5 / 16, 0, 1))
@@ -198,6 +201,7 @@ def test_a_missing_texture_is_warned_of_by_name_and_drawn_plain(tmp_path, caplog
     assert plain.min() > 60
 
 
+@pytest.mark.long
 def test_real_models_are_recognisable_alike_by_every_renderer(renderer):
     data = os.environ.get("CADALIGN_DATA")
     if not data:

@@ -124,12 +124,13 @@ def test_a_file_of_posed_photos(tmp_path):
     assert "b.jpg.camera" in str(dataset.problems["b.jpg"])
 
 
+@pytest.mark.slow
 def test_damaged_files_are_told(tmp_path):
     write_bop(tmp_path, photos=1)
     assert_damage_is_told(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ten_thousand_photos_take_little_time(tmp_path):
     write_bop(tmp_path, photos=10_000, images=False)
     camera = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}
@@ -140,6 +141,7 @@ def test_ten_thousand_photos_take_little_time(tmp_path):
     assert (summary.photos, summary.objects, summary.images) == (10_000, 10_000, 0)
 
 
+@pytest.mark.long
 def test_the_table_of_six_photos_stands_still(real_data):
     """All pairs of objects move alike from photo to photo: the truth is one table."""
     dataset = cadalign.datasets.open(real_data / "real" / "lmo_multiview")
@@ -154,6 +156,7 @@ def test_the_table_of_six_photos_stands_still(real_data):
     np.testing.assert_allclose(between, [between[0]] * 6, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_samples_of_posed_photos(real_data):
     dataset = cadalign.datasets.open(real_data / "real" / "bop_samples")
     photos = list(dataset)

@@ -136,6 +136,7 @@ def test_bad_lines_and_calibrations_do_not_stop_the_others(tmp_path):
     assert "0003.txt, line 2" in text
 
 
+@pytest.mark.slow
 def test_damaged_files_are_told(tmp_path):
     write_text(tmp_path / "label_2" / "0.txt", CAR)
     write_text(tmp_path / "calib" / "0.txt", P2)
@@ -145,7 +146,7 @@ def test_damaged_files_are_told(tmp_path):
     assert_damage_is_told(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ten_thousand_labels_take_little_time(tmp_path):
     lines = [f"{number} 1 {CAR if number % 100 != 7 else CAR[:20]}" for number in range(10_000)]
     write_text(tmp_path / "label_02" / "0003.txt", "\n".join(lines))
@@ -163,6 +164,7 @@ def test_a_folder_without_labels_is_refused(tmp_path):
         KittiCars(tmp_path)
 
 
+@pytest.mark.long
 def test_the_mean_car_in_the_true_box_lies_on_the_sample_keypoints(real_data):
     dataset = cadalign.datasets.open(real_data / "real" / "kitti_cars")
     gaps = []

@@ -195,6 +195,7 @@ def test_detections_in_photos(tmp_path):
         Pascal3DDetections(tmp_path)
 
 
+@pytest.mark.long
 def test_the_sample_photos_have_keypoints_of_their_models(real_data):
     dataset = cadalign.datasets.open(real_data / "real" / "pascal3d")
     photos = list(dataset)

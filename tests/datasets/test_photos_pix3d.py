@@ -114,7 +114,7 @@ def test_any_damage_is_told(root):
     assert_damage_is_told(root)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ten_thousand_records_take_little_memory_and_time(root):
     """One record at a time is parsed: what grows with their number is the file itself."""
     count = 10_000

@@ -56,6 +56,7 @@ def positions(model: SampleModel) -> FloatArray:
 # What is written ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_layout_is_that_of_keypointnet(root: Path, records: list[dict[str, Any]]) -> None:
     counts = Counter(record["class_id"] for record in records)
     assert counts == dict.fromkeys(CATEGORIES.values(), 12)
@@ -70,6 +71,7 @@ def test_layout_is_that_of_keypointnet(root: Path, records: list[dict[str, Any]]
             assert set(keypoint["pcd_info"]) == {"point_index"}
 
 
+@pytest.mark.slow
 def test_every_model_is_in_exactly_one_split(root: Path, records: list[dict[str, Any]]) -> None:
     lines = [
         line
@@ -80,6 +82,7 @@ def test_every_model_is_in_exactly_one_split(root: Path, records: list[dict[str,
     assert all((root / "splits" / f"{split}.txt").read_text() for split in ("train", "val", "test"))
 
 
+@pytest.mark.long
 def test_keypoints_rebuilt_from_the_file_are_where_they_say(
     root: Path, records: list[dict[str, Any]]
 ) -> None:
@@ -96,6 +99,7 @@ def test_keypoints_rebuilt_from_the_file_are_where_they_say(
             assert distance[nearest] == pytest.approx(distance.min(), abs=1e-12)
 
 
+@pytest.mark.long
 def test_file_holds_the_mesh_and_its_colours(root: Path, models: tuple[SampleModel, ...]) -> None:
     for model in models[::5]:
         path = root / "ShapeNetCore.v2.ply" / CATEGORIES[model.category] / f"{model.model_id}.ply"
@@ -150,6 +154,7 @@ def test_round_bottles_and_swivel_chairs_have_a_rotation(records: list[dict[str,
 # Repeatable and safe -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_same_seed_gives_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
     first = contents(write_sample_dataset(tmp_path / "a", per_category=2))
     again = contents(write_sample_dataset(tmp_path / "b", per_category=2))
@@ -161,6 +166,7 @@ def test_same_seed_gives_same_bytes_and_another_seed_others(tmp_path: Path) -> N
     assert all(first[name] != other[name] for name in meshes)
 
 
+@pytest.mark.long
 def test_a_model_depends_neither_on_the_count_nor_on_the_categories(
     models: tuple[SampleModel, ...],
 ) -> None:
@@ -177,6 +183,7 @@ def test_one_model_of_one_category_is_a_data_set(tmp_path: Path) -> None:
     assert (root / "splits" / "test.txt").read_text() == ""
 
 
+@pytest.mark.long
 def test_more_models_than_styles_differ_from_the_first_round() -> None:
     first, *_, second = sample_models(per_category=13, categories=["bottle"])
     assert first.mesh.vertices.shape != second.mesh.vertices.shape or not np.allclose(
@@ -184,6 +191,7 @@ def test_more_models_than_styles_differ_from_the_first_round() -> None:
     )
 
 
+@pytest.mark.long
 def test_interrupted_run_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +214,7 @@ def test_full_disk_is_a_data_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_earlier_sample_data_set_is_replaced(tmp_path: Path) -> None:
     write_sample_dataset(tmp_path / "data", per_category=2, categories=["bottle"])
     root = write_sample_dataset(tmp_path / "data", per_category=1, categories=["chair"])
@@ -259,6 +268,7 @@ def test_impossible_arguments_are_refused(
 # The models --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_models_have_diagonal_one_and_are_not_quite_centred(
     models: tuple[SampleModel, ...],
 ) -> None:
@@ -279,6 +289,7 @@ def test_faces_have_an_area_and_their_number_is_moderate(models: tuple[SampleMod
         assert len(np.unique(model.mesh.faces)) == len(model.mesh.vertices)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_parts_are_closed_and_face_outward(category: str) -> None:
     for index in range(12):
@@ -368,6 +379,7 @@ def test_keypoints_are_not_in_one_plane_and_apart(models: tuple[SampleModel, ...
         assert distances[np.triu_indices(len(points), 1)].min() > 0.005, model.model_id
 
 
+@pytest.mark.long
 def test_models_are_mirror_symmetric(models: tuple[SampleModel, ...]) -> None:
     for model in models:
         mesh = model.mesh
@@ -384,6 +396,7 @@ def test_models_are_mirror_symmetric(models: tuple[SampleModel, ...]) -> None:
                 np.testing.assert_allclose(at[right] * (-1, 1, 1), at[left], atol=1e-6)
 
 
+@pytest.mark.long
 def test_keypoints_are_seen_from_around(models: tuple[SampleModel, ...]) -> None:
     """Six are visible from most views 5 to 50 degrees up, and none is buried in the model."""
     views = np.radians([(7 + 45 * i, e) for i in range(8) for e in (5, 25, 50)])

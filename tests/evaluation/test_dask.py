@@ -27,7 +27,7 @@ distributed = pytest.importorskip(
     "distributed", reason="Dask is not installed: pip install 'cadalign[dask]'"
 )
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 KIND = SweepOptions("points", values=(8, 20), runs=600, methods=("optimal", "aepnp-paper", "limit"))
 
@@ -40,6 +40,7 @@ def cluster() -> Iterator[Any]:
         yield cluster
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_the_middle_leaves_the_bytes_as_they_are(
     tmp_path: Path, cluster: Any
 ) -> None:
@@ -110,6 +111,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.long
 def test_a_lost_scheduler_is_told_of_and_the_run_goes_on(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -142,6 +144,7 @@ def test_a_lost_scheduler_is_told_of_and_the_run_goes_on(
     assert hit.results.read_bytes() == calm.results.read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
 def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
     workers = DaskWorkers(address, timeout=1.0)

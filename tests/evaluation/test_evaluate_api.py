@@ -32,6 +32,8 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         "retrieval",
         "unseen",
         "evidence",
+        "photos",
+        "estimates",
     ]
     for options in known_options():
         spec = spec_named(options.experiment)
@@ -39,6 +41,7 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         assert len({column.key for column in spec.columns}) == len(spec.columns)
 
 
+@pytest.mark.long
 def test_retrieval(sample_root: Path) -> None:
     table = evaluate(sample_root, "retrieval", keypoints=[8], noises_px=[1.0], methods=["optimal"])
     assert set(table.protocol) == {"leave-in", "leave-out"}
@@ -46,6 +49,7 @@ def test_retrieval(sample_root: Path) -> None:
     assert (table.seconds[table.status == "ok"] > 0).all()
 
 
+@pytest.mark.long
 def test_the_demonstration(sample_root: Path, tmp_path: Path) -> None:
     table = evaluate(sample_root, "demo", categories=["car"], per_category=1, out=tmp_path)
     assert table.status.tolist() == ["ok"]

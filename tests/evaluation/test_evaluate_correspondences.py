@@ -218,6 +218,7 @@ class TestInputs:
         assert ((scale[1:] > 0.5) & (scale[1:] < 2)).all()
         assert scale[1] != scale[2]
 
+    @pytest.mark.long
     def test_moved_points_lie_all_over_the_image_and_where_its_lens_model_holds(self):
         # Its lens model folds back at 230 px from the middle: it holds in half of the image.
         camera = replace(CAMERA, distortion=(-0.7, 0.0, 0.0, 0.0))
@@ -236,6 +237,7 @@ class TestInputs:
         radius = np.linalg.norm(moved - (camera.cx, camera.cy), axis=1)
         assert (radius < 115).mean() == pytest.approx(0.25, abs=0.05)
 
+    @pytest.mark.slow
     def test_inputs_depend_on_seed_image_draw_and_share_alone(self, colmap, tmp_path):
         def rows(name, **changes):
             found = run(colmap, tmp_path / name, replace(QUICK, **changes))
@@ -360,6 +362,7 @@ class TestRows:
 
 
 class TestBrokenImages:
+    @pytest.mark.long
     def test_one_becomes_failed_rows_and_the_others_go_on(self, tmp_path, capsys, no_figures):
         root = write_colmap(tmp_path / "model", images=3, broken=(1,))
         out = tmp_path / "run"
@@ -402,7 +405,7 @@ class TestRuns:
         with pytest.raises(DataError, match="another configuration: correspondences is"):
             run(root, tmp_path / "run")
 
-    @pytest.mark.slow
+    @pytest.mark.long
     def test_results_are_the_same_bytes_with_and_without_workers(self, colmap, tmp_path):
         options = CorrespondenceOptions(ANY, outliers=(0.0, 0.4), draws=5)
         run(colmap, tmp_path / "none", options, workers=0)
@@ -435,6 +438,7 @@ class TestReport:
             assert summary["milliseconds"].median > 0
             assert math.isnan(summary["inlier_recall"]) == (summary.method == "epnp")
 
+    @pytest.mark.long
     def test_table_and_figures_are_written(self, finished):
         SPEC.write(Run.open(finished.path))
         with finished.summary.open() as file:
@@ -461,6 +465,7 @@ class TestReport:
                 file = finished.figures / f"outliers_{metric}.{ending}"
                 assert file.stat().st_size > 5000
 
+    @pytest.mark.long
     def test_a_method_that_fails_everywhere_has_no_quartiles_but_a_figure(self, colmap, tmp_path):
         folder = RunFolder(tmp_path / "run")
         # Nothing agrees to a thousandth of a pixel.
@@ -477,6 +482,7 @@ class TestReport:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_it_prints_a_table_and_where_the_run_is(self, colmap, tmp_path, capsys, no_figures):
         arguments = ["evaluate", "correspondences", str(colmap), "--outliers", "0.5", "--draws"]
         arguments += ["1", "--methods", "ransac-optimal", "--workers", "0"]
@@ -487,6 +493,7 @@ class TestCommand:
         assert "…" not in printed.out
         assert "0 of 2 rows failed" in printed.err
 
+    @pytest.mark.slow
     def test_json_is_valid_and_complete(self, colmap, tmp_path, capsys, no_figures):
         arguments = ["evaluate", "correspondences", str(colmap), "--format", "colmap", "--draws"]
         arguments += ["1", "--outliers", "0", "0.4", "--methods", "epnp", "ransac-optimal"]
@@ -542,6 +549,7 @@ class TestCommand:
 @needs_data
 @pytest.mark.parametrize("name", ["maupertuis_colmap", "balbianello"])
 class TestRealModels:
+    @pytest.mark.long
     def test_the_robust_optimum_succeeds_where_others_do_not(self, name, tmp_path):
         options = CorrespondenceOptions(
             ANY,
@@ -568,6 +576,7 @@ class TestRealModels:
         assert found[0.0, "aepnp-paper"]["success"] == 1
         assert found[0.5, "aepnp-paper"]["success"] == 0
 
+    @pytest.mark.long
     def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, name, tmp_path):
         options = CorrespondenceOptions(
             ANY, outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")

@@ -22,7 +22,7 @@ from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import SPEC
 from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
-from cadalign.evaluation.outcome import FAILED, OK
+from cadalign.evaluation.outcome import FAILED, OK, SKIPPED
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.summary import Summary, summary_csv
 from cadalign.geometry.alignment import Alignment
@@ -60,6 +60,7 @@ def evaluate(root: Path, **options: Any) -> Any:
     return cadalign.evaluate(root, workers=0, **options)
 
 
+@pytest.mark.slow
 def test_every_model_view_and_method_has_a_row(sample_root: Path) -> None:
     table = evaluate(sample_root, views_per_model=2, methods=["optimal", "epnp", "limit"])
     assert len(table) == 4 * 2 * 3
@@ -80,6 +81,7 @@ def test_without_noise_the_optimum_is_exact(sample_root: Path) -> None:
     assert (table.sym_box_iou > 1 - 1e-5).all()
 
 
+@pytest.mark.slow
 def test_symmetry_aware_errors_never_exceed_the_plain_ones(sample_root: Path) -> None:
     table = evaluate(sample_root, methods=["optimal", "epnp", "aepnp-paper"], views_per_model=3)
     assert (table.sym_rotation_error_deg <= table.rotation_error_deg + 1e-9).all()
@@ -90,14 +92,15 @@ def test_symmetry_aware_errors_never_exceed_the_plain_ones(sample_root: Path) ->
     assert (chairs.sym_rotation_error_deg == chairs.rotation_error_deg).all()
 
 
-def test_models_that_cannot_be_used_become_failed_rows(annotated: Path) -> None:
+def test_models_that_cannot_be_used_become_failed_or_skipped_rows(annotated: Path) -> None:
     table = evaluate(annotated, methods=["optimal", "aepnp", "limit"])
     assert len(table) == 4 * 3
     good = table[table.model_id == "good"]
     assert (good.status == OK).all()
     assert (good.visibility == "hull").all()
     failed = table[table.model_id != "good"]
-    assert (failed.status == FAILED).all()
+    expected = np.where(failed.model_id == "few", SKIPPED, FAILED)
+    assert (failed.status == expected).all()
     assert (failed.reason != "").all()
     reasons = failed.groupby("model_id").reason.first()
     assert "there are only 5" in reasons["few"]
@@ -113,6 +116,7 @@ def test_rays_without_a_mesh_are_a_failed_row(annotated: Path) -> None:
     assert "there is no mesh" in reason
 
 
+@pytest.mark.long
 def test_an_instance_does_not_depend_on_its_neighbours(sample_root: Path) -> None:
     methods = ("optimal", "aepnp-paper", "limit")
     options = KeypointNetOptions(sample_root, views_per_model=2, methods=methods)
@@ -157,6 +161,7 @@ def test_a_folder_without_annotations_is_an_error(tmp_path: Path) -> None:
         evaluate(tmp_path)
 
 
+@pytest.mark.long
 def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--render", "overlay", "--workers", "0", "--methods", "optimal"]
@@ -171,6 +176,7 @@ def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
     assert {path.suffix for path in (out / "figures").iterdir()} == {".png", ".pdf"}
 
 
+@pytest.mark.slow
 def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Path) -> None:
     """As the Cramer-Rao bound may state one, at much noise."""
     model = next(iter(KeypointNet(sample_root)))
@@ -182,6 +188,7 @@ def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Pat
     assert (folder.overlays / "chair_behind.png").is_file()
 
 
+@pytest.mark.long
 def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(
     annotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -189,12 +196,13 @@ def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(
     options = ["--out", run, "--workers", "0", "--methods", "optimal", "limit", "--json"]
     assert main(["evaluate", "keypointnet", str(annotated), *options]) == 3
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["rows"], printed["failed"]) == (8, 6)
+    assert [printed[name] for name in ("rows", "failed", "skipped")] == [6, 4, 2]
     assert {row["method"] for row in printed["summary"]} == {"optimal", "limit"}
     assert main(["evaluate", "show", run, "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["summary"] == printed["summary"]
 
 
+@pytest.mark.long
 def test_a_run_of_nothing_but_failures_exits_with_1(annotated: Path, tmp_path: Path) -> None:
     options = ["--min-visible", "13", "--methods", "aepnp", "--out", str(tmp_path / "run")]
     assert main(["evaluate", "keypointnet", str(annotated), "--workers", "0", *options]) == 1
@@ -217,6 +225,7 @@ def test_translation_up_to_scale_is_no_more_than_the_absolute_one(annotated: Pat
     assert (solved.translation_error_up_to_scale <= solved.translation_error + 1e-12).all()
 
 
+@pytest.mark.long
 def test_runs_without_translation_up_to_scale_still_open(annotated: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     evaluate(annotated, methods=["optimal"], out=run)
@@ -257,13 +266,22 @@ def test_failed_rows_count_against_success_and_not_in_medians() -> None:
     assert np.isnan(optimal["box_iou"])
 
 
+def test_skipped_rows_count_neither_in_medians_nor_in_success() -> None:
+    rows = [row("limit", error) for error in (1.0, 4.0)]
+    rows += [{**row("limit", None), "status": SKIPPED} for _ in range(6)]
+    (limit,) = summaries_of(rows)
+    assert (limit["instances"], limit["failed"], limit["skipped"]) == (2, 0, 6)
+    assert limit["success_10deg_10pct"] == 1.0
+    assert limit["rotation_error_deg"] == 2.5
+
+
 def test_a_category_where_all_failed_has_empty_cells() -> None:
     summaries = summaries_of([row("optimal", None)])
     assert texts(summaries[0]) == ["-"] * 6
     assert summary_csv(summaries, rename={}).splitlines()[1].startswith("chair,optimal,1,1,,,")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_optimum_beats_the_published_solver_and_is_at_the_limit(real_data: Path) -> None:
     table = evaluate(
         real_data / "keypointnet",
@@ -279,3 +297,18 @@ def test_the_optimum_beats_the_published_solver_and_is_at_the_limit(real_data: P
         )
         assert (optimal < paper).all(), category
         assert optimal.rotation_error_deg < 1.15 * limit.rotation_error_deg, category
+
+
+def test_overlays_of_models_without_meshes_are_refused_before_the_run(
+    annotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    options = ["--render", "overlay", "--workers", "0", "--out", str(out)]
+    assert main(["evaluate", "keypointnet", str(annotated), *options]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--render: none of the models has a mesh, so that there is nothing to draw" in said
+    assert not (out / "results.parquet").exists()
+    hull = [*options, "--visibility", "hull"]
+    assert main(["evaluate", "keypointnet", str(annotated), *hull]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--render: visibility hull uses no meshes" in said

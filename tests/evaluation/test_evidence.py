@@ -34,6 +34,7 @@ def car(root: Path) -> ObjectScene:
     return make_scene(model, 0, EvidenceOptions(root, noise_px=0.0))
 
 
+@pytest.mark.long
 def test_scene_is_the_same_each_time(root: Path) -> None:
     (model,) = KeypointNet(root).subset(categories=["car"])
     options = EvidenceOptions(root)
@@ -72,6 +73,7 @@ def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str
     )
 
 
+@pytest.mark.long
 def test_every_method_gives_what_it_is_named_after(car: ObjectScene, root: Path) -> None:
     options = EvidenceOptions(root)
     for method in METHODS:
@@ -87,6 +89,7 @@ def test_every_method_gives_what_it_is_named_after(car: ObjectScene, root: Path)
         assert all((view.cam_from_rig is not None) == known for view in given.views)
 
 
+@pytest.mark.long
 def test_run_resumes_and_reports(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--methods", *QUICK, "--categories", "car", "chair", "--workers", "0"]

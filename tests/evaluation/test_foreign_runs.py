@@ -92,6 +92,7 @@ def cut_timings(run: Path) -> None:
 _ANEW = "; remove it and start the same run again: what is missing is done anew"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -257,6 +258,7 @@ def _correspondences(root: Path, out: Path) -> None:
     do_run(options, RunFolder(out), workers=0, dask=None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("make", [_keypointnet, _retrieval, _correspondences])
 def test_a_finished_run_without_timings_is_shown(
     sample_root: Path, tmp_path: Path, make: Callable[[Path, Path], None]
@@ -270,6 +272,7 @@ def test_a_finished_run_without_timings_is_shown(
     assert main(["evaluate", "show", str(run)]) == code
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("assets", [[], ["--assets"]])
 @pytest.mark.parametrize("record", ["", "alert(1)", "[1]", "[" * 100_000, "{} alert(1)"])
 def test_records_that_are_no_objects_are_refused(

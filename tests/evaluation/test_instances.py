@@ -110,6 +110,7 @@ def test_instances_follow_from_seed_and_names_alone() -> None:
         assert first.shape != other.shape or not np.array_equal(first, other)
 
 
+@pytest.mark.long
 def test_the_limits_errors_have_the_cramer_rao_bound_as_their_covariance() -> None:
     rng = np.random.default_rng(0)
     problem = simulate_problem(rng, points=12, noise_px=0.0)

@@ -51,6 +51,7 @@ def table(root: Path, shapes: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return run(root, tmp_path_factory.mktemp("run") / "run", shapes)
 
 
+@pytest.mark.long
 def test_categories_with_a_shape_have_its_method(table: pd.DataFrame) -> None:
     by_category = table.groupby("category").method.agg(set)
     assert by_category["chair"] == {*METHODS, "shape"}
@@ -58,6 +59,7 @@ def test_categories_with_a_shape_have_its_method(table: pd.DataFrame) -> None:
     assert (table.status == "ok").all()
 
 
+@pytest.mark.slow
 def test_a_learned_shape_finds_pose_and_box(table: pd.DataFrame) -> None:
     found = table[table.method == "shape"]
     assert (found.rotation_error_deg < 10).all()
@@ -68,6 +70,7 @@ def test_a_learned_shape_finds_pose_and_box(table: pd.DataFrame) -> None:
     assert (found.rms_px < 5).all()
 
 
+@pytest.mark.long
 def test_other_methods_are_as_without_shapes(
     root: Path, table: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -79,6 +82,7 @@ def test_other_methods_are_as_without_shapes(
     pd.testing.assert_frame_equal(same[plain.columns], plain)
 
 
+@pytest.mark.long
 def test_records_hold_the_estimated_box(root: Path, shapes: Path, tmp_path: Path) -> None:
     found = run(root, tmp_path / "run", shapes / "chair.shape", categories=["chair"])
     chosen = found[found.method == "shape"].set_index("model_id")
@@ -105,6 +109,7 @@ def test_records_hold_the_estimated_box(root: Path, shapes: Path, tmp_path: Path
         assert all("warp" in other for other in estimate["alternatives"])
 
 
+@pytest.mark.long
 def test_the_page_shows_the_method_and_errors_up_to_scale(
     root: Path, shapes: Path, tmp_path: Path
 ) -> None:
@@ -121,6 +126,7 @@ def test_the_page_shows_the_method_and_errors_up_to_scale(
     assert {row["method"] for row in page["headline"]["rows"]} == {"optimal", "shape"}
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
 def test_box_alignment_gives_the_same_box(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,6 +140,7 @@ def test_box_alignment_gives_the_same_box(seed: int) -> None:
     np.testing.assert_allclose(box.corners, wanted.corners, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_another_shape(root: Path, shapes: Path, tmp_path: Path) -> None:
     file = tmp_path / "chair.shape"
     file.write_bytes((shapes / "chair.shape").read_bytes())

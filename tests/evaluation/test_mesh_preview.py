@@ -47,6 +47,7 @@ def test_a_light_model_stays_as_it_is_and_its_creases_are_edges() -> None:
     np.testing.assert_allclose(lengths, 1)  # no diagonals
 
 
+@pytest.mark.long
 @given(rings=st.integers(5, 60), squash=st.floats(0.01, 3.0), most=st.integers(8, 2000))
 def test_there_are_never_more_triangles_or_lines_than_asked_for(
     rings: int, squash: float, most: int
@@ -94,6 +95,7 @@ def decoded(preview: MeshPreview) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rings", [20, 200])
 def test_json_holds_the_same_to_16_bits(rings: int) -> None:
     preview = preview_of(sphere(rings), max_faces=200_000)
@@ -114,6 +116,7 @@ def test_a_sketch_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         write_preview(tmp_path / "no" / "such.json", cube())
 
 
+@pytest.mark.long
 def test_real_models_keep_their_extent(real_data: Path) -> None:
     dataset = KeypointNet(real_data / "keypointnet").subset(with_mesh=True)
     for model in dataset:

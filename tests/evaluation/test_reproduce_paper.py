@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from cadalign.evaluation.simulation.options import SWEEPS, SweepKind
 SCRIPT = Path(__file__).parents[2] / "scripts" / "reproduce_paper.py"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_everything_is_in_one_folder_beside_the_papers_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -44,6 +45,14 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
         assert f"figures/{picture}.png" in report
     for link in (part.split(")")[0] for part in report.split("](")[1:]):
         assert (tmp_path / link).is_file(), link
+    page = (tmp_path / "index.html").read_text()
+    assert page.count("<table>") == sum(
+        line.startswith("|---") for line in report.replace("| ---", "|---").splitlines()
+    )
+    pictures = re.findall(r'<img src="([^"]+)"', page)
+    assert all((tmp_path / picture).is_file() for picture in pictures)
+    assert f"figures/{picture}.png" in pictures
+    assert not re.search(r'(?:src|href)="(?:https?:)?//', page)
     with (tmp_path / "table1.csv").open() as file:
         rows = list(csv.DictReader(file))
     stated = [row for row in rows if "stated" in row["method"]]
@@ -60,6 +69,7 @@ def test_the_papers_table_is_as_stated() -> None:
     assert (bottle.rotation_error_deg, bottle.scale_z_error) == (7.004, 0.107)
 
 
+@pytest.mark.long
 def test_the_script_explains_itself() -> None:
     shown = subprocess.run(
         [sys.executable, str(SCRIPT), "--help"], capture_output=True, text=True, check=True
@@ -67,6 +77,7 @@ def test_the_script_explains_itself() -> None:
     assert "--quick" in shown.stdout
 
 
+@pytest.mark.long
 def test_the_script_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     shown = subprocess.run(

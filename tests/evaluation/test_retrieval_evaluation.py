@@ -31,6 +31,8 @@ from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.shape import distances
 
+pytestmark = pytest.mark.slow
+
 QUICK = RetrievalRunOptions(Path(), noises_px=(1.0,), keypoints=(6, 8))
 
 
@@ -115,6 +117,7 @@ class TestQueries:
 
 
 class TestRows:
+    @pytest.mark.long
     def test_there_is_one_for_each_query_protocol_and_method(self, finished: RunFolder) -> None:
         rows = rows_of(finished)
         assert len(rows) == 30 * 2 * 2 * 2
@@ -203,6 +206,7 @@ class TestRows:
 
 
 class TestRuns:
+    @pytest.mark.long
     def test_bytes_are_the_same_with_workers_and_after_a_crash(
         self, finished: RunFolder, library: Path, tmp_path: Path
     ) -> None:
@@ -346,6 +350,7 @@ class TestSummaries:
         assert np.isnan([summary["box_iou_up_to_scale"] for summary in summaries]).all()
         assert np.isfinite([summary["box_iou"] for summary in summaries]).all()
 
+    @pytest.mark.long
     def test_table_and_figures_are_written(self, finished: RunFolder) -> None:
         summaries = SPEC.write(Run.open(finished.path))
         with finished.summary.open() as file:
@@ -365,6 +370,7 @@ class TestSummaries:
 
 @pytest.mark.usefixtures("no_figures")
 class TestCommand:
+    @pytest.mark.long
     def test_a_run_is_made_and_shown_again(
         self, library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -394,7 +400,7 @@ class TestCommand:
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path: Path) -> None:
     options = RetrievalRunOptions(
         real_data / "keypointnet",

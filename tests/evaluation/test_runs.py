@@ -105,6 +105,7 @@ def run_squares(
     return read_table(folder.results).to_pylist()
 
 
+@pytest.mark.long
 def test_results_are_in_the_order_of_the_tasks_whatever_the_workers(tmp_path: Path) -> None:
     rows = run_squares(tmp_path / "none", Squares())
     assert [row["task"] for row in rows] == list(range(100))
@@ -122,7 +123,7 @@ def test_tasks_that_raise_become_failed_rows_and_spare_the_others(tmp_path: Path
     assert len(rows) == 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_task_that_kills_its_workers_becomes_a_failed_row(tmp_path: Path) -> None:
     rows = run_squares(tmp_path, Squares(kills=(5, 60)), workers=2)
     failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
@@ -130,7 +131,7 @@ def test_a_task_that_kills_its_workers_becomes_a_failed_row(tmp_path: Path) -> N
     assert [row["task"] for row in rows] == list(range(100))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_that_dies_once_costs_nothing_but_a_retry(tmp_path: Path) -> None:
     run_squares(tmp_path / "calm", Squares())
     run_squares(tmp_path / "hit", Squares(kills_once=(20, 71), scratch=tmp_path), workers=2)
@@ -140,7 +141,7 @@ def test_a_worker_that_dies_once_costs_nothing_but_a_retry(tmp_path: Path) -> No
     assert calm.read_bytes() == hit.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workers_that_cannot_live_end_the_run_with_a_reason(tmp_path: Path) -> None:
     with pytest.raises(CadalignError, match="die before they are given any task"):
         run_squares(tmp_path, Squares(dead_on_arrival=True), workers=1)
@@ -151,6 +152,7 @@ def test_what_no_task_survives_ends_the_run(tmp_path: Path) -> None:
         run_squares(tmp_path, Squares(full_disk=True))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
     done: list[int] = []
 
@@ -183,6 +185,7 @@ def of_another_schema(path: Path) -> None:
     write_rows(path, (("task", str),), [{"task": "a"}])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", [Path.unlink, cut_short, of_another_schema])
 @pytest.mark.parametrize("table", ["", ".timings"])
 def test_damaged_chunks_are_noticed_at_the_start_and_done_again(
@@ -275,6 +278,7 @@ def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
         run_squares(tmp_path / "file" / "run", Squares())
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_no_half_files_and_the_run_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -322,7 +326,7 @@ def test_a_chunk_with_a_failing_task_keeps_its_order() -> None:
     assert [row["task"] for row in result.rows] == [1, 2, 3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timing
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="needs Linux's /proc")
 def test_workers_end_soon_after_their_run_is_killed(tmp_path: Path) -> None:
@@ -356,11 +360,11 @@ def processes_with(tag: bytes) -> list[str]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_real_run_killed_ten_times_ends_with_the_same_bytes(tmp_path: Path) -> None:
     write_annotations(tmp_path / "data", models=120)
     calm, killed = tmp_path / "calm", tmp_path / "killed"
-    assert subprocess.run(command(tmp_path, calm, workers=2), check=False).returncode == 3
+    assert subprocess.run(command(tmp_path, calm, workers=2), check=False).returncode == 0
     rng = random.Random(0)
     kills = 0
     while kills < 10:
@@ -375,7 +379,7 @@ def test_a_real_run_killed_ten_times_ends_with_the_same_bytes(tmp_path: Path) ->
         process.send_signal(signal.SIGKILL)
         process.wait()
         kills += 1
-    assert subprocess.run(command(tmp_path, killed, workers=2), check=False).returncode == 3
+    assert subprocess.run(command(tmp_path, killed, workers=2), check=False).returncode == 0
     assert kills == 10
     for name in ("results.parquet", "exhibits.parquet", "summary.csv", "run.json"):
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name

@@ -68,6 +68,7 @@ def test_another_seed_gives_other_problems() -> None:
     assert not np.array_equal(first.points_2d, other.points_2d)
 
 
+@pytest.mark.slow
 def test_the_optimum_is_at_the_limit_and_the_published_solver_above() -> None:
     table = simulate("noise", values=[2], runs=60, methods=["optimal", "aepnp-paper", "limit"])
     medians = table.groupby("method").rotation_error_deg.median()
@@ -120,6 +121,7 @@ def test_bad_options_are_named(sweep: str, options: dict[str, Any], message: str
         SweepOptions(sweep, **options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sweep", list(SWEEPS))
 def test_the_command_writes_a_table_and_a_figure_for_each_metric(
     sweep: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

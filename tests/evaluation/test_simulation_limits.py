@@ -19,6 +19,8 @@ from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
+pytestmark = pytest.mark.slow
+
 PROBLEMS = 2000
 DRAWS = 40
 KEYPOINT_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -143,7 +145,7 @@ def assert_at_the_limit(problems: list[Problem], noise_px: float) -> None:
 # --- the table -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("points", "noise_px"),
     [(6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0)],
@@ -174,7 +176,7 @@ def real_problems(real_data: Path, category: str, count: int) -> Iterator[Proble
         yield Problem(points_3d, points_2d, KEYPOINT_CAMERA, gt, None)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("category", ["chair", "airplane", "mug", "bathtub"])
 def test_errors_on_real_keypoints_are_at_the_cramer_rao_bound(
     real_data: Path, category: str
@@ -249,7 +251,7 @@ def are_modes(modes: Modes) -> np.ndarray:
     return modes.converged & (np.abs(np.log(modes.scale)) < np.log(100)).all(axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("points", "allowed"), [(6, 0.005), (7, 0.002), (10, 0.001)])
 def test_optimum_is_hardly_ever_missed(points: int, allowed: float) -> None:
     problems = simulated_row(points, 1.0)
@@ -263,7 +265,7 @@ def test_optimum_is_hardly_ever_missed(points: int, allowed: float) -> None:
     assert missed.mean() < allowed, f"missed in problems {np.flatnonzero(missed).tolist()}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_five_points_give_the_true_mode_first_or_among_the_alternatives() -> None:
     problems = simulated_row(5, 1.0)
     modes = refined_from_truth(Row.of(problems))
@@ -289,7 +291,7 @@ def test_five_points_give_the_true_mode_first_or_among_the_alternatives() -> Non
 # --- the covariance --------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_covariance_is_calibrated() -> None:
     """Mean squared Mahalanobis distance of the error: the number of unknowns, 8."""
     problems = simulated_row(20, 1.0)
@@ -304,6 +306,7 @@ def test_covariance_is_calibrated() -> None:
     assert squared.mean() == pytest.approx(8.0, abs=0.6)
 
 
+@pytest.mark.long
 def test_covariance_at_the_truth_is_the_cramer_rao_bound() -> None:
     """What `fit` reports for noise-free keypoints is the bound computed here."""
     problems = simulated_row(12, 0.0)[:200]
@@ -319,7 +322,7 @@ def test_covariance_at_the_truth_is_the_cramer_rao_bound() -> None:
 # --- always ----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["optimal", "aepnp"])
 @pytest.mark.parametrize(("points", "noise_px"), [(6, 1.0), (7, 5.0), (20, 1.0), (100, 10.0)])
 def test_all_results_are_valid_alignments(method: str, points: int, noise_px: float) -> None:
@@ -346,7 +349,7 @@ def test_all_results_are_valid_alignments(method: str, points: int, noise_px: fl
 # --- the linear solvers ----------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_linear_solver_is_several_times_as_accurate_as_the_papers() -> None:
     """The paper's simulation at 1024 points and 2 px."""
     problems = simulated_row(1024, 2.0)[:1000]
@@ -356,7 +359,7 @@ def test_linear_solver_is_several_times_as_accurate_as_the_papers() -> None:
     assert 3.0 < paper < 5.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_linear_solver_is_consistent_where_the_papers_is_biased() -> None:
     """At 10 px, four times the points halve the linear solver's error, and not the paper's."""
     few, many = (

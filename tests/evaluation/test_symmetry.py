@@ -85,6 +85,7 @@ def test_a_tilted_bottle_keeps_the_error_of_its_tilt() -> None:
     assert errors(group, est, gt)[0] == pytest.approx(12.0, abs=1e-6)
 
 
+@pytest.mark.long
 def test_the_nearest_angle_is_the_best_of_all() -> None:
     group = symmetry_group(*bottle())
     for seed in range(20):
@@ -154,6 +155,7 @@ def test_thin_models_are_not_symmetric_by_the_tolerance() -> None:
     assert len(group.rotations) == 2
 
 
+@pytest.mark.long
 def test_real_bottles_are_round_and_chairs_are_not(real_data: Path) -> None:
     dataset = KeypointNet(real_data / "keypointnet")
 

@@ -142,6 +142,7 @@ def root(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["evaluate", "middle", "--help"])
@@ -162,6 +163,7 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--draws: 0 is less than 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
     options = MiddleOptions(root)
     whole, cut = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "cut")
@@ -205,6 +207,7 @@ def test_it_has_a_table_a_page_figures_and_a_data_frame(root: Path, tmp_path: Pa
     assert ["draws", "5"] in payload["runs"][0]["settings"]
 
 
+@pytest.mark.long
 def test_it_is_shown_again(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
     run(MiddleOptions(root), RunFolder(out), workers=0, dask=None)

@@ -28,6 +28,7 @@ from cadalign.evaluation.unseen.options import METHODS, UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview
 from cadalign.evaluation.unseen.spec import SPEC
 from cadalign.evaluation.unseen.tasks import UnseenTask, UnseenTasks, observe_object
+from cadalign.fitting.joint import single
 from cadalign.geometry.metrics import box_iou
 from cadalign.report import headline_text, write_report
 
@@ -87,6 +88,7 @@ def column(folder: RunFolder, name: str, method: str) -> np.ndarray:
 
 
 class TestRecords:
+    @pytest.mark.long
     def test_hold_what_the_metrics_are_of(self, finished: RunFolder) -> None:
         """Pose, box and warped keypoints of every method."""
         errors = {
@@ -113,6 +115,7 @@ class TestRecords:
                 )
                 assert estimate["rms_px"] >= 0
 
+    @pytest.mark.slow
     def test_are_on_the_page(self, finished: RunFolder, tmp_path: Path) -> None:
         written = write_report([finished.path], tmp_path / "report.html")
         page = embedded_payload(written.path)
@@ -164,6 +167,7 @@ class TestViews:
 
 
 class TestLevel:
+    @pytest.mark.long
     def test_levels_of_gaussian_errors_are_uniform(self) -> None:
         rng = np.random.default_rng(0)
         root = rng.standard_normal((3, 3))
@@ -200,6 +204,7 @@ class TestRun:
         assert iou["shape"] > 0.85
         assert rotation["exact"] == pytest.approx(rotation["limit"], rel=0.5)
 
+    @pytest.mark.slow
     def test_scale_is_forgiven_and_nothing_else(self, finished: RunFolder) -> None:
         for name in METHODS:
             absolute, relative = (
@@ -229,6 +234,7 @@ class TestRun:
         )
         assert (inside <= further).all()
 
+    @pytest.mark.long
     def test_a_killed_run_goes_on_to_the_same_bytes(
         self, root: Path, finished: RunFolder, tmp_path: Path
     ) -> None:
@@ -252,6 +258,7 @@ class TestRun:
         assert broken.results.read_bytes() == whole.results.read_bytes()
         assert broken.config_file.read_bytes() == whole.config_file.read_bytes()
 
+    @pytest.mark.long
     def test_results_do_not_depend_on_the_other_methods(
         self, root: Path, finished: RunFolder, tmp_path: Path
     ) -> None:
@@ -267,6 +274,7 @@ class TestRun:
         with pytest.raises(DataError, match="another configuration: noise_px is"):
             run(UnseenOptions(root, noise_px=1.0), finished, workers=0, dask=None)
 
+    @pytest.mark.long
     def test_outliers_are_found(self, root: Path, tmp_path: Path) -> None:
         folder = RunFolder(tmp_path / "run")
         options = UnseenOptions(root, outliers=0.3, methods=("shape", "exact", "limit"))
@@ -274,6 +282,7 @@ class TestRun:
         assert np.median(column(folder, "rotation_error_deg", "shape")) < 15
         assert np.median(column(folder, "rotation_error_deg", "limit")) < 5
 
+    @pytest.mark.long
     def test_bad_objects_do_not_stop_the_others(self, root: Path, tmp_path: Path) -> None:
         spoiled = tmp_path / "frames"
         (spoiled / "annotations").mkdir(parents=True)
@@ -325,6 +334,7 @@ class TestOptions:
 
 @pytest.mark.usefixtures("no_figures")
 class TestCommand:
+    @pytest.mark.long
     def test_a_run_is_made_and_shown_again(
         self, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -354,7 +364,7 @@ class TestCommand:
         assert "Cramer-Rao bound" in headline_text([finished.path], format="md")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_real_bottles_the_shape_model_is_best(real_data: Path, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     options = UnseenOptions(real_data / "keypointnet", categories=("bottle",), max_models=30)
@@ -369,3 +379,20 @@ def test_of_real_bottles_the_shape_model_is_best(real_data: Path, tmp_path: Path
     for name in ("random-rigid", "random-stretched", "mean-rigid", "mean-stretched", "nearest"):
         assert rotation["shape"] < rotation[name]
         assert iou["shape"] > iou[name]
+
+
+@pytest.mark.long
+def test_of_real_knives_modes_are_nearer_than_minima(
+    real_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their keypoints lie near a line, and the turn about it is nearly open."""
+    options = UnseenOptions(real_data / "keypointnet", categories=("knife",), methods=("shape",))
+    found = {}
+    for name in ("modes", "minima"):
+        folder = RunFolder(tmp_path / name)
+        run(options, folder, workers=0, dask=None)
+        keys = ("translation_error_up_to_scale", "rotation_error_deg")
+        found[name] = [float(np.median(column(folder, key, "shape"))) for key in keys]
+        monkeypatch.setattr(single, "find_directions", lambda _, __, minima, count: (minima, count))
+    assert found["modes"][0] <= 0.7 * found["minima"][0]
+    assert found["modes"][1] < 0.8 * found["minima"][1]

@@ -44,6 +44,7 @@ def holds_truth(result: FitResult, problem: Problem) -> bool:
 # --- misfits ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_wrong_keypoint_is_found_and_named() -> None:
     named = count = 0
     for seed in range(40):
@@ -62,6 +63,7 @@ def test_wrong_keypoint_is_found_and_named() -> None:
     assert named >= 0.9 * count
 
 
+@pytest.mark.long
 def test_shuffled_keypoints_are_a_misfit_without_outliers() -> None:
     checked = 0
     for seed in range(20):
@@ -78,6 +80,7 @@ def test_shuffled_keypoints_are_a_misfit_without_outliers() -> None:
     assert checked
 
 
+@pytest.mark.slow
 def test_stretched_object_contradicts_a_held_stretch() -> None:
     for problem, result in fits(20, 30, stretch="none"):
         error = np.abs(result.alignment.scale / problem.alignment.scale - 1).max()
@@ -86,6 +89,7 @@ def test_stretched_object_contradicts_a_held_stretch() -> None:
             assert "stretch" in result.warnings[0] or "held at 1" in result.warnings[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("points", "options"),
     [
@@ -151,6 +155,7 @@ def test_sigma_that_is_changed_afterwards_changes_no_result() -> None:
 # --- stated deviations -----------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [1.0, None])
 @pytest.mark.parametrize("points", [6, 8, 12])
 def test_ellipsoid_holds_the_truth(points: int, sigma: float | None) -> None:
@@ -183,6 +188,7 @@ def test_keypoints_given_twice_say_nothing_of_the_noise(loss: str) -> None:
         fit(*twice, problem.camera, sigma=None, loss=loss)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [6, 8, 10])
 def test_robust_sigma_does_not_collapse(points: int) -> None:
     sigmas = [result.sigma for _, result in fits(points, 40, sigma=None, loss="cauchy")]

@@ -279,6 +279,7 @@ def test_many_good_keypoints_leave_no_alternative() -> None:
 # --- real keypoints ---------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["optimal", "aepnp"])
 def test_real_keypoints_without_noise_are_exact(real_data: Any, method: str) -> None:
     from cadalign.datasets import KeypointNet

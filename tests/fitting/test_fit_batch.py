@@ -56,6 +56,7 @@ def assert_like_single_fits(
 RAGGED = problems_of([6, 20, 7, 100, 10, 64])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

@@ -273,6 +273,7 @@ def assert_valid(alignment: Alignment, points_3d: np.ndarray) -> None:
     assert (alignment.apply(points_3d)[:, 2] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["optimal", "aepnp", "aepnp-paper", "epnp"])
 @given(seed=SEEDS, points=st.integers(6, 30), noise=st.sampled_from([0.0, 1.0, 10.0, 100.0]))
 def test_every_result_is_a_valid_alignment(

@@ -49,6 +49,7 @@ def spoiled(problem: Problem, share: float, seed: int = 0) -> tuple[np.ndarray, 
 # --- accuracy ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(
     seed=st.integers(0, 10_000),
     points=st.integers(7, 30),
@@ -65,6 +66,7 @@ def test_exact_keypoints_give_back_the_focal_length(seed: int, points: int, foca
     assert_same(result.alignment, problem.alignment, 1e-5)
 
 
+@pytest.mark.long
 def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
     rng = np.random.default_rng(3)
     problems = [simulate_problem(rng, points=50, noise_px=1.0) for _ in range(500)]
@@ -101,6 +103,7 @@ def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
     assert (ratios > 0.85).all(), ratios
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("points", [5, 6, 8, 50])
 def test_no_better_explanation_is_missed(points: int) -> None:
     missed = 0
@@ -135,6 +138,7 @@ def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior
             assert cost(sign * deviation * np.eye(9)[k]) >= here - 1e-9
 
 
+@pytest.mark.slow
 def test_lens_distortion_is_honoured() -> None:
     camera = Camera.without_focal(640, 480, cx=310.0, cy=250.0, distortion=LENS.distortion)
     square = dataclasses.replace(LENS, fy=LENS.fx)
@@ -271,6 +275,7 @@ def test_focal_length_that_nothing_determines_is_said_so() -> None:
     )
 
 
+@pytest.mark.long
 def test_end_of_the_searched_range_is_said_so() -> None:
     problem = problem_of(0, points=12, noise_px=1.0)
     points = problem.points_3d @ problem.alignment.rotation.T
@@ -290,6 +295,7 @@ def test_end_of_the_searched_range_is_said_so() -> None:
         )
 
 
+@pytest.mark.long
 def test_other_explanations_have_cameras_of_their_own() -> None:
     found = []
     for seed in range(40):
@@ -370,6 +376,7 @@ def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() ->
 # --- robust -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("points", "share"), [(30, 0.0), (50, 0.3), (50, 0.5), (150, 0.75)])
 @pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LONG], ids=["wide", "long"])
 def test_wrong_keypoints_are_found(camera: Camera, points: int, share: float) -> None:
@@ -404,6 +411,7 @@ def test_robust_search_is_reproducible_and_guided() -> None:
     assert first.inliers.sum() >= 18
 
 
+@pytest.mark.slow
 def test_noise_without_a_model_has_no_consensus() -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -429,6 +437,7 @@ def test_best_hypothesis_can_be_had_as_it_is() -> None:
 # --- many at once -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ransac", [None, RansacOptions()], ids=["all", "robust"])
 def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> None:
     problems = [problem_of(seed, points=8 + seed) for seed in range(5)]
@@ -460,6 +469,7 @@ def test_batch_with_known_focal_lengths_names_them() -> None:
 # --- real photos ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> None:
     rng = np.random.default_rng(0)
     strong = weak = 0
@@ -482,6 +492,7 @@ def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> N
     assert (strong, weak) == (9, 3)
 
 
+@pytest.mark.long
 def test_structure_from_motion_through_lenses(real_data: Path) -> None:
     rng = np.random.default_rng(0)
     for image in Bundler(real_data / "sfm" / "balbianello"):
@@ -547,6 +558,7 @@ def test_keypoints_in_one_place_are_refused() -> None:
         fit(np.ones((8, 3)), np.arange(16.0).reshape(8, 2), UNKNOWN, focal="estimate")
 
 
+@pytest.mark.slow
 def test_pixels_that_no_lens_reaches_are_refused() -> None:
     camera = Camera.without_focal(640, 480, distortion=(-5.0, 0.0, 0.0, 0.0))
     points_2d = np.array([[1e7, 1e7], [0, 0], [600, 400], [3, 470], [300, 5], [1e6, 3]])

@@ -15,7 +15,7 @@ from cadalign import fit, fit_batch
 from cadalign.fitting import options
 from cadalign.fitting.options import FitOptions, RansacOptions
 
-NOT_OPTIONS = {"ransac", "confidences", "workers"}
+NOT_OPTIONS = {"ransac", "confidences", "workers", "symmetry"}
 
 
 @pytest.mark.parametrize("function", [fit, fit_batch])
@@ -38,6 +38,7 @@ def test_every_option_has_its_help_below_it(kind: type) -> None:
         assert lines[place + 1].startswith('    """'), field.name
 
 
+@pytest.mark.long
 def test_importing_the_options_compiles_nothing() -> None:
     code = f"import sys, {options.__name__}; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

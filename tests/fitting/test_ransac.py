@@ -48,6 +48,7 @@ def test_outliers_are_found_and_the_rest_is_fitted(share: float) -> None:
     assert result.stats.score > 0
 
 
+@pytest.mark.long
 def test_wrong_ones_among_eight_keypoints_are_found() -> None:
     found = refused = 0
     for seed in range(100):
@@ -82,6 +83,45 @@ def test_the_same_seed_gives_the_same_result() -> None:
     assert results[0].stats.hypotheses != results[2].stats.hypotheses
 
 
+def test_threads_do_not_change_the_result() -> None:
+    cases = [spoiled(seed, points=60, outliers=40) for seed in range(4)]
+    points_3d, points_2d = [c[0].points_3d for c in cases], [c[1] for c in cases]
+    one, two = (
+        fit_batch(points_3d, points_2d, CAMERA, ransac=RansacOptions(seed=3), workers=workers)
+        for workers in (1, 2)
+    )
+    np.testing.assert_array_equal(one.inliers, two.inliers)
+    np.testing.assert_array_equal(one.rotation, two.rotation)
+
+
+def test_order_of_the_keypoints_does_not_matter() -> None:
+    problem, points_2d, wrong = spoiled(6, points=120, outliers=70)
+    order = np.random.default_rng(0).permutation(120)
+    confidences = np.where(wrong, 0.3, 0.7) + np.random.default_rng(1).uniform(0, 0.3, 120)
+    for trusted in (None, confidences):
+        plain = fit(
+            problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(), confidences=trusted
+        )
+        mixed = fit(
+            problem.points_3d[order],
+            points_2d[order],
+            CAMERA,
+            ransac=RansacOptions(),
+            confidences=None if trusted is None else trusted[order],
+        )
+        np.testing.assert_array_equal(mixed.inliers, plain.inliers[order])
+        np.testing.assert_allclose(mixed.alignment.scale, plain.alignment.scale, rtol=1e-6)
+
+
+def test_trusted_inliers_are_sampled_first() -> None:
+    problem, points_2d, wrong = spoiled(3, points=300, outliers=270)
+    options = RansacOptions(min_iterations=1, max_iterations=100)
+    trusted = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=1.0 - wrong)
+    assert not trusted.inliers[wrong].any()
+    assert trusted.inliers[~wrong].mean() > 0.9
+
+
+@pytest.mark.long
 def test_confidences_shorten_the_search() -> None:
     problem, points_2d, wrong = spoiled(3, points=300, outliers=255)
     options = RansacOptions(min_iterations=1, max_iterations=50_000)
@@ -135,6 +175,7 @@ def test_batch_equals_single_fits_and_keeps_errors() -> None:
         assert np.isnan(batch.rotation[3]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("points", [8, 30, 300])
 def test_random_correspondences_are_refused_with_the_best_score(points: int) -> None:
     for seed in range(5):
@@ -215,7 +256,7 @@ def sfm_images(real_data: Path) -> list[Any]:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("share", "draws", "wanted", "max_iterations"),
     [(0.0, 20, 0.995, 10_000), (0.25, 20, 0.995, 10_000), (0.5, 20, 0.995, 10_000)]

@@ -10,6 +10,8 @@ from fuzz import fits, mutations, readers
 from fuzz.failures import LONGEST_FIT, fit_outcome
 from fuzz.fit_cases import draw_case, draw_cases
 
+pytestmark = pytest.mark.long
+
 
 def over_seeds(run: Callable[[int], object], seeds: range) -> None:
     for seed in seeds:

@@ -41,6 +41,7 @@ def assert_close(first: Alignment, second: Alignment) -> None:
     np.testing.assert_allclose(first.scale, second.scale, rtol=1e-12)
 
 
+@pytest.mark.slow
 @given(alignment=ALIGNMENTS)
 def test_apply_is_rotation_times_stretch_plus_translation(alignment: Alignment) -> None:
     expected = [
@@ -64,12 +65,14 @@ def test_inverse_undoes_apply_on_either_side(alignment: Alignment) -> None:
     np.testing.assert_allclose(alignment.apply(alignment.inverse(POINTS)), POINTS, atol=1e-11)
 
 
+@pytest.mark.long
 @given(similarity=SIMILARITIES, alignment=ALIGNMENTS)
 def test_identity_is_neutral_on_either_side(similarity: Alignment, alignment: Alignment) -> None:
     assert_close(similarity @ Alignment.identity(), similarity)
     assert_close(Alignment.identity() @ alignment, alignment)
 
 
+@pytest.mark.slow
 @given(outer=SIMILARITIES, inner=ALIGNMENTS)
 def test_composition_applies_the_inner_first(outer: Alignment, inner: Alignment) -> None:
     np.testing.assert_allclose(
@@ -77,11 +80,13 @@ def test_composition_applies_the_inner_first(outer: Alignment, inner: Alignment)
     )
 
 
+@pytest.mark.slow
 @given(first=SIMILARITIES, second=SIMILARITIES, third=ALIGNMENTS)
 def test_composition_is_associative(first: Alignment, second: Alignment, third: Alignment) -> None:
     assert_close((first @ second) @ third, first @ (second @ third))
 
 
+@pytest.mark.slow
 @given(similarity=SIMILARITIES)
 def test_every_similarity_has_an_inverse_among_similarities(similarity: Alignment) -> None:
     size = similarity.scale[0]
@@ -91,6 +96,7 @@ def test_every_similarity_has_an_inverse_among_similarities(similarity: Alignmen
     np.testing.assert_allclose((similarity @ inverse).cam_from_model, np.eye(4), atol=1e-9)
 
 
+@pytest.mark.slow
 @given(outer=ALIGNMENTS.filter(lambda a: np.ptp(a.scale) > 1e-9), inner=ALIGNMENTS)
 def test_an_uneven_stretch_cannot_follow_another_alignment(
     outer: Alignment, inner: Alignment

@@ -37,6 +37,7 @@ def points_in_view(seed: int, count: int = 40) -> np.ndarray:
     return np.hstack([rng.uniform(-0.65, 0.65, (count, 2)) * [1.0, 0.75] * depth, depth])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_project_agrees_with_opencv(lens: str, seed: int) -> None:
@@ -47,6 +48,7 @@ def test_project_agrees_with_opencv(lens: str, seed: int) -> None:
     np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_normalize_undoes_project(lens: str, seed: int) -> None:
@@ -56,6 +58,7 @@ def test_normalize_undoes_project(lens: str, seed: int) -> None:
     np.testing.assert_allclose(rays, points[:, :2] / points[:, 2:], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_project_undoes_normalize(lens: str, seed: int) -> None:
@@ -193,6 +196,7 @@ def test_from_dict_undoes_to_dict(model: str) -> None:
     assert Camera.from_dict(camera.to_dict()) == camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
 @given(
     values=st.tuples(

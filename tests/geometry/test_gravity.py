@@ -68,6 +68,7 @@ def test_one_edge_tells_the_direction_across_its_plane(pitch: float, roll: float
     assert error @ np.linalg.pinv(covariance, rcond=1e-9) @ error < 6
 
 
+@pytest.mark.long
 def test_the_deviation_of_two_edges_is_that_of_their_errors() -> None:
     up, rng = up_from_pitch_roll(-15, 5), np.random.default_rng(0)
     exact = np.array([edge_of(up, np.array([x, 0.3, 4.0])) for x in (-1.2, 1.3)])

@@ -60,6 +60,7 @@ def test_cameras_and_alignments_take_any_value_or_refuse_it(value: Any) -> None:
     read_or_refuse(lambda: CAMERA.with_focal(value))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
 @pytest.mark.parametrize("model", COLMAP_PARAMS)
 def test_any_parameter_of_a_lens_is_used_or_refused(model: str, value: Any) -> None:

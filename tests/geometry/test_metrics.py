@@ -232,6 +232,7 @@ def volume_by_duality(first: Box, second: Box) -> float:
     return float(ConvexHull(corners).volume)
 
 
+@pytest.mark.slow
 @given(seed=SEEDS)
 def test_box_iou_agrees_with_the_intersection_of_half_spaces(seed: int) -> None:
     est, gt = overlapping_boxes(seed)
@@ -240,6 +241,7 @@ def test_box_iou_agrees_with_the_intersection_of_half_spaces(seed: int) -> None:
     assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_box_iou_agrees_with_counting_random_points(seed: int) -> None:
     est, gt = overlapping_boxes(seed)
@@ -251,6 +253,7 @@ def test_box_iou_agrees_with_counting_random_points(seed: int) -> None:
     assert box_iou(est=est, gt=gt) == pytest.approx(expected, abs=0.005)
 
 
+@pytest.mark.slow
 @given(seed=SEEDS, frame=SEEDS)
 def test_box_iou_is_symmetric_and_does_not_depend_on_frame_or_unit(seed: int, frame: int) -> None:
     est, gt = overlapping_boxes(seed)
@@ -280,6 +283,22 @@ def test_box_iou_is_continuous_at_a_perfect_estimate(seed: int, angle: float) ->
     # A turn by an angle moves a face by at most half a diagonal times the angle.
     largest = 4 * angle * np.linalg.norm(gt.extents) / gt.extents.min()
     assert 1 - box_iou(est=est, gt=gt) <= largest + 1e-11
+
+
+@given(seed=SEEDS)
+def test_box_iou_of_boxes_that_share_faces_edges_or_corners(seed: int) -> None:
+    """Boxes on a grid, one with its axes exchanged: the overlap is that of intervals."""
+    rng = np.random.default_rng(seed)
+    low = rng.integers(0, 3, (2, 3)).astype(float)
+    high = low + rng.integers(1, 3, (2, 3))
+    overlap = np.clip(high.min(axis=0) - low.max(axis=0), 0, None).prod()
+    volumes = (high - low).prod(axis=1)
+    frame, order = random_rotation(rng), rng.permutation(3)
+    turn = np.eye(3)[:, order]
+    turn[:, 0] *= np.linalg.det(turn)
+    est = Box(frame @ (low[0] + high[0]) / 2, frame @ turn, (high - low)[0][order])
+    gt = Box(frame @ (low[1] + high[1]) / 2, frame, (high - low)[1])
+    assert box_iou(est=est, gt=gt) == pytest.approx(overlap / (volumes.sum() - overlap), abs=1e-12)
 
 
 @pytest.mark.parametrize(("name", "flat_first"), [("est", True), ("gt", False)])
@@ -312,6 +331,7 @@ def scaled_box(box: Box, factor: float) -> Box:
     return Box(factor * box.center, box.rotation, factor * box.extents)
 
 
+@pytest.mark.long
 @given(seed=SEEDS)
 def test_box_iou_up_to_scale_is_the_largest_over_all_factors(seed: int) -> None:
     est, gt = boxes_before_the_camera(seed)
@@ -322,6 +342,7 @@ def test_box_iou_up_to_scale_is_the_largest_over_all_factors(seed: int) -> None:
     assert best - 1e-6 <= found <= best + 0.16
 
 
+@pytest.mark.long
 @given(seed=SEEDS, logarithm=st.floats(-3, 3))
 def test_box_iou_up_to_scale_depends_on_neither_scale_nor_order(
     seed: int, logarithm: float
@@ -341,6 +362,7 @@ def test_box_iou_up_to_scale_of_boxes_in_other_directions_is_zero() -> None:
     assert box_iou_up_to_scale(est=behind, gt=ahead) == 0.0
 
 
+@pytest.mark.long
 def test_box_iou_up_to_scale_around_the_camera_is_that_of_equal_volumes() -> None:
     room = Box([0, 0, 0], np.eye(3), [2, 3, 4])
     long = Box([0, 0, 0], np.eye(3), [1, 1, 8])

@@ -41,6 +41,7 @@ def test_axes_are_taken_in_steps_with_every_discrete_motion():
     np.testing.assert_allclose(poses[1][:3, :3], step, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 def test_the_error_about_an_axis_is_the_least_over_all_angles(seed):
     rng = np.random.default_rng(seed)
@@ -75,3 +76,42 @@ def test_what_is_no_motion_is_refused():
         nearest_rotation(np.diag([1.0, 1, -1]))
     with pytest.raises(InputError, match="not a rotation"):
         nearest_rotation(np.full((3, 3), np.inf))
+
+
+@pytest.mark.parametrize(
+    ("data", "count", "axes"),
+    [
+        ("__SYM_NONE", 0, 0),
+        ("__SYM_ROTATE_UP_2", 1, 0),
+        ("__SYM_ROTATE_UP_4", 3, 0),
+        ("__SYM_ROTATE_UP_INF", 0, 1),
+        ({"axis": [0, 0, 2], "fold": 3, "offset": [1, 0, 0]}, 2, 0),
+        ({"axis": [0, 0, 2], "fold": None}, 0, 1),
+        ({"symmetries_discrete": [FLIP.ravel().tolist()]}, 1, 0),
+        ({"symmetries_continuous": [{"axis": [0, 1, 0], "offset": [0, 0, 1]}]}, 0, 1),
+    ],
+)
+def test_every_form_is_read_and_written_as_bop_does(data, count, axes):
+    symmetry = Symmetry.from_dict(data)
+    assert (len(symmetry.motions), len(symmetry.axes)) == (count, axes)
+    again = Symmetry.from_dict(symmetry.to_dict() if count or axes else "__SYM_NONE")
+    np.testing.assert_array_equal(again.poses(max_step=0.5), symmetry.poses(max_step=0.5))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("__SYM_ROTATE_UP_3", "symmetry: '__SYM_ROTATE_UP_3' is no symmetry"),
+        (4, "symmetry: expected a name or an object, got int"),
+        ({}, "symmetry: the fields"),
+        ({"axis": [0, 1, 0]}, "symmetry: the fields axis are no symmetry's"),
+        ({"axis": [0, 1], "fold": 2}, "symmetry.axis: "),
+        ({"axis": [0, 1, 0], "fold": 0}, "symmetry.fold: '0' is no number of rotations"),
+        ({"symmetries_discrete": [[1, 2]]}, r"symmetry.symmetries_discrete\[0\]: "),
+        ({"symmetries_discrete": 3}, "symmetry.symmetries_discrete: expected a list"),
+        ({"symmetries_continuous": [3]}, "symmetry.axis: "),
+    ],
+)
+def test_other_forms_are_refused_by_their_field(data, message):
+    with pytest.raises(InputError, match=message):
+        Symmetry.from_dict(data)

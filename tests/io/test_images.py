@@ -108,6 +108,7 @@ def test_missing_photo_and_folder_are_refused(
         read(tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("error")
 def test_damaged_exif_data_are_passed_over(tmp_path: Path) -> None:
     path = write_photo(tmp_path / "photo.jpg", equivalent=26, focal=4.0, density=3000.0)
@@ -120,6 +121,7 @@ def test_damaged_exif_data_are_passed_over(tmp_path: Path) -> None:
                 read(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("read", [read_photo, photo_size, FocalPrior.from_exif])
 def test_pixels_that_the_file_cannot_hold_are_refused(
     tmp_path: Path, read: Callable[[Path], object]

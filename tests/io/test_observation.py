@@ -129,8 +129,8 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             DATA | {"cameras": 3},
             "{path}: top level: unknown field 'cameras'; "
             "known are cam_from_rig, camera, camera_height, camera_height_sigma, depth, "
-            "depth_scale, depth_sigma, fit, image, keypoints, mask, mask_sigma, model, shape, "
-            "size, up, up_sigma_deg",
+            "depth_scale, depth_sigma, fit, image, init, keypoints, mask, mask_sigma, model, "
+            "object, pixel_origin, shape, size, symmetry, up, up_sigma_deg",
         ),
         (
             DATA | {"x` - at `$.y": 3},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.files import replaced, write_json
 
-from cadalign import Camera
+from cadalign import Alignment, Camera
 from cadalign.errors import DataError, InputError
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
@@ -38,6 +38,11 @@ ONE: dict[str, Any] = {
     "model": "chair.obj",
     "shape": "chair.shape",
     "size": {"height": 0.9, "length": 0.5, "sigma": [0.01, 0.02, 0.03]},
+    "init": {
+        "rotation": [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]],
+        "translation": [0.1, 0.0, 2.5],
+        "scale": [1.0, 1.2, 0.9],
+    },
     "fit": {"sigma": 2.0},
 }
 _SHARED: dict[str, Any] = {
@@ -76,6 +81,21 @@ def test_views_arrive(tmp_path: Path) -> None:
     for view in observation.views:
         assert view.evidence.cam_from_rig is not None
         assert view.evidence.cam_from_rig.tolist() == np.eye(4).tolist()
+
+
+def test_start_arrives_and_needs_no_keypoints() -> None:
+    data = replaced(ONE, "init.scale", ...) | {"keypoints": []}
+    for given in (data, replaced(data, "keypoints", ...)):
+        observation = Observation.from_dict(given)
+        assert observation.init == Alignment(np.diag([-1.0, -1, 1]), [0.1, 0, 2.5], np.ones(3))
+        assert len(observation.points_2d) == 0
+        assert not observation.is_plain
+    of_several = Observation.from_dict(SEVERAL | {"init": ONE["init"]})
+    assert of_several.init is not None
+    assert of_several.to_dict()["init"] == ONE["init"]
+    alone = Observation.from_dict({"camera": CAMERA, "keypoints": KEYPOINTS, "init": ONE["init"]})
+    assert not alone.is_plain
+    assert Observation.from_dict(ONE | {"init": None}).init is None
 
 
 @pytest.mark.parametrize("data", [ONE, SEVERAL])
@@ -149,11 +169,23 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
             {"camera": CAMERA, "keypoints": KEYPOINTS, "depth_sigma": 0.1},
             "{path}: depth_sigma: given without depth; give depth, too",
         ),
+        (
+            replaced(ONE, "init", ...) | {"keypoints": []},
+            "{path}: keypoints: [] is not a list of at least 1",
+        ),
+        (replaced(ONE, "init.translation", ...), "{path}: init.translation: missing"),
+        (
+            replaced(ONE, "init.rotation.0.0", 1.0),
+            "{path}: init.rotation: ",
+        ),
+        (replaced(ONE, "init.scale.1", 0.0), "{path}: init.scale: "),
+        (replaced(ONE, "init.scale.1", "a"), "{path}: init.scale[1]: 'a' is not a finite number"),
         (SEVERAL | {"views": []}, "{path}: views: [] is not a list of at least 1"),
         (SEVERAL | {"views": {}}, "{path}: views: {{}} is not a list"),
         (
             SEVERAL | {"camera": CAMERA},
-            "{path}: top level: unknown field 'camera'; known are fit, model, shape, size, views",
+            "{path}: top level: unknown field 'camera'; "
+            "known are fit, init, model, object, shape, size, symmetry, views",
         ),
         (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
         (

@@ -47,6 +47,7 @@ def _has_color_near(image, pixel, color, *, within=2):
     return bool(_near_color(part, color).any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, LARGE, BENT])
 @pytest.mark.parametrize("background", BACKGROUNDS.values(), ids=BACKGROUNDS)
 def test_boxes_are_drawn_along_their_near_edges(camera, background):
@@ -162,6 +163,7 @@ def test_background_stays_as_it_was():
     np.testing.assert_array_equal(draw_overlay(photo, CAMERA), photo)
 
 
+@pytest.mark.slow
 def test_legend_names_what_is_drawn_and_avoids_it():
     # The box sits in the top left: the legend goes elsewhere.
     box = Box([-0.75, -0.55, 3.0], np.eye(3), [0.8, 0.5, 0.5])

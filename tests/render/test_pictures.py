@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import av
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from cadalign import Alignment, Camera, Mesh
 from cadalign.errors import DataError, InputError, RenderError
@@ -201,6 +203,40 @@ def test_a_movie_can_be_read_again(tmp_path):
     assert [image.shape for image in read] == [(62, 82, 3)] * 8
     # OpenCV's order is blue, green, red.
     assert np.abs(read[5][30, 40].astype(int) - (0, 100, 200)).max() < 25
+
+
+@pytest.mark.parametrize("ending", [".webm", ".gif"])
+def test_other_movies_can_be_read_again(tmp_path, ending):
+    frames = [np.full((61, 81, 3), (200, 20 * n, 0), np.uint8) for n in range(8)]
+    path = tmp_path / f"m{ending}"
+    assert write_movie(path, iter(frames), fps=25) == 8
+    if ending == ".gif":
+        with Image.open(path) as movie:
+            assert movie.n_frames == 8
+            assert movie.info["duration"] == 40
+            movie.seek(5)
+            assert (
+                np.abs(np.asarray(movie.convert("RGB"))[30, 40].astype(int) - (200, 100, 0)).max()
+                < 25
+            )
+    else:
+        with av.open(str(path)) as movie:
+            read = [frame.to_ndarray(format="rgb24") for frame in movie.decode(video=0)]
+        assert len(read) == 8
+        assert np.abs(read[5][30, 40].astype(int) - (200, 100, 0)).max() < 25
+
+
+def test_mp4_is_h264(tmp_path):
+    write_movie(tmp_path / "m.mp4", [np.zeros((60, 80, 3), np.uint8)] * 3, fps=30)
+    with av.open(str(tmp_path / "m.mp4")) as movie:
+        stream = movie.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+
+
+def test_other_endings_are_refused(tmp_path):
+    with pytest.raises(InputError, match="is no movie"):
+        write_movie(tmp_path / "m.avi", [], fps=30)
 
 
 def test_a_movie_that_cannot_be_made_leaves_no_file(tmp_path, monkeypatch):

@@ -15,6 +15,8 @@ from cadalign import Camera, Mesh
 from cadalign.errors import RenderError
 from cadalign.render import Scene, look_at
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera.from_fov(160, 120, fov_x=50)
 
 
@@ -38,7 +40,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
     renderer_or_skip("pyrender")
     script = tmp_path / "pool.py"
@@ -86,7 +88,7 @@ def resident():
         return next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
 
 renderer = make_renderer(sys.argv[1])
-camera = Camera.from_fov(320, 240, fov_x=50)
+camera = Camera.from_fov(160, 120, fov_x=50)
 scenes = [Scene(ball(3)), Scene(ball(4))]
 for number in range(500):
     if number == 100:
@@ -98,7 +100,7 @@ print(resident() - before)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs /proc")
 @pytest.mark.parametrize("name", ["raycast", "open3d", "pyrender"])
 def test_memory_stays_flat_over_500_frames(name):

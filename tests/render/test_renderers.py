@@ -59,6 +59,7 @@ def _view(scene, camera, **angles):
     return frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
 
 
+@pytest.mark.long
 def test_open3d_agrees_with_embreex_on_depth_and_faces():
     renderer_or_skip("open3d")
     camera = Camera.from_fov(640, 480, fov_x=50)
@@ -81,6 +82,7 @@ def _shape(shape):
     return np.array(shape.vertices), np.array(shape.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, SKEWED, BENT], ids=["plain", "skewed", "bent"])
 def test_mask_edges_of_the_colour_lie_within_a_pixel_of_the_cast_ones(renderer, camera):
     scene = Scene(_knot())
@@ -93,6 +95,7 @@ def test_mask_edges_of_the_colour_lie_within_a_pixel_of_the_cast_ones(renderer, 
     assert (drawn >= cv2.erode(cast, around)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("camera", [CAMERA, SKEWED, BENT], ids=["plain", "skewed", "bent"])
 @pytest.mark.parametrize("place", [(20.3, 30.8), (79.5, 59.5), (130.62, 95.37)])
 def test_a_marker_is_drawn_where_project_says(renderer, camera, place):
@@ -163,6 +166,7 @@ def test_all_renderers_draw_about_the_same_colours(renderer):
     assert lower[2] > lower[0] + 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1, 2, 3, 5, 7])
 def test_textures_of_odd_widths_are_read_row_by_row(renderer, width):
     texture = np.zeros((4, width, 3), np.uint8)
@@ -209,6 +213,7 @@ def test_out_of_view_and_too_large_are_the_same_everywhere(renderer):
         renderer.render(scene, CAMERA, _view(scene, CAMERA), samples=0)
 
 
+@pytest.mark.slow
 def test_an_image_larger_than_a_tile_has_no_seams():
     renderer = renderer_or_skip("pyrender")
     camera = Camera.from_fov(2300, 90, fov_x=60)
@@ -219,6 +224,7 @@ def test_an_image_larger_than_a_tile_has_no_seams():
     assert np.abs(np.diff(color[:, :3].astype(int), axis=0)).max() <= 1
 
 
+@pytest.mark.slow
 def test_lens_that_cannot_be_inverted_everywhere_leaves_those_pixels_empty(renderer):
     camera = replace(BENT, fx=60.0, fy=60.0, distortion=(-0.4, 0.05, 0.0, 0.0))
     corners = [[0, 0], [159, 0], [0, 119], [159, 119]]
@@ -333,6 +339,7 @@ def test_unknown_renderers_are_refused():
         make_renderer("blender")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
@@ -352,6 +359,7 @@ def test_a_broken_graphics_library_does_not_take_the_caller_down(
     assert re.search(reason, found.detail), found.detail
 
 
+@pytest.mark.long
 def test_a_missing_egl_device_is_told(monkeypatch):
     renderer_or_skip("pyrender")
     monkeypatch.setenv("EGL_DEVICE_ID", "77")

@@ -27,6 +27,7 @@ def test_the_skeleton_holds_the_minimum_spanning_tree(seed: int, count: int) -> 
     assert connected_components(graph)[0] == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("up_axis", ["x", "y", "z", None])
 @pytest.mark.parametrize("modes", [0, 1, 6])
 def test_a_picture_is_drawn(tmp_path: Path, up_axis: str | None, modes: int) -> None:

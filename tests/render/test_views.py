@@ -79,6 +79,7 @@ def test_look_at_refuses_bad_values(options, where):
         look_at(**{"azimuth": 0, "elevation": 0, "distance": 3} | options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("scale", [(1, 1, 1), (1, 2, 0.5), (1, 0.5, 2)])
 def test_object_lies_inside_the_image_and_fills_its_share(scene, corners, camera, scale):
@@ -104,6 +105,7 @@ def test_distance_scales_with_the_model(scene, size):
     np.testing.assert_allclose(other.translation, one.translation * size, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_views_are_spread_evenly_within_the_band(scene, corners):
     rng = np.random.default_rng(0)
     directions = []

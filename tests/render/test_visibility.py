@@ -133,6 +133,7 @@ def _pile_of_boxes(rng):
     return Mesh(np.array(whole.vertices), np.array(whole.faces))
 
 
+@pytest.mark.slow
 def test_agrees_with_depth_images_of_piled_boxes():
     rng = np.random.default_rng(5)
     agree = []
@@ -161,6 +162,7 @@ def test_twenty_keypoints_take_about_a_millisecond():
     assert reference_seconds(testing, below=2e-3) < 2e-3
 
 
+@pytest.mark.long
 @needs_data
 def test_agrees_with_depth_images_of_real_models():
     root = Path(os.environ["CADALIGN_DATA"]) / "keypointnet"

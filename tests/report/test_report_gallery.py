@@ -15,6 +15,8 @@ from support.pages import Opened, card_names, open_first, page_yardstick, scroll
 from support.reports import Recipe, listed, payload_of, write_page
 from support.timing import Measure, reference_seconds
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def two_runs(tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -240,7 +242,7 @@ def test_a_thousand_instances_are_usable_within_two_seconds(opened: Opened, tmp_
     expect(page.locator("#gallery .found")).to_have_text("333 instances of 1,000")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timing
 def test_ten_thousand_instances_with_assets_open_and_scroll(opened: Opened, tmp_path: Path) -> None:
     payload = payload_of(Recipe(instances=10_000, exhibits=False, categories=("chair",)))

@@ -18,6 +18,8 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import write_report
 from cadalign.web import asset
 
+pytestmark = pytest.mark.long
+
 # Contrast that WCAG 2 asks of text (AA), and of what is drawn.
 _TEXT, _DRAWN = 4.5, 3.0
 
@@ -246,6 +248,16 @@ def test_whatever_can_be_used_has_a_name(opened: Opened, tmp_path: Path) -> None
     assert page.evaluate("document.documentElement.lang") == "en"
 
 
+def test_tables_begin_with_all_and_are_whole_at_1440_pixels(opened: Opened, tmp_path: Path) -> None:
+    address = write_page(tmp_path / "report.html", Recipe(categories=("bottle", "airplane", "all")))
+    page = opened(address, viewport={"width": 1440, "height": 900})
+    groups = page.locator("table.headline tr.group")
+    expect(groups.first).to_contain_text("all")
+    expect(groups).to_have_count(3)
+    for scroller in page.locator(".scroller").all():
+        assert scroller.evaluate("(e) => e.scrollWidth - e.clientWidth") <= 0
+
+
 def test_a_phone_shows_all_of_it(opened: Opened, tmp_path: Path) -> None:
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     page = opened(
@@ -284,7 +296,7 @@ def test_paper_gets_tables_plots_and_a_few_cards(
     assert sum(card.is_visible() for card in page.locator(".cards > li").all()) == 12
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_real_run_makes_a_page(opened: Opened, sample_root: Path, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     options = KeypointNetOptions(

@@ -31,7 +31,9 @@ def headline(category: str = "chair") -> Headline:
         HeadlineRow(0, "all", "limit", {"n": 3.0, "r": None}),
     ]
     paper = [HeadlineRow(0, category, "stated", {"n": None, "r": 0.998})]
-    return Headline("category", COLUMNS, rows, failures=[], paper=paper, note="Medians, in %.")
+    return Headline(
+        "category", COLUMNS, rows, failures=[], skipped=[], paper=paper, note="Medians, in %."
+    )
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +144,7 @@ def test_the_page_of_several_runs_goes_where_one_is(
     assert (tmp_path / "deep" / "er" / "page.html").is_file()
 
 
+@pytest.mark.long
 def test_commands_write_the_page_at_their_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

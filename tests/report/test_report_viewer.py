@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 from playwright.sync_api import Locator, expect
 from support.pages import Opened, card_names, open_first
@@ -17,6 +18,8 @@ from support.reports import METHODS, WARNING, Recipe, listed, payload_of, write_
 
 from cadalign import Alignment
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+
+pytestmark = pytest.mark.slow
 
 NO_WEBGL = """
 const real = HTMLCanvasElement.prototype.getContext;
@@ -41,6 +44,7 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
     return float((np.abs(before - after).max(axis=1) > 24).mean())
 
 
+@pytest.mark.long
 def test_an_instance_opens_with_layers_numbers_and_warnings(opened: Opened, plain: str) -> None:
     page = opened(plain + "#order=best")
     dialog = open_first(page)
@@ -69,6 +73,7 @@ def test_an_instance_opens_with_layers_numbers_and_warnings(opened: Opened, plai
     expect(dialog.locator(".warnings")).to_have_count(0)
 
 
+@pytest.mark.long
 def test_boxes_and_keypoints_are_where_the_camera_sees_them(opened: Opened, plain: str) -> None:
     payload = payload_of(Recipe())
     page = opened(f"{plain}#order=listed&show={METHODS[1]}")
@@ -187,6 +192,7 @@ def test_without_webgl_there_is_a_word(opened: Opened, plain: str) -> None:
     expect(dialog.locator("table").first).to_be_visible()
 
 
+@pytest.mark.long
 def test_a_warped_model_is_drawn_at_the_estimated_keypoints(
     opened: Opened, plain: str, tmp_path: Path
 ) -> None:

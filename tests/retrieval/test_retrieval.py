@@ -19,9 +19,11 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.fitting.likelihood import bent
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.bounds import error_bound
 from cadalign.retrieval.candidates import gather_candidates, observe
+from cadalign.retrieval.kernels import search_all
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import rank
 from cadalign.retrieval.shape import SAME_SHAPE, shape_distance
@@ -65,6 +67,7 @@ def same(one: Sequence[Match], other: Sequence[Match]) -> bool:
 # --- what it finds ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 def test_the_model_is_found_with_pose_and_stretch(camera: Camera) -> None:
     for number in (0, 17, 59):
@@ -97,6 +100,7 @@ def test_a_match_holds_what_belongs_to_its_pose() -> None:
     assert repr(best).startswith("Match('box', '003', score=")
 
 
+@pytest.mark.long
 def test_the_alignment_is_the_optimum_that_fit_finds() -> None:
     for number in range(6):
         pixels = view(MODELS[number], pose_of(number), noise_px=2.0, seed=number)
@@ -176,6 +180,7 @@ def test_hidden_keypoints_hardly_count() -> None:
     assert first.log_likelihood - second.log_likelihood == pytest.approx(2 * np.log(2))
 
 
+@pytest.mark.long
 def test_each_keypoint_may_have_its_own_sigma_or_covariance() -> None:
     pixels = view(MODELS[2], pose_of(2), noise_px=2.0)
     one = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=2.0)
@@ -199,6 +204,7 @@ def test_shape_sigma_adds_a_share_of_the_extent_to_the_noise() -> None:
     assert one[0].log_likelihood == pytest.approx(other[0].log_likelihood)
 
 
+@pytest.mark.long
 def test_a_robust_loss_tolerates_wrong_keypoints() -> None:
     found = {"linear": 0, "cauchy": 0}
     for number in range(8):
@@ -212,6 +218,7 @@ def test_a_robust_loss_tolerates_wrong_keypoints() -> None:
 
 
 class TestStretch:
+    @pytest.mark.long
     def test_no_model_is_stretched_beyond_the_limit(self) -> None:
         pixels = view(MODELS[4], pose_of(4, scale=(2.5, 1.0)))
         wide = LIBRARY.retrieve(pixels, IDS, CAMERA, scale_prior_sigma=None)
@@ -255,6 +262,7 @@ class TestStretch:
         assert best.model_id == "004"
         assert best.alignment.scale.tolist() == [1, 1, 1]
 
+    @pytest.mark.slow
     def test_epnp_does_not_stretch_and_finds_what_is_not_stretched(self) -> None:
         pixels = view(MODELS[4], pose_of(4, scale=(1.0, 1.0)), noise_px=0.5)
         best = LIBRARY.retrieve(pixels, IDS, CAMERA, method="epnp")[0]
@@ -316,6 +324,7 @@ class TestCategories:
         [*MODELS, *(make_model(n, category="can") for n in range(60, 90))]
     )
 
+    @pytest.mark.slow
     def test_without_a_name_all_are_compared(self) -> None:
         for number, category in ((3, "box"), (70, "can")):
             pixels = view(make_model(number), pose_of(number), noise_px=0.5)
@@ -334,6 +343,7 @@ class TestCategories:
         ):
             self.LIBRARY.retrieve(np.zeros((10, 2)), IDS, CAMERA, category="boxx")
 
+    @pytest.mark.long
     def test_models_can_be_excluded(self) -> None:
         pixels = view(MODELS[3], pose_of(3), noise_px=0.5)
         rest = self.LIBRARY.retrieve(pixels, IDS, CAMERA, exclude=[("box", "003")], top=90)
@@ -351,15 +361,17 @@ class TestCategories:
 # --- the bound and the order -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 10_000),
     count=st.integers(6, 12),
     depth=st.floats(0.4, 5.0),
     noise_px=st.floats(0.0, 200.0),
     own_sigmas=st.booleans(),
+    loss=st.sampled_from(["linear", "huber", "cauchy"]),
 )
 def test_no_pose_has_errors_below_the_bound(
-    seed: int, count: int, depth: float, noise_px: float, own_sigmas: bool
+    seed: int, count: int, depth: float, noise_px: float, own_sigmas: bool, loss: str
 ) -> None:
     """Also of poses so near that depths differ by large factors."""
     rng = np.random.default_rng(seed)
@@ -376,7 +388,7 @@ def test_no_pose_has_errors_below_the_bound(
     if own_sigmas:
         factors = rng.normal(size=(count, 2, 2)) + 2 * np.eye(2)
         covariances = factors @ factors.transpose(0, 2, 1)
-    options = RetrievalOptions(sigma=covariances)
+    options = RetrievalOptions(sigma=covariances, loss=loss, loss_scale=1.5)
     model = LibraryModel("box", "1", xyz, np.arange(count), np.zeros((2, 3)))
     field = gather_candidates(
         Library.from_models([model])._table,
@@ -385,26 +397,55 @@ def test_no_pose_has_errors_below_the_bound(
         exclude=(),
     )
     errors = pixels - seen
-    cost = np.einsum("ni,nij,nj->", errors, np.linalg.inv(covariances), errors)
+    squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    cost = bent(squares, loss, 1.5).sum()
     assert field.bounds[0] <= cost * (1 + 1e-9) + 1e-9
 
 
-def test_the_bound_is_the_eigenvalue_over_the_largest_leverage() -> None:
+def depth_variances(
+    a: np.ndarray, rays: np.ndarray, multipliers: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """a_i' S^-1 a_i of the linear problem S, its least eigenvalue, and the largest leverage."""
+    (u, v), w = rays.T, multipliers
+    p = (a.T * w) @ a
+    p_u, p_v = (a.T * (w * u)) @ a, (a.T * (w * v)) @ a
+    s = (a.T * (w * (u**2 + v**2))) @ a
+    s -= p_u @ np.linalg.solve(p, p_u) + p_v @ np.linalg.solve(p, p_v)
+    least = eigh(s, p, eigvals_only=True)[0]
+    leverage = np.einsum("ni,ij,nj->n", a, np.linalg.inv(p), a).max()
+    return np.einsum("ni,ij,nj->n", a, np.linalg.inv(s), a), least, leverage
+
+
+def test_the_bound_is_the_least_error_that_the_linear_problem_leaves() -> None:
     for seed in range(10):
         rng = np.random.default_rng(seed)
         points, rays = rng.uniform(-0.3, 0.3, (9, 3)), rng.uniform(-0.2, 0.2, (9, 2))
         seen, weights = rng.permutation(9), rng.uniform(1, 4, 9)
-        a = np.hstack([np.ones((9, 1)), points])
-        w, (u, v) = weights[seen], rays[seen].T
-        p = (a.T * w) @ a
-        p_u, p_v = (a.T * (w * u)) @ a, (a.T * (w * v)) @ a
-        s = (a.T * (w * (u**2 + v**2))) @ a
-        s -= p_u @ np.linalg.solve(p, p_u) + p_v @ np.linalg.solve(p, p_v)
-        leverage = np.einsum("ni,ij,nj->n", a, np.linalg.inv(p), a)
-        expected = eigh(s, p, eigvals_only=True)[0] / leverage.max()
-        assert error_bound(points, seen, rays, weights) == pytest.approx(expected, rel=1e-6)
+        a, w = np.hstack([np.ones((9, 1)), points]), weights[seen]
+        multipliers, bounds = w, []
+        for _ in range(3):
+            variances, least, leverage = depth_variances(a, rays[seen], multipliers)
+            bounds.append((w / (multipliers * variances)).min())
+            if multipliers is w:  # the eigenvalue over the leverage is a bound, too, but lower
+                assert bounds[0] >= least / leverage
+            multipliers = 1 / variances
+        assert error_bound(points, seen, rays, weights) == pytest.approx(max(bounds), rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_bound_of_noisy_views_is_a_good_part_of_the_error(seed: int) -> None:
+    rng = np.random.default_rng([3, seed])
+    points = rng.uniform(-0.3, 0.3, (9, 3))
+    inside = points @ np.linalg.qr(rng.standard_normal((3, 3)))[0] + [0, 0, 2]
+    noise = 1e-3 * rng.standard_normal((9, 2))
+    bound = error_bound(
+        points, np.arange(9), inside[:, :2] / inside[:, 2:] + noise, np.full(9, 1e6)
+    )
+    squares = 1e6 * (noise**2).sum()
+    assert 0.1 * squares < bound < squares
+
+
+@pytest.mark.long
 def test_the_bound_spares_most_of_the_work() -> None:
     pixels = view(MODELS[3], pose_of(3), noise_px=1.0)
     options = RetrievalOptions(top=1)
@@ -414,6 +455,43 @@ def test_the_bound_spares_most_of_the_work() -> None:
     assert ranking.searched < 500
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_a_robust_query_is_bounded_and_finds_what_an_exhaustive_one_finds(loss: str) -> None:
+    pixels = view(MODELS[3], pose_of(3), noise_px=1.0)
+    many = Library.from_models([make_model(number) for number in range(1500)])
+    options = RetrievalOptions(top=1, loss=loss, loss_scale=3.0)
+    observed = observe(pixels, IDS, CAMERA, options)
+    candidates = gather_candidates(many._table, observed, options, ())
+    found = rank(candidates, observed, options, -1)
+    every = rank(candidates, observed, replace(options, exhaustive=True), -1)
+    assert (candidates.bounds > 0).all()
+    assert found.searched < every.searched == 1500
+    likely = every.scores > 1e-8
+    assert found.candidates[: likely.sum()].tolist() == every.candidates[likely].tolist()
+
+
+@pytest.mark.parametrize("noise_px", [1.0, 5.0])
+def test_candidates_that_cannot_count_are_searched_less(noise_px: float) -> None:
+    """The ceilings change no log-likelihood within 20 of the best."""
+    many = Library.from_models([make_model(number) for number in range(300)])
+    options = RetrievalOptions(sigma=noise_px, top=1)
+    pixels = view(MODELS[3], pose_of(3), noise_px=noise_px)
+    observed = observe(pixels, IDS, CAMERA, options)
+    candidates = gather_candidates(many._table, observed, options, (), 1)
+    everything = np.arange(len(candidates.models))
+    effort = 5, 4, 20
+    free = np.full(len(everything), np.inf)
+    _, costs = search_all(observed.query, candidates.keypoints, everything, free, *effort)
+    reached = candidates.base - costs / 2
+    ceilings = 2 * (candidates.base - reached.max() + 20)
+    _, found = search_all(observed.query, candidates.keypoints, everything, ceilings, *effort)
+    near = reached > reached.max() - 20
+    assert (found[near] == costs[near]).all()
+    assert (found > costs).any()
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("noise_px", [0.5, 4.0, 12.0])
 def test_the_list_is_the_same_as_if_all_models_were_searched(noise_px: float) -> None:
     for number in range(8):
@@ -426,6 +504,7 @@ def test_the_list_is_the_same_as_if_all_models_were_searched(noise_px: float) ->
             assert one.score == pytest.approx(other.score, abs=1e-4)
 
 
+@pytest.mark.long
 def test_nothing_depends_on_the_order_of_anything_or_on_the_workers() -> None:
     rng = np.random.default_rng(0)
     shuffled = Library.from_models([MODELS[k] for k in rng.permutation(60)])
@@ -596,6 +675,7 @@ def rank_1_rate(library: Library, noise_px: float, keypoints: int, queries: int)
     return hits / made
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("noise_px", "keypoints", "least"),
     [(1.0, 8, 0.97), (1.0, 10, 0.99), (3.0, 8, 0.82), (5.0, 8, 0.60)],
@@ -607,7 +687,7 @@ def test_real_chairs_are_found_among_799(
     assert rank_1_rate(chairs, noise_px, keypoints, 60) >= least
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scores_of_real_chairs_are_calibrated(chairs: Library) -> None:
     """The mean probability of the first match is the share of right ones."""
     models = list(chairs)[::10]
@@ -621,6 +701,7 @@ def test_scores_of_real_chairs_are_calibrated(chairs: Library) -> None:
     assert np.mean(scores) == pytest.approx(np.mean(right), abs=0.12)
 
 
+@pytest.mark.long
 def test_the_list_is_exact_in_a_library_of_real_chairs(chairs: Library) -> None:
     for place, noise_px in enumerate((1.0, 3.0, 5.0)):
         model = list(chairs)[100 * place]

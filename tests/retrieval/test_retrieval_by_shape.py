@@ -68,6 +68,7 @@ def iou(match: Any, model: LibraryModel) -> float:
     return box_iou_up_to_scale(est=match.box, gt=Box.from_model(model.bounds, POSE))
 
 
+@pytest.mark.long
 def test_first_match_of_unseen_objects_overlaps_more_than_by_fits() -> None:
     by_shape = [iou(first(model), model) for model in OBJECTS]
     by_fit = [iou(first(model, shape=None), model) for model in OBJECTS]
@@ -81,6 +82,7 @@ def gap(model: LibraryModel, other: LibraryModel) -> float:
     return float(np.linalg.norm(one - two * (one * two).sum() / (two * two).sum()))
 
 
+@pytest.mark.long
 def test_unstretched_first_match_is_among_the_most_similar() -> None:
     places = []
     for model in OBJECTS:
@@ -91,6 +93,7 @@ def test_unstretched_first_match_is_among_the_most_similar() -> None:
     assert np.median(places) <= len(MODELS) / 30
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [5, 10])
 def test_models_of_the_library_are_found(count: int) -> None:
     ranks = []
@@ -103,6 +106,7 @@ def test_models_of_the_library_are_found(count: int) -> None:
     assert np.median(ranks) <= (1 if count == 10 else 8)
 
 
+@pytest.mark.slow
 def test_size_and_place_of_models_do_not_count() -> None:
     model = OBJECTS[0]
     moved = [
@@ -148,6 +152,7 @@ def test_stretched_box_is_close_to_the_estimated_one() -> None:
     assert best.rms < 20
 
 
+@pytest.mark.slow
 def test_models_that_lack_keypoints_are_ranked_below_the_same_with_them() -> None:
     model = OBJECTS[4]
     best = first(model)
@@ -166,6 +171,7 @@ def test_excluded_models_are_left_out() -> None:
     assert other.model_id != best.model_id
 
 
+@pytest.mark.slow
 def test_outliers_do_not_count_with_a_robust_loss() -> None:
     model = OBJECTS[5]
     pixels = seen(model)
@@ -176,6 +182,7 @@ def test_outliers_do_not_count_with_a_robust_loss() -> None:
     assert iou(robust[0], model) > iou(first(model), model) - 0.1
 
 
+@pytest.mark.long
 def test_categories_share_the_probability() -> None:
     tall = [
         replace(each, category="mast", xyz=each.xyz * [0.2, 2, 0.2], bounds=each.bounds * 1.0)

@@ -103,6 +103,7 @@ class TestSilhouettes:
         frame = RaycastRenderer().render(Scene(model.load_mesh()), CAMERA, pose)
         return CAMERA.project(pose.apply(model.xyz)), frame
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["a-cut", "b-full"])
     def test_a_mask_tells_models_with_the_same_keypoints_apart(self, twins, name) -> None:
         pixels, frame = self.seen(twins, name)
@@ -120,6 +121,7 @@ class TestSilhouettes:
         gap = ranked[0].silhouette_iou - ranked[2].silhouette_iou
         assert ranked[0].score / ranked[2].score == pytest.approx(np.exp(gap / 0.05))
 
+    @pytest.mark.long
     def test_a_mask_may_hold_opacities(self, twins) -> None:
         pixels, frame = self.seen(twins, "b-full")
         by_mask = twins.retrieve(pixels, np.arange(7), CAMERA, mask=frame.mask)
@@ -127,6 +129,7 @@ class TestSilhouettes:
             ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=mask)
             assert [m.to_dict() for m in ranked] == [m.to_dict() for m in by_mask]
 
+    @pytest.mark.slow
     def test_an_image_s_opacity_is_its_mask(self, twins) -> None:
         pixels, frame = self.seen(twins, "b-full")
         image = np.dstack([np.zeros((480, 640, 3)), 255 * frame.mask]).astype(np.uint8)
@@ -134,6 +137,7 @@ class TestSilhouettes:
         assert ranked[0].model_id == "b-full"
         assert ranked[0].silhouette_iou > 0.99
 
+    @pytest.mark.long
     @pytest.mark.parametrize("name", ["a-cut", "b-full"])
     def test_the_object_is_cut_out_of_a_photo(self, twins, name) -> None:
         pixels, frame = self.seen(twins, name)
@@ -144,6 +148,7 @@ class TestSilhouettes:
         assert ranked[0].model_id == name
         assert ranked[0].silhouette_iou > 0.95
 
+    @pytest.mark.slow
     def test_what_shows_nothing_or_does_not_fit_is_refused(self, twins) -> None:
         pixels, _ = self.seen(twins, "b-full")
 
@@ -195,6 +200,7 @@ def _hull(points: np.ndarray) -> Mesh:
 # --- the commands ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_library_is_built_and_shown(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,6 +239,24 @@ def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFix
     assert lines[2].split()[:4] == ["1", "chair", case.model_id, "100.0"]
     assert lines[2].split()[-4:-2] == [f"{matches[0].rms:.2f}", "13/13"]
     assert not any("IoU" in line for line in lines)
+
+
+@pytest.mark.long
+def test_table_and_page_say_that_it_is_none_of_these(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = Library.from_models(m for m in case.library if m.model_id != case.model_id)
+    others.save(tmp_path / "others.cadalign")
+    seen = str(case.folder / "seen.json")
+    options = ["--library", str(tmp_path / "others.cadalign"), "--out", str(tmp_path / "out")]
+    assert main(["retrieve", seen, *options]) == 0
+    said = capsys.readouterr().err
+    assert "None of these: 100.0 %" in said
+    assert "None of these: 100.0 %" in (tmp_path / "out" / "index.html").read_text("utf-8")
+    saved = json.loads((tmp_path / "out" / "matches.json").read_text("utf-8"))
+    assert saved[0]["none_probability"] > 0.999
+    assert main(["retrieve", *case.arguments]) == 0
+    assert "None of these: 100" not in capsys.readouterr().err
 
 
 def test_matches_as_json_are_those_of_the_library(
@@ -276,6 +300,7 @@ def test_the_sigma_of_the_file_is_used(case: Case, capsys: pytest.CaptureFixture
     assert json.loads(capsys.readouterr().out) == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("option", ["--mask", "--silhouette"])
 def test_silhouettes_are_compared(
     case: Case, option: str, capsys: pytest.CaptureFixture[str]
@@ -287,6 +312,7 @@ def test_silhouettes_are_compared(
     assert float(lines[2].split()[-1]) > 0.9
 
 
+@pytest.mark.long
 def test_a_photo_with_opacity_needs_no_cutting_out(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -331,6 +357,7 @@ def test_a_photo_without_opacity_has_three_channels(case: Case, tmp_path: Path) 
     assert read_opacity(path, CAMERA).shape == (480, 640, 3)
 
 
+@pytest.mark.long
 def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -345,6 +372,7 @@ def test_a_photo_that_moved_is_missed_only_where_it_is_shown(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_a_page_shows_the_matches_side_by_side(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str], browser: Browser
 ) -> None:
@@ -380,6 +408,7 @@ def test_a_page_shows_the_matches_side_by_side(
             page.close()
 
 
+@pytest.mark.long
 def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None:
     for top in (3, 2):
         write_retrieval(
@@ -388,6 +417,7 @@ def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None
     assert len(list(tmp_path.glob("overlay_*.png"))) == 2
 
 
+@pytest.mark.slow
 def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) -> None:
     mine = ["overlay_mine.png", "overlay_1.png", "overlay_007.png", "overlay_12_old.png"]
     for name in (*mine, "overlay_12.png", "overlay_100.png"):
@@ -456,6 +486,7 @@ def test_malformed_queries_are_refused(
     assert missing == f"{tmp_path / 'no.json'}: no such file"
 
 
+@pytest.mark.long
 def test_what_the_library_refuses_is_one_line(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,6 +35,7 @@ def test_complete_vectors_give_their_mean_and_covariance(seed: int, entries: int
     assert model.covariances[0] == pytest.approx(expected, abs=1e-5 * np.abs(expected).max() + 1e-6)
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32 - 1))
 def test_log_likelihoods_are_the_marginal_densities(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -53,6 +54,7 @@ def test_log_likelihoods_are_the_marginal_densities(seed: int) -> None:
         assert found == pytest.approx(np.log(density), rel=1e-9)
 
 
+@pytest.mark.long
 def test_missing_entries_are_recovered_from_the_others() -> None:
     rng = np.random.default_rng(0)
     values = correlated(rng, 4000, 4)
@@ -65,6 +67,7 @@ def test_missing_entries_are_recovered_from_the_others() -> None:
     assert np.abs(model.covariances[0] - covariance).max() < 0.1 * np.abs(covariance).max()
 
 
+@pytest.mark.slow
 def test_every_round_makes_the_vectors_more_likely() -> None:
     rng = np.random.default_rng(1)
     values = correlated(rng, 100, 5)

@@ -18,8 +18,9 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.io.sealed import Seal
 from cadalign.shapes.examples import Example
+from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import ShapeComponent
+from cadalign.shapes.parts import Reflection, ShapeComponent
 from cadalign.shapes.shape_file import SEAL
 
 TABLE = np.array(
@@ -49,6 +50,7 @@ def learned() -> ShapeModel:
     return ShapeModel.learn(tables(120, missing=0.2), category="table", up_axis="y")
 
 
+@pytest.mark.long
 def test_the_mean_is_that_of_the_models(learned: ShapeModel) -> None:
     expected = np.mean([each.points_3d for each in tables(120)], axis=0)
     assert learned.ids == tuple(IDS)
@@ -58,6 +60,7 @@ def test_the_mean_is_that_of_the_models(learned: ShapeModel) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_modes_are_the_three_sizes(learned: ShapeModel) -> None:
     component = max(learned.components, key=lambda each: each.weight)
     shares = component.variance / np.trace(component.covariance)
@@ -74,6 +77,7 @@ def test_the_mirror_symmetry_is_found(learned: ShapeModel) -> None:
     assert np.abs(mirrored[partners] - learned.mean[:-2]).max() < 0.1
 
 
+@pytest.mark.long
 def test_a_symmetric_mixture_is_its_own_mirror_image() -> None:
     model = ShapeModel.learn(tables(60), components=1)
     assert model.reflection is not None
@@ -85,6 +89,7 @@ def test_a_symmetric_mixture_is_its_own_mirror_image() -> None:
     assert mirrored == pytest.approx(mean, abs=1e-6)
 
 
+@pytest.mark.long
 def test_two_kinds_of_objects_get_two_components() -> None:
     rng = np.random.default_rng(5)
     high = [Example(f"{row}", IDS, TABLE + rng.normal(0, 0.05, (7, 3))) for row in range(60)]
@@ -98,6 +103,7 @@ def test_two_kinds_of_objects_get_two_components() -> None:
     assert len(ShapeModel.learn(high).components) == 1
 
 
+@pytest.mark.long
 def test_the_order_of_models_hardly_matters() -> None:
     models = tables(40)
     first = ShapeModel.learn(models, components=1, modes=5)
@@ -105,6 +111,7 @@ def test_the_order_of_models_hardly_matters() -> None:
     assert first.mean == pytest.approx(second.mean, abs=0.02)
 
 
+@pytest.mark.long
 @given(st.floats(1e-3, 1e3))
 @settings(max_examples=5, deadline=None)
 def test_learning_does_not_depend_on_the_unit(factor: float) -> None:
@@ -119,6 +126,7 @@ def test_learning_does_not_depend_on_the_unit(factor: float) -> None:
     assert other.mean == pytest.approx(plain.mean * factor, rel=1e-5, abs=1e-5 * factor)
 
 
+@pytest.mark.slow
 def test_without_bounds_the_boxes_are_those_of_the_keypoints() -> None:
     bare = [replace(each, bounds=None) for each in tables(30)]
     model = ShapeModel.learn(bare, components=1)
@@ -127,6 +135,7 @@ def test_without_bounds_the_boxes_are_those_of_the_keypoints() -> None:
     assert np.abs(offset).max() < 0.1
 
 
+@pytest.mark.long
 def test_progress_ends_at_all_steps() -> None:
     steps: list[tuple[int, int]] = []
     ShapeModel.learn(tables(20), on_progress=lambda done, total: steps.append((done, total)))
@@ -151,6 +160,45 @@ def test_from_basis_scales_with_the_size() -> None:
     assert not model.has_box
 
 
+def mirrored_across_x(rows: FloatArray, offset: float = 0.0) -> FloatArray:
+    """Tables, or motions of them, (..., 9, 3) in the mirror."""
+    found = rows[..., [1, 0, 3, 2, 5, 4, 6, 7, 8], :] * [-1, 1, 1] + [2 * offset, 0, 0]
+    found[..., [7, 8], 0] = found[..., [8, 7], 0]
+    return np.asarray(found)
+
+
+def test_from_basis_with_a_reflection_is_symmetric(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    skew, modes = TABLE + [0.5, 0, 0] + rng.normal(0, 0.1, TABLE.shape), rng.normal(size=(2, 7, 3))
+    mirror = Reflection("x", 0.5, ((0, 1), (2, 3), (4, 5)))
+    made, free = (
+        ShapeModel.from_basis(
+            skew, modes, [0.3, 0.1], residual_sigma=0.05, size_sigma=0.1, reflection=each
+        )
+        for each in (mirror, None)
+    )
+    assert made.reflection == mirror
+    assert made.mean == pytest.approx((free.mean + mirrored_across_x(free.mean, 0.5)) / 2)
+    assert made.mean == pytest.approx(mirrored_across_x(made.mean, 0.5))
+    (component,), (other,) = made.components, free.components
+    matrix = np.array([mirrored_across_x(row.reshape(9, 3)).ravel() for row in np.eye(27)])
+    averaged = (other.covariance + matrix.T @ other.covariance @ matrix) / 2
+    assert component.covariance == pytest.approx(averaged, abs=1e-12)
+    made.save(tmp_path / "table.shape")
+    assert ShapeModel.open(tmp_path / "table.shape").reflection == mirror
+
+
+def test_a_reflection_changes_nothing_of_a_symmetric_basis() -> None:
+    mirror = Reflection("x", 0.0, ((0, 1), (2, 3), (4, 5)))
+    wider = TABLE * [1, 0, 0]
+    made, free = (
+        ShapeModel.from_basis(TABLE, [wider], [0.2], reflection=each) for each in (mirror, None)
+    )
+    assert len(made.components[0].modes) == 1
+    assert made.mean == pytest.approx(free.mean)
+    assert made.components[0].covariance == pytest.approx(free.components[0].covariance)
+
+
 def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
     rng = np.random.default_rng(0)
     modes, sigmas = rng.normal(size=(3, 7, 3)), np.array([0.3, 0.0, 0.1])
@@ -160,6 +208,7 @@ def test_from_basis_keeps_the_covariance_of_its_modes() -> None:
     assert model.components[0].covariance[:21, :21] == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12))
 def test_from_covariance_keeps_it(seed: int, rank: int) -> None:
     rng = np.random.default_rng(seed)
@@ -189,11 +238,18 @@ def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
 
 
 def test_a_saved_model_is_the_same(learned: ShapeModel, tmp_path: Path) -> None:
-    learned = replace(learned, inflation=1.25)
+    few = FewKeypoints(typical=9.5, share=0.8)
+    learned = replace(learned, inflation=1.25, degrees_of_freedom=5.0, few_keypoints=few)
     learned.save(tmp_path / "table.shape")
     opened = cadalign.ShapeModel.open(tmp_path / "table.shape")
     for name in ("category", "ids", "has_box", "up_axis", "reflection", "unit", "inflation"):
         assert getattr(opened, name) == getattr(learned, name)
+    assert opened.degrees_of_freedom == learned.degrees_of_freedom
+    assert opened.few_keypoints == few
+    assert opened.box_margins is not None
+    assert learned.box_margins is not None
+    assert (opened.box_margins.margins == learned.box_margins.margins).all()
+    assert (opened.box_margins.tolerances == learned.box_margins.tolerances).all()
     for mine, other in zip(learned.components, opened.components, strict=True):
         assert mine.weight == other.weight
         assert mine.residual_sigma == other.residual_sigma
@@ -210,14 +266,28 @@ def test_a_file_without_inflation_is_read(learned: ShapeModel, tmp_path: Path) -
     learned.save(file)
     document = msgspec.msgpack.decode(SEAL.unwrap(file.read_bytes(), "table.shape"))
     del document["inflation"]
+    del document["degrees_of_freedom"]
+    del document["box_margins"]
+    del document["few_keypoints"]
     SEAL.write(file, msgspec.msgpack.encode(document))
     assert ShapeModel.open(file).inflation == 1
+    assert ShapeModel.open(file).degrees_of_freedom is None
+    assert ShapeModel.open(file).box_margins is None
+    assert ShapeModel.open(file).few_keypoints is None
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_an_inflation_that_is_no_factor_is_refused(learned: ShapeModel, value: float) -> None:
     with pytest.raises(InputError, match="inflation"):
         replace(learned, inflation=value)
+
+
+@pytest.mark.parametrize("value", [2.0, 0.0, float("nan")])
+def test_degrees_of_freedom_without_a_covariance_are_refused(
+    learned: ShapeModel, value: float
+) -> None:
+    with pytest.raises(InputError, match="degrees_of_freedom"):
+        replace(learned, degrees_of_freedom=value)
 
 
 @pytest.fixture(scope="module")
@@ -332,6 +402,7 @@ def test_refusals(learned: ShapeModel) -> None:
         ({"size_sigma": -0.1}, "size_sigma: -0.1 is negative"),
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
         ({"up_axis": "w"}, "up_axis: 'w' is not one of 'x', 'y', 'z'"),
+        ({"reflection": Reflection("x", 0, ((0, 9),))}, "reflection: unknown keypoint 9"),
         ({"residual_sigma": -1}, "residual_sigma: -1 is not a standard deviation"),
     ],
 )
@@ -369,6 +440,7 @@ def test_real_linear_models_are_read(real_data: Path) -> None:
     assert model.components[0].covariance.shape == (48, 48)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("category", ["chair", "airplane", "mug"])
 def test_real_models_that_were_held_out_are_likely(real_data: Path, category: str) -> None:
     """A keypoint follows from the others: its error is far below its deviation in the category."""

@@ -109,6 +109,7 @@ def test_refusals() -> None:
     ).startswith("bounds: the least corner")
 
 
+@pytest.mark.slow
 def test_a_real_chair_becomes_another_without_folds(real_data: Path) -> None:
     chairs = KeypointNet(real_data / "keypointnet")["chair"]
     model = next(each for each in chairs if each.mesh_path is not None)

@@ -59,6 +59,7 @@ def test_no_solution_comes_twice_and_the_least_stretch_comes_first(seed: int) ->
     assert stretch == sorted(stretch)
 
 
+@pytest.mark.long
 def test_truth_is_among_the_solutions() -> None:
     """At least 99.8 % of 2,000 random problems, to 1e-4."""
     missed = []
@@ -70,6 +71,7 @@ def test_truth_is_among_the_solutions() -> None:
     assert len(missed) <= 4, f"missed in problems {missed}"
 
 
+@pytest.mark.long
 def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     """No exact alignment that a local search from many starts finds is left out."""
     from cadalign.solvers.objective import keypoint_objective

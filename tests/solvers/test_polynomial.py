@@ -8,16 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial as P
 
-from cadalign.solvers.polynomial import multiply_add, real_roots
+from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
 
-def roots_of(
-    coefficients: np.ndarray, *, start: float = -1.0, end: float = 1.0, touching: float = 1e-7
-) -> np.ndarray:
+def roots_of(coefficients: np.ndarray, *, reach: float = 1.0, touching: float = 1e-7) -> np.ndarray:
     degree = len(coefficients) - 1
-    found = np.empty(2 * degree)
-    count = real_roots(np.asarray(coefficients, dtype=float), degree, start, end, touching, found)
-    return np.sort(found[:count])
+    memory = np.empty((ROOTS_ROWS + 1, 2 * degree))
+    memory[1, : degree + 1] = coefficients
+    count = real_roots(memory, 1, degree, reach, touching)
+    return np.sort(memory[2, :count])
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 8))
@@ -73,11 +72,19 @@ def test_roots_do_not_depend_on_the_polynomials_size(size: float) -> None:
     np.testing.assert_allclose(found, roots, rtol=0, atol=1e-9)
 
 
-@given(seed=st.integers(0, 2**32 - 1), factor=st.floats(-3, 3))
-def test_multiply_add_is_polynomial_multiplication(seed: int, factor: float) -> None:
+@pytest.mark.parametrize("scale", [1e-3, 1e-2, 0.1, 1.0])
+def test_small_roots_beside_large_ones_are_found(scale: float) -> None:
+    small = scale * np.array([-0.7, -0.2, 0.1, 0.4])
+    roots = np.sort(np.concatenate([small, [0.93, -0.97, 3.0, 40.0]]))
+    found = roots_of(P.polyfromroots(roots))
+    np.testing.assert_allclose(found, roots[np.abs(roots) < 1], rtol=1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1), reach=st.floats(0.1, 10))
+def test_roots_are_those_within_reach(seed: int, reach: float) -> None:
     rng = np.random.default_rng(seed)
-    first, second, base = rng.normal(size=4), rng.normal(size=3), rng.normal(size=6)
-    target = base.copy()
-    multiply_add(target, first, second, factor)
-    expected = base + factor * P.polymul(first, second)
-    np.testing.assert_allclose(target, expected, rtol=0, atol=1e-12)
+    roots = np.sort(rng.uniform(-12, 12, 6))
+    if np.diff(roots).min() < 0.1 or np.abs(np.abs(roots) - reach).min() < 1e-3:
+        return
+    found = roots_of(P.polyfromroots(roots), reach=reach)
+    np.testing.assert_allclose(found, roots[np.abs(roots) < reach], rtol=0, atol=1e-6)

@@ -67,6 +67,7 @@ def test_ray_derivatives_are_those_of_finite_differences(seed: int) -> None:
     )
 
 
+@pytest.mark.slow
 @given(seed=seeds, axis=st.sampled_from("xyz"), camera=st.sampled_from([PLAIN, LENS]))
 def test_pixel_derivatives_are_those_of_finite_differences(
     seed: int, axis: str, camera: Camera

@@ -39,6 +39,7 @@ def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:
     assert FitResult.from_json(result.to_json()).alignment == result.alignment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

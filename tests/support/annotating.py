@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import uvicorn
+from playwright.sync_api import Page
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
@@ -20,6 +22,7 @@ from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.server import listen, make_app
 from cadalign.annotate.session import Session
+from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
@@ -58,8 +61,11 @@ class Case:
             keypoints=folder / self.keypoints.name,
         )
 
-    def open(self, **options: Any) -> Session:
-        """A session with the calibrated camera and the model's keypoints."""
+    def open(self, *, prepared: bool = True, **options: Any) -> Session:
+        """A session with the calibrated camera and the model's keypoints.
+
+        One that is not ``prepared`` aligns nothing.
+        """
         defaults: dict[str, Any] = {
             "image": self.photo,
             "model": self.model,
@@ -67,13 +73,14 @@ class Case:
             "keypoints": self.keypoints,
         }
         session = open_session(SessionOptions(**(defaults | options)))
-        session.warm_up()
+        if prepared:
+            session.warm_up()
         return session
 
 
-def make_case(sample_root: Path, folder: Path) -> Case:
-    """Render the photo and write camera and keypoints."""
-    model = KeypointNet(sample_root)["chair", "sample_chair_000"]
+def make_case(root: Path, folder: Path, *, model_id: str = "sample_chair_000") -> Case:
+    """Render the photo of a chair and write camera and keypoints."""
+    model = KeypointNet(root)["chair", model_id]
     instance = make_instance(
         model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
     )
@@ -144,3 +151,43 @@ def served(session: Session) -> Iterator[Access]:
         server.should_exit = True
         thread.join(timeout=10)
         listener.close()
+
+
+def wait(page: Page, condition: str, *, polls: int = 3000) -> None:
+    """Wait for a condition in a page, given in JavaScript."""
+    for _ in range(polls):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(20)
+    raise AssertionError(f"never true: {condition}")
+
+
+def place_of_pixel(page: Page, uv: Sequence[float]) -> tuple[float, float]:
+    """Place in the page of a pixel of the photo."""
+    x, y = page.evaluate(
+        """uv => {
+            const { left, top } = annotator.photo.canvas.getBoundingClientRect();
+            const place = annotator.photo.toView(uv);
+            return [left + place.x, top + place.y];
+        }""",
+        list(uv),
+    )
+    return x, y
+
+
+def fitted(
+    case: Case, capsys: pytest.CaptureFixture[str], name: str = "photo.json"
+) -> dict[str, Any]:
+    """The output of `cadalign fit --json` for an observation file."""
+    command = ["fit", str(case.folder / name), "--json", "--out", str(case.folder / "x")]
+    assert main(command) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+def flat(value: Any) -> list[float]:
+    """All numbers of nested lists and objects."""
+    if isinstance(value, dict):
+        return flat(list(value.values()))
+    if isinstance(value, list | tuple):
+        return [number for item in value for number in flat(item)]
+    return [value]

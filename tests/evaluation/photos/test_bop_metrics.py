@@ -190,6 +190,7 @@ def test_recalls():
     assert np.isnan(mspd_recall([], width=640))
 
 
+@pytest.mark.slow
 def test_the_sample_against_itself_and_a_millimetre_off(real_data):
     photo = cadalign.datasets.open(real_data / "real" / "lmo_multiview")[0]
     shown = photo.objects[0]

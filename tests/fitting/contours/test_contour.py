@@ -24,6 +24,7 @@ def disc(center: tuple[float, float], radius: float) -> np.ndarray:
     return distances(center) < radius
 
 
+@pytest.mark.long
 @given(x=st.floats(60, 100), y=st.floats(50, 70), radius=st.floats(12, 40), soft=st.booleans())
 def test_a_disc_has_its_own_radius_and_normals(
     x: float, y: float, radius: float, soft: bool

@@ -39,6 +39,7 @@ def case_of(seed: int, scale: tuple[float, float, float]) -> tuple[Model, View, 
     return model, View(CAMERA, pixels), View(CAMERA, pixels, **told), truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_depth_over_the_surface_sharpens_all_scales(seed: int) -> None:
     model, _, view, truth = case_of(seed, (1.5, 0.8, 1.2))
@@ -52,6 +53,7 @@ def test_depth_over_the_surface_sharpens_all_scales(seed: int) -> None:
     assert result.std.scale[0] < 0.7 * at_keypoints.std.scale[0]
 
 
+@pytest.mark.slow
 def test_contributions_tell_mask_and_depth_apart() -> None:
     model, _, view, _ = case_of(0, (1.5, 0.8, 1.2))
     result = align(model, view)

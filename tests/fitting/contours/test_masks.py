@@ -14,9 +14,11 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation.accuracy.masks import damaged_mask
 from cadalign.fitting.contours.bound import contour_bound
-from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
+
+pytestmark = pytest.mark.long
 
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 
@@ -157,6 +159,29 @@ def test_damaged_masks_still_help(sample_root: Path, kind: str) -> None:
         assert abs(residuals.offset) == pytest.approx(2, abs=0.5)
 
 
+@pytest.mark.parametrize("kind", ["exact", "dilated", "eroded", "smoothed"])
+def test_deviations_are_those_of_the_errors(sample_root: Path, kind: str) -> None:
+    dataset = KeypointNet(sample_root)
+    whitened = []
+    for category in ("chair", "vessel", "car"):
+        for seed in range(4):
+            case = case_of(dataset[category][0], seed)
+            mask = damaged_mask(case.mask, kind, np.random.default_rng(seed))
+            result = align(case.model, case.view(mask=mask))
+            turn = result.alignment.rotation @ case.truth.rotation.T
+            errors = np.concatenate(
+                [
+                    vector_from_rotation(turn),
+                    result.alignment.translation - case.truth.translation,
+                    np.log(result.alignment.scale / case.truth.scale)[1:],
+                ]
+            )
+            deviations = np.sqrt(result.covariance.diagonal())[[0, 1, 2, 3, 4, 5, 7, 8]]
+            whitened.append(np.abs(errors / deviations))
+    assert np.mean(np.array(whitened) < 1.96) > 0.9
+    assert 0.4 < np.sqrt(np.mean(np.square(whitened))) < 1.3
+
+
 class TestOtherObjects:
     def test_the_mask_of_a_neighbour_is_named_and_left_out(self, sample_root: Path) -> None:
         case = chair(sample_root)
@@ -168,6 +193,19 @@ class TestOtherObjects:
         assert residuals is not None
         assert not residuals.is_used
         assert rotation_error(est=result.alignment, gt=alone.alignment) < 1e-3
+
+    def test_neighbours_are_named_at_least_19_times_of_20(self, sample_root: Path) -> None:
+        dataset = KeypointNet(sample_root)
+        models = [dataset[category][0] for category in ("bottle", "car", "chair", "vessel")]
+        cases = [case_of(model, seed) for seed in range(5) for model in models]
+        named = []
+        for number, case in enumerate(cases):
+            columns = np.flatnonzero(case.mask.any(axis=0))
+            step = (len(columns) if number % 2 else -len(columns)) * 3 // 4
+            neighbour = np.roll(cases[(7 * number + 1) % len(cases)].mask, step, axis=1)
+            warnings = align(case.model, case.view(mask=neighbour)).warnings
+            named.append(any(text.startswith("views[0].mask contradicts") for text in warnings))
+        assert np.mean(named) >= 0.95
 
 
 class TestStarts:

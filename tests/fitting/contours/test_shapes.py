@@ -16,6 +16,8 @@ from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.shapes.examples import Example, examples_of
 from cadalign.shapes.warp import linear_warp, warp_mesh
 
+pytestmark = pytest.mark.long
+
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 
 
@@ -49,6 +51,31 @@ def test_a_learned_shape_is_better_with_a_mask(bottles: tuple[AnnotatedModel, ..
             result = align(shape, View(CAMERA, pixels, ids=ids, mask=given))
             found.append(box_iou_up_to_scale(est=result.box, gt=box))
     assert np.mean(joint) > np.mean(alone)
+
+
+def test_depth_over_a_learned_surface_counts_as_similar(
+    bottles: tuple[AnnotatedModel, ...],
+) -> None:
+    shape, model = learned(bottles[4:]), bottles[0]
+    rng = np.random.default_rng(5)
+    scene, points = Scene(model.load_mesh()), model.keypoints.xyz
+    shown = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, roll=10.0)
+    truth = shown.cam_from_model
+    pixels = CAMERA.project(truth.apply(points[shown.visible]))
+    pixels += rng.normal(0, 1, pixels.shape)
+    seen = cast_geometry(scene, CAMERA, truth)
+    depth = np.where(seen.mask, seen.depth * (1 + 0.005 * rng.normal(size=seen.depth.shape)), 6.0)
+    ids = model.keypoints.semantic_ids[shown.visible].tolist()
+    view = View(CAMERA, pixels, ids=ids, mask=seen.mask, depth=depth, depth_sigma=0.005)
+    result = align(shape, view)
+    of_depth = next(each for each in result.evidence if each.kind == "depth")
+    assert of_depth.count > 30
+    assert of_depth.rms_sigmas < 1.5  # the surface's own error is part of sigma
+    lengths = np.ptp(result.bounds, axis=0) * result.alignment.scale
+    errors = np.log(lengths / np.ptp(scene.bounds, axis=0))
+    assert np.abs(errors).max() < 0.1
+    assert np.linalg.norm(result.alignment.translation - truth.translation) < 0.05
+    assert not any("contradict" in text for text in result.warnings)
 
 
 def test_a_learned_shape_without_meshes_is_told_what_to_do() -> None:

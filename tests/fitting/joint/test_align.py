@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Model, RansacOptions, View, align, align_batch, fit
+from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.fitting.joint.result import AlignResult
 from cadalign.metrics import rotation_error
+from cadalign.shapes.box_margins import BoxMargins
+from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
@@ -97,6 +99,7 @@ class TestSimilarModel:
         assert honest.std.rotation_deg > 3 * naive.std.rotation_deg
         assert not any("residuals" in text for text in honest.warnings)
 
+    @pytest.mark.long
     def test_stated_deviations_hold_the_truth(self) -> None:
         points, inside = keypoints(12), 0
         for seed in range(100):
@@ -121,6 +124,46 @@ class TestSimilarModel:
         growth /= np.trace(plain.points_covariance, axis1=1, axis2=2)
         assert (growth > 1).all()
         assert (growth < 1.5**2 + 1e-9).all()
+
+    def test_few_keypoints_need_less_inflation(self) -> None:
+        model = replace(spreads(0.05), inflation=1.5)
+        less = replace(model, few_keypoints=FewKeypoints(typical=40.0, share=0.7))
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        for views in (view, [view, view]):  # two without motion take the way of any evidence
+            wide, narrow = align(model, views), align(less, views)
+            assert narrow.std.rotation_deg < wide.std.rotation_deg
+            assert np.allclose(narrow.points_3d, wide.points_3d, atol=1e-12)
+
+    def test_heavy_tails_change_the_regions_and_not_the_estimate(self) -> None:
+        model = spreads(0.05)
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        plain, tails = align(model, view), align(replace(model, degrees_of_freedom=4.0), view)
+        assert (tails.covariance == plain.covariance).all()
+        assert plain.radius(0.95) == pytest.approx(1.96, abs=1e-3)
+        assert tails.radius(0.999, dimension=3) > plain.radius(0.999, dimension=3)
+        assert tails.radius(0.5) < plain.radius(0.5)
+        read = AlignResult.from_dict(json.loads(json.dumps(tails.to_dict())))
+        assert read.degrees_of_freedom == 4
+        for wrong in (0.0, 1.0, float("nan")):
+            with pytest.raises(InputError, match="probability"):
+                plain.radius(wrong)
+        with pytest.raises(InputError, match="dimension"):
+            plain.radius(0.5, dimension=0)
+
+    def test_the_box_ends_at_keypoints_that_its_faces_are_near(self) -> None:
+        model = spreads(0.05)
+        view = seen(model.components[0].mean[:-2], truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        near = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
+        result = align(replace(model, box_margins=near), view)
+        points = result.points_3d
+        assert np.allclose(result.bounds, [points.min(0) - 0.01, points.max(0) + 0.01])
+        far = BoxMargins(np.full((2, 3), -9.0), np.zeros((2, 3)))
+        assert np.allclose(
+            align(replace(model, box_margins=far), view).bounds, align(model, view).bounds
+        )
+        tall = Size(height=float(np.ptp(points[:, 1])) + 0.2, sigma=0.001)
+        sized = align(replace(model, box_margins=near), view, size=tall)
+        assert np.allclose(sized.bounds, align(model, view, size=tall).bounds)
 
     def test_a_learned_shape_comes_nearer_than_its_mean(self) -> None:
         model, rng = spreads(0.05), np.random.default_rng(2)
@@ -167,6 +210,7 @@ class TestSeveralViews:
         motion = together.poses[1].rotation @ together.poses[0].rotation.T
         assert np.abs(motion - turned(30)[:3, :3]).max() < 0.02
 
+    @pytest.mark.long
     def test_errors_are_at_the_bound(self) -> None:
         points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
         poses = [np.eye(4), turned(25)]
@@ -237,6 +281,40 @@ def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     for view, result in zip(views, batch, strict=False):
         assert isinstance(result, AlignResult)
         assert result.alignment == align(model, view).alignment
+
+
+def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
+    model = spreads(0.03)
+    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(angle)) for angle in (0, 5)]
+    size = Size(width=3.0)
+    four, two = (
+        View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:count])))
+        for count in (4, 2)
+    )
+    start = truth_of((1, 1, 1))
+    batch = align_batch(
+        model, [*views, four, two], size=[None, size, None, None], init=[None, None, start, start]
+    )
+    alone = (
+        align(model, views[0]),
+        align(model, views[1], size=size),
+        align(model, four, init=start),
+    )
+    for result, expected in zip(batch, alone, strict=False):
+        assert isinstance(result, AlignResult)
+        assert result.alignment == expected.alignment
+    assert isinstance(batch[3], DegenerateError)  # two keypoints, whatever the start
+    for result in align_batch(model, views, size=size, workers=2):
+        assert isinstance(result, AlignResult)
+        width = result.alignment.scale[0] * np.ptp(result.bounds[:, 0])
+        assert width == pytest.approx(3.0, rel=0.1)
+
+
+def test_a_start_does_not_change_what_the_keypoints_tell() -> None:
+    model, truth = spreads(0.03), truth_of((1, 1, 1))
+    view = seen(keypoints(), truth, np.eye(4))
+    alone, started = align(model, view), align(model, view, init=truth)
+    assert rotation_error(est=started.alignment, gt=alone.alignment) < 1e-3
 
 
 def test_three_keypoints_suffice_with_a_prior() -> None:
@@ -320,6 +398,28 @@ def test_a_damaged_result_is_refused_by_field() -> None:
             lambda: align_batch(Model(points_3d=keypoints()), [], workers=0),
             "workers: must be >= 1, or -1 for all cores, not 0",
         ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()), [View(CAMERA, [[1, 2]])], size=[Size(width=1.0)] * 2
+            ),
+            "size: 2 for 1 objects; give one for all, or one or None for each",
+        ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()),
+                [View(CAMERA, [[1, 2]])],
+                init=[4],  # type: ignore[list-item]
+            ),
+            "init[0]: expected a cadalign.Alignment or None, got int",
+        ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()),
+                [View(CAMERA, [[1, 2]])],
+                size=1.0,  # type: ignore[arg-type]
+            ),
+            "size: expected a cadalign.Size or a sequence of them, got float",
+        ),
     ],
 )
 def test_bad_input_is_named(call: Any, message: str) -> None:
@@ -344,5 +444,7 @@ def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
     result = align(model, seen(mean, truth, np.eye(4)))
     assert rotation_error(est=result.alignment, gt=truth) < 5
     behind = Alignment(LOOK @ np.diag([-1.0, 1.0, -1.0]), truth.translation, np.ones(3))
+    assert result.probability < 0.9
+    assert any("another pose, 1" in text for text in result.warnings)
     others = [each.alignment for each in result.alternatives]
     assert min(rotation_error(est=each, gt=behind) for each in others) < 5

@@ -80,6 +80,7 @@ def everything(points: np.ndarray, rng: np.random.Generator) -> Case:
     return views, size, [truth]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "build",
     [
@@ -149,6 +150,7 @@ class TestRealCameras:
                 poses.setdefault(int(image), {})[each["obj_id"]] = pose
         return camera, meshes, poses
 
+    @pytest.mark.long
     def test_two_views_of_five_keypoints_reach_the_bound(
         self, scene: tuple[Camera, dict[int, np.ndarray], dict[int, dict[int, np.ndarray]]]
     ) -> None:

@@ -21,6 +21,8 @@ from support.scenes import (
 
 from cadalign import Model, Size, View, align
 
+pytestmark = pytest.mark.long
+
 SEEDS = 40
 Case = tuple[list[View], Size | None]
 
@@ -41,6 +43,15 @@ def wrong_depth(points: np.ndarray, rng: np.random.Generator) -> Case:
     depth = in_camera(points, truth_of(), np.eye(4))[:, 2]
     noise = 1 + 0.005 * rng.normal(size=len(depth))
     told = {"depth": 1.05 * depth * noise, "depth_sigma": 0.005}
+    views[0] = View(views[0].camera, views[0].points_2d, cam_from_rig=np.eye(4), **told)
+    return views, None
+
+
+def wrong_depth_image(points: np.ndarray, rng: np.random.Generator) -> Case:
+    views = rig(points, truth_of(), [0, 20, 40], rng)
+    image = depth_image(points, truth_of())
+    noise = 1 + 0.005 * rng.normal(size=image.shape)
+    told = {"depth": 1.05 * image * noise, "depth_sigma": 0.005}
     views[0] = View(views[0].camera, views[0].points_2d, cam_from_rig=np.eye(4), **told)
     return views, None
 
@@ -85,6 +96,7 @@ def warnings_of(
     [
         (wrong_motion, "views[2].cam_from_rig"),
         (wrong_depth, "views[0].depth"),
+        (wrong_depth_image, "views[0].depth"),
         (wrong_gravity, "views[0].up"),
     ],
 )

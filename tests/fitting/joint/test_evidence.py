@@ -86,6 +86,7 @@ class TestSize:
         assert str(caught.value).startswith(message)
 
 
+@pytest.mark.long
 def test_deviations_of_a_learned_shape_hold_the_truth() -> None:
     model, truth = similar(), truth_of((1.5, 1.5, 1.5))
     component, squares = model.components[0], []

@@ -57,11 +57,17 @@ def test_they_are_read_as_they_were_written() -> None:
     assert (again.points_cam_covariance == result.points_cam_covariance).all()
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not DATA.is_dir(), reason="CADALIGN_DATA has no KeypointNet")
+@pytest.mark.xfail(
+    strict=True,
+    reason="these chairs are nearer to the others than those that deviations are calibrated on, "
+    "and the 95 % regions hold 98.6 %",
+)
 def test_regions_hold_unseen_keypoints_of_unseen_chairs() -> None:
     dataset = KeypointNet(DATA)
     shape = ShapeModel.from_dataset(dataset, "chair", split="train", meshes=False)
-    squares = []
+    shares = []
     for row, model in enumerate(dataset.subset(categories=["chair"], split="val")["chair"]):
         rng = np.random.default_rng(row)
         pose = look_at(azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=2.0)
@@ -78,8 +84,6 @@ def test_regions_hold_unseen_keypoints_of_unseen_chairs() -> None:
         )
         error = KEYPOINT_CAMERA.project(in_camera) - pixels
         found = np.einsum("na,nab,nb->n", error, np.linalg.inv(covariances), error)
-        squares.extend(np.delete(found, seen))
-    held = np.mean(np.array(squares) < -2 * np.log(1 - 0.95))  # chi-square, 2 degrees of freedom
-    # Chairs have heavier tails than Gaussians. One factor widens all deviations until rotations and
-    # seen keypoints are held as often as stated; regions of unseen ones are then on the wide side.
-    assert 0.90 <= held <= 0.99
+        shares.extend(np.delete(found, seen) / result.radius(0.95, dimension=2) ** 2)
+    held = np.mean(np.array(shares) < 1)
+    assert 0.90 <= held <= 0.98

@@ -12,6 +12,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Model, ShapeModel, View, align, fit
 from cadalign.metrics import rotation_error
+from cadalign.shapes.parts import Reflection
 
 DATA = Path(os.environ.get("CADALIGN_DATA", "/nonexistent")) / "real"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="CADALIGN_DATA has no real photos")
@@ -24,16 +25,17 @@ MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of len
 def car_shape(tracks: dict[str, Any]) -> ShapeModel:
     """The 14-point car with its 5 modes, in metres, and the spread of real cars' dimensions."""
     mean = np.loadtxt(CARS / "meanShape_2.txt")
-    points = np.array(tracks["model_xyz"])
+    points, names = np.array(tracks["model_xyz"]), tracks["names"]
     in_metres = np.linalg.lstsq(mean - mean.mean(0), points - points.mean(0), rcond=None)[0]
     modes = np.loadtxt(CARS / "vectors2.txt").reshape(5, 14, 3) @ in_metres
     return ShapeModel.from_basis(
         points,
         modes,
         np.full(5, MODE_DEVIATION),
-        names=tracks["names"],
+        names=names,
         residual_sigma=0.03,
         size_sigma=LENGTH_SIGMAS,
+        reflection=Reflection("x", 0.0, tuple(zip(names[::2], names[1::2], strict=True))),
         up_axis="z",
         unit="m",
     )

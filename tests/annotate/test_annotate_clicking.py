@@ -1,0 +1,342 @@
+"""Snapping, mirror images, dragging on the model, the loupe, and undo after a restart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+from support.annotating import Case, place, place_all, served, wait
+
+from cadalign.annotate.history_file import history_path
+from cadalign.annotate.image_corners import nearest_corner
+from cadalign.annotate.mirror import MirrorPlanes
+from cadalign.annotate.model import CadModel
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.errors import CadalignError
+from cadalign.geometry.mesh import Mesh
+
+pytestmark = pytest.mark.long
+
+IDLE = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
+)
+
+
+def cube() -> Mesh:
+    """A cube about the origin with sides of 2, each of two triangles."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = [[a, b, c] for q in quads for a, b, c in ([q[0], q[1], q[2]], [q[0], q[2], q[3]])]
+    return Mesh(corners, np.array(faces))
+
+
+def sphere() -> Mesh:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    return Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+
+
+# --- snapping ----------------------------------------------------------------------------------
+
+
+def test_click_near_a_corner_snaps_to_it() -> None:
+    model = CadModel(cube())
+    eye = np.array([0.4, 0.3, 6.0])
+    beside = np.array([0.97, 0.96, 1.0]) - eye
+    plain = model.pick(eye, beside)
+    snapped = model.pick(eye, beside, snap=0.02)
+    assert plain is not None
+    assert snapped is not None
+    np.testing.assert_allclose(plain.xyz, [0.97, 0.96, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(snapped.xyz, [1, 1, 1])
+    # Also from beside the model, but never to one that the model hides.
+    missed = model.pick(eye, np.array([1.03, 1.02, 1.0]) - eye, snap=0.02)
+    assert missed is not None
+    np.testing.assert_array_equal(missed.xyz, [1, 1, 1])
+    hidden = model.pick(np.array([0, 0, 6.0]), np.array([0.7, 0.7, -1.0]) - [0, 0, 6], snap=0.02)
+    assert hidden is not None
+    assert hidden.xyz[2] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("radius", [0.985, 1.015])
+def test_click_near_the_silhouette_snaps_to_it(radius: float) -> None:
+    model = CadModel(sphere())
+    eye = np.array([0, 0, 50.0])
+    direction = np.array([radius * np.cos(0.3), radius * np.sin(0.3), 0]) - eye
+    snapped = model.pick(eye, direction, snap=0.001)
+    assert snapped is not None
+    x, y, _ = snapped.xyz
+    assert np.hypot(x, y) == pytest.approx(1, abs=4e-3)
+    assert np.arctan2(y, x) == pytest.approx(0.3, abs=0.15)
+
+
+def test_corner_of_a_photo_is_found_to_parts_of_a_pixel() -> None:
+    rows, columns = np.indices((80, 90))
+    soft = 1 / (1 + np.exp(-(columns - 40.3) / 0.6)) / (1 + np.exp(-(rows - 30.6) / 0.6))
+    photo = np.repeat((30 + 200 * soft)[..., None], 3, axis=2).astype(np.uint8)
+    found = nearest_corner(photo, (44, 27), reach=8)
+    assert found is not None
+    np.testing.assert_allclose(found, (40.3, 30.6), atol=0.7)
+    assert nearest_corner(photo, (80, 70), reach=8) is None  # nothing there
+    assert nearest_corner(np.zeros((80, 90, 3), dtype=np.uint8), (1, 1), reach=8) is None
+
+
+def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
+    session = case.open()
+    session.act(0, {"do": "place_uv", "uv": [200, 200], "snap": 60})
+    (pair,) = session.photos[0].document.pairs
+    assert pair.uv is not None
+    assert pair.uv != (200, 200)
+    u, v = pair.uv
+    session.act(0, {"do": "move", "pair": 1, "uv": [u + 1, v - 1], "snap": 3})
+    moved = session.photos[0].document.pairs[0].uv
+    assert moved is not None
+    np.testing.assert_allclose(moved, pair.uv, atol=1.5)
+    empty = {"do": "place_uv", "uv": [3, 3], "snap": 2}
+    assert "No corner" in session.act(0, empty).message
+
+
+# --- mirror images -----------------------------------------------------------------------------
+
+
+def test_mirror_planes_are_those_of_the_surface() -> None:
+    mesh = cube()
+    assert CadModel(mesh).mirror_planes.axes == (0, 2)
+    vertices = mesh.vertices.copy()
+    vertices[vertices[:, 2] > 0, 0] *= 0.5  # tapers to the front: left and right alone are alike
+    model = CadModel(Mesh(vertices, mesh.faces))
+    assert model.mirror_planes.axes == (0,)
+    image = model.mirrored([-0.5, 0.2, 1])
+    assert image is not None
+    np.testing.assert_allclose(image.xyz, [0.5, 0.2, 1], atol=1e-9)
+    assert model.mirrored([0, 1, 0.3]) is None  # on the plane
+    vertices[-1] += 0.6
+    lopsided = CadModel(Mesh(vertices, mesh.faces))
+    assert lopsided.mirror_planes.axes == ()
+    flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    assert MirrorPlanes.of_mesh(flat, np.zeros(3), 1.0).axes == ()
+
+
+def test_mirrored_pair_is_offered_until_it_is_there(case: Case) -> None:
+    session = case.open()
+    corner = max(session.model.samples, key=lambda point: abs(point.xyz[0]))
+    keypoint = session.registry.add(corner)
+    place(session, keypoint, [100, 100])
+    (pair,) = page_state(session, 0)["pairs"]
+    assert pair["mirrored"] is not None
+    session.act(0, {"do": "mirrored", "pair": 1})
+    first, second = page_state(session, 0)["pairs"]
+    assert second["uv"] is None
+    np.testing.assert_allclose(second["xyz"], pair["mirrored"], atol=1e-9)
+    assert first["mirrored"] is None
+    session.act(0, {"do": "place_uv", "uv": [100, 120]})  # completes the second
+    session.act(0, {"do": "place_uv", "uv": [120, 120]})
+    with pytest.raises(CadalignError, match="no mirror image"):
+        session.act(0, {"do": "mirrored", "pair": 3})
+
+
+def aim(session: Session) -> dict[str, Any]:
+    """A ray that hits the model away from its keypoints."""
+    model = session.model
+    keypoints = np.array([point.xyz for _, point in session.registry])
+    for target in model.scene.triangles.mean(axis=1):
+        origin = target + [0, 0, -3 * model.diagonal]
+        point = model.pick(origin, [0, 0, 1])
+        if point and np.linalg.norm(keypoints - point.xyz, axis=1).min() > 0.05 * model.diagonal:
+            return {"origin": model.to_display(origin).tolist(), "direction": [0, 0, 1]}
+    raise AssertionError
+
+
+def test_alignment_shows_where_a_model_point_is_expected(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    keypoint, uv = case.clicks[6]
+    session.act(0, {"do": "place_keypoint", "keypoint": keypoint})
+    pair = page_state(session, 0)["pairs"][-1]
+    assert pair["uv"] is None
+    np.testing.assert_allclose(pair["expected"], uv, atol=12)
+
+
+# --- model points are moved --------------------------------------------------------------------
+
+
+def test_model_point_is_moved_and_refused_where_another_pair_is(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    before = session.photos[0].document.pairs[0]
+    session.act(0, {"do": "repick", "pair": 1, **aim(session)})
+    moved = session.photos[0].document.pairs[0]
+    assert moved.uv == before.uv
+    assert moved.keypoint != before.keypoint
+    session.act(0, {"do": "undo"})
+    assert session.photos[0].document.pairs[0] == before
+    missed = session.act(
+        0, {"do": "repick", "pair": 1, "origin": [9, 9, 9], "direction": [1, 1, 1]}
+    )
+    assert "missed" in missed.message
+    assert session.photos[0].document.pairs[0] == before
+    document = session.photos[0].document
+    with pytest.raises(CadalignError, match="already used by pair 1"):
+        document.exchange_keypoint(2, before.keypoint or 0)
+
+
+# --- undo after a restart ----------------------------------------------------------------------
+
+
+def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    session.act(0, {"do": "pick", **aim(session)})
+    session.act(0, {"do": "delete", "pair": 6})
+    session.act(0, {"do": "delete", "pair": 2})
+    session.act(0, {"do": "move", "pair": 3, "uv": [50, 60]})
+    session.act(0, {"do": "undo"})
+    state = page_state(session, 0)
+    numbers = [pair["position"] for pair in state["pairs"]]
+    assert numbers == [1, 3, 4, 5]
+
+    again = case.open(keypoints=None)
+    restored = page_state(again, 0)
+    assert json.dumps(restored["pairs"]) == json.dumps(state["pairs"])
+    assert restored["can_undo"]
+    assert restored["can_redo"]
+    again.act(0, {"do": "redo"})
+    assert again.photos[0].document.pair(3).uv == (50, 60)
+    for _ in range(3):
+        again.act(0, {"do": "undo"})
+    assert [pair.number for pair in again.photos[0].document.pairs] == [1, 2, 3, 4, 5, 6]
+    placed = again.registry[again.photos[0].document.pair(6).keypoint or 0]
+    assert placed.xyz == session.registry[placed.semantic_id or 0].xyz
+    while again.photos[0].history.can_undo:
+        again.act(0, {"do": "undo"})
+    assert again.photos[0].document.pairs == ()
+
+
+def test_history_of_another_annotation_is_left_alone(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    data: dict[str, Any] = json.loads(case.observation.read_text())
+    data["keypoints"][0]["uv"] = [7.0, 7.0]
+    case.observation.write_text(json.dumps(data))
+    assert not page_state(case.open(), 0)["can_undo"]
+    history_path(case.observation).write_text("{")
+    assert len(page_state(case.open(), 0)["pairs"]) == 5
+
+
+# --- in the page -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
+    session = case.open()
+    context = browser.new_context(viewport={"width": 1366, "height": 768})
+    errors: list[str] = []
+    with served(session) as access:
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(access.url)
+        wait(page, IDLE)
+        yield page, session
+        context.close()
+    assert errors == []
+
+
+def on_page(page: Page, xyz: np.ndarray) -> tuple[float, float]:
+    at = page.evaluate("xyz => annotator.model.toPage(xyz)", xyz.tolist())
+    return at["x"], at["y"]
+
+
+def seen_corner(page: Page, session: Session) -> np.ndarray:
+    """A corner of the model that is seen in the page, apart from the markers."""
+    eye = session.model.from_display(
+        page.evaluate("annotator.model.stage.camera.position.toArray()")
+    )
+    points = session.model.snap_points
+    keypoints = np.array([point.xyz for _, point in session.registry])
+    for xyz in points.xyz[points.kind == 0]:
+        gap = np.linalg.norm(keypoints - xyz, axis=1).min()
+        if gap > 0.1 * session.model.diagonal and session.model.is_seen(eye, xyz):
+            return np.asarray(xyz)
+    raise AssertionError
+
+
+def test_key_held_snaps_and_points_are_dragged_on_the_model(
+    opened: tuple[Page, Session], case: Case
+) -> None:
+    page, session = opened
+    corner = seen_corner(page, session)
+    x, y = on_page(page, session.model.to_display(corner))
+    page.keyboard.down("s")
+    wait(page, "annotator.isSnapping")
+    page.mouse.click(x + 3, y + 2)
+    wait(page, "annotator.api.idle && annotator.state.pairs.length === 1")
+    page.keyboard.up("s")
+    wait(page, "!annotator.isSnapping")
+    snapped = np.array(session.registry[session.photos[0].document.pairs[0].keypoint or 0].xyz)
+    assert np.linalg.norm(snapped - corner) < 0.03 * session.model.diagonal
+    gaps = np.linalg.norm(session.model.snap_points.xyz - snapped, axis=1)
+    assert gaps.min() < 1e-9 * session.model.diagonal
+
+    # Dragged, the model stays where it is, and the point goes to the surface under the pointer.
+    eye = "annotator.model.stage.camera.position.toArray()"
+    before = page.evaluate(eye)
+    x, y = on_page(page, session.model.to_display(snapped))
+    middle = page.evaluate(
+        """() => { const { left, top, width, height } =
+            annotator.model.stage.canvas.getBoundingClientRect();
+            return [left + width / 2, top + height / 2]; }"""
+    )
+    page.mouse.move(x, y)
+    page.mouse.down()
+    target = np.array([x, y]) + 0.25 * (np.array(middle) - [x, y])
+    page.mouse.move(*target.tolist(), steps=5)
+    page.mouse.up()
+    page.wait_for_timeout(300)
+    wait(page, IDLE)
+    moved = np.array(session.registry[session.photos[0].document.pairs[0].keypoint or 0].xyz)
+    assert page.evaluate(eye) == pytest.approx(before)
+    if np.linalg.norm(moved - snapped) > 0:
+        assert on_page(page, session.model.to_display(moved)) == pytest.approx(target, abs=2)
+    else:
+        assert "missed" in page.locator("[role=alert]").inner_text()
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 60, middle[1], steps=4)
+    page.mouse.up()
+    wait(page, f"Math.abs({eye}[0] - {before[0]}) > 1e-4")  # beside points it is turned as before
+
+
+def test_mirror_image_is_taken_by_key(opened: tuple[Page, Session]) -> None:
+    page, session = opened
+    corner = max(session.model.samples, key=lambda point: abs(point.xyz[0]))
+    place(session, session.registry.add(corner), [100, 100])
+    page.evaluate("annotator.api.refresh()")
+    wait(page, "annotator.api.idle && annotator.state.pairs.length === 1")
+    page.get_by_role("button", name="mirror image of pair 1").wait_for()
+    page.keyboard.press("m")
+    wait(page, "annotator.api.idle && annotator.state.pairs.length === 2")
+    page.keyboard.press("m")
+    page.wait_for_timeout(200)
+    assert "No pair has a mirror image" in page.locator("[role=alert]").inner_text()
+
+
+def test_loupe_magnifies_about_the_pointer(opened: tuple[Page, Session]) -> None:
+    page, _ = opened
+    page.keyboard.press("l")
+    assert page.get_by_role("button", name="Loupe").get_attribute("aria-pressed") == "true"
+    for name in ("Photo", "Model"):
+        box = page.locator(f"section[aria-label={name}] canvas").bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        frame = page.locator(f"section[aria-label={name}] .loupe")
+        frame.wait_for(state="visible")
+    page.mouse.move(2, 2)
+    page.locator(".loupe:visible").wait_for(state="hidden")
+    page.keyboard.press("l")
+    assert page.get_by_role("button", name="Loupe").get_attribute("aria-pressed") == "false"

@@ -1,0 +1,215 @@
+"""Evidence beyond keypoints in an observation file: kept, used as `cadalign fit` does, named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.annotating import Case, flat, place_all
+
+from cadalign import Size, Symmetry, View, align
+from cadalign.annotate.alignment import LIKELY_STRETCH
+from cadalign.annotate.further import FurtherEvidence
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.cli import main
+from cadalign.errors import CadalignError
+from cadalign.geometry.camera import Camera
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence, KnownSize
+from cadalign.render import cast_geometry
+
+pytestmark = pytest.mark.long
+
+PIECES = ("mask", "keypoint depths", "depth image", "up", "camera_height", "size", "views", "rig")
+
+
+def observed(case: Case, *pieces: str) -> Observation:
+    """The photo's keypoints with some pieces of further evidence."""
+    instance = case.instance
+    camera, truth = instance.camera, instance.cam_from_model
+    in_camera = truth.apply(instance.points_3d)
+    given: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
+    if "mask" in pieces:
+        assert instance.scene is not None
+        mask = cast_geometry(instance.scene, camera, truth).mask
+        write_image(case.folder / "m.mask.png", np.where(mask, 255, 0).astype(np.uint8))
+        given["mask"] = case.folder / "m.mask.png"
+    if "keypoint depths" in pieces:
+        depths = in_camera[:, 2].copy()
+        depths[1] = np.nan
+        fields["depths"] = depths
+        given["depth_sigma"] = 0.005
+    if "depth image" in pieces:
+        assert instance.scene is not None
+        depth = cast_geometry(instance.scene, camera, truth).depth
+        counts = np.where(np.isfinite(depth), depth * 2000, 0).astype(np.uint16)
+        write_image(case.folder / "m.depth.png", counts)
+        given |= {"depth": case.folder / "m.depth.png", "depth_scale": 1 / 2000}
+    if "up" in pieces:
+        given |= {"up": truth.rotation @ [0.0, 1.0, 0.0], "up_sigma_deg": 2.0}
+    if "camera_height" in pieces:
+        up = truth.rotation @ [0.0, 1.0, 0.0]
+        lowest = (in_camera @ up).min()
+        given |= {"camera_height": float(max(-lowest, 0.1)), "up": up}
+    if "size" in pieces:
+        lengths = np.ptp(np.asarray(instance.scene.bounds), axis=0) * truth.scale  # type: ignore[union-attr]
+        fields["size"] = KnownSize(width=float(lengths[0]), height=float(lengths[1]), sigma=0.01)
+    first = Observation(
+        instance.points_3d,
+        instance.points_2d,
+        camera,
+        semantic_ids=instance.semantic_ids,
+        names=tuple(f"point {number}" for number in instance.semantic_ids),
+        image=case.photo,
+        evidence=ImageEvidence(**given),
+        **fields,
+    )
+    if "views" not in pieces and "rig" not in pieces:
+        return first
+    turn = np.eye(4)
+    turn[:3, 3] = [0.1, 0.02, 0.05]
+    moved = in_camera @ turn[:3, :3].T + turn[:3, 3]
+    other = replace(first, points_2d=camera.project(moved), image=None, evidence=ImageEvidence())
+    if "rig" in pieces:
+        first = replace(first, evidence=replace(first.evidence, cam_from_rig=np.eye(4)))
+        other = replace(other, evidence=ImageEvidence(cam_from_rig=turn))
+    return replace(first, others=(other,))
+
+
+def stored(case: Case) -> dict[str, Any]:
+    return dict(json.loads(case.observation.read_text()))
+
+
+@pytest.mark.parametrize("pieces", [*[(piece,) for piece in PIECES], ("mask", "up", "size")])
+def test_evidence_is_kept_used_as_by_fit_and_named(
+    case: Case, capsys: pytest.CaptureFixture[str], pieces: tuple[str, ...]
+) -> None:
+    if "camera_height" in pieces or "depth image" in pieces:
+        pytest.importorskip("embreex")
+    observed(case, *pieces).save(case.observation)
+    before = stored(case)
+    session = case.open(keypoints=None)
+    state = session.photos[0]
+    session.act(0, {"do": "move", "pair": 1, "uv": [200, 200]})
+    session.act(0, {"do": "undo"})
+    after = stored(case)
+    for data in (before, after):  # what the annotator adds to any file it saves
+        data.pop("model", None)
+    assert after == before
+
+    live, _ = session.live(state)
+    assert isinstance(live, LiveShape)
+    assert live.shown is not None
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command = json.loads(capsys.readouterr().out)
+    page = live.shown.to_dict()
+    for name in ("alignment", "covariance", "std", "stretch", "points_3d"):
+        np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
+    assert page["warnings"] == command["warnings"]
+    shown = page_state(session, 0)["alignment"]
+    words = {"up": "gravity", "size": "known width and height", "views": "1 other view"}
+    words |= {"keypoint depths": "depth", "depth image": "depth", "rig": "known camera poses"}
+    words |= {"camera_height": "camera height"}
+    for piece in pieces:
+        assert words.get(piece, piece) in shown["also_used"]
+    assert shown["facts"]
+    assert shown["box"]
+
+
+def test_the_symmetry_of_a_file_is_kept(case: Case) -> None:
+    given = replace(observed(case, "views"), symmetry=Symmetry.around((0, 1, 0), fold=2))
+    further = FurtherEvidence.of(given, case.photo, where=case.observation)
+    assert further.added_to(given.views[0]).symmetry is given.symmetry
+
+
+def test_evidence_outlives_the_last_pair(case: Case) -> None:
+    observed(case, "up", "size").save(case.observation)
+    session = case.open()
+    for pair in session.photos[0].document.pairs:
+        session.act(0, {"do": "delete", "pair": pair.number})
+    again = case.open()
+    assert stored(case)["up_sigma_deg"] == 2.0
+    place_all(again, case, count=5)
+    assert stored(case)["size"]["sigma"] == 0.01
+    assert page_state(again, 0)["alignment"]["also_used"] == "gravity, known width and height"
+
+
+def test_second_view_is_annotated_in_its_place(case: Case) -> None:
+    whole = observed(case, "views")
+    (other,) = whole.others
+    assert isinstance(other, Observation)
+    replace(other, others=(replace(whole, others=()),)).save(case.observation)
+    session = case.open(keypoints=None)
+    live, _ = session.live(session.photos[0])
+    assert isinstance(live, LiveShape)
+    assert live.place == 1
+    assert np.abs(live.residuals).max() < 10
+    session.act(0, {"do": "move", "pair": 1, "uv": [200, 200]})
+    views = stored(case)["views"]
+    assert views[1]["keypoints"][0]["uv"] == [200, 200]
+    assert views[1]["image"] == "photo.png"
+    assert "image" not in views[0]
+
+
+def test_views_of_other_photos_are_refused(case: Case) -> None:
+    whole = observed(case, "views")
+    replace(whole, image=case.folder / "gone.png").save(case.observation)
+    with pytest.raises(CadalignError, match=r"none of its 2 views has the image photo\.png"):
+        case.open(observation=case.observation)
+
+
+def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
+    whole = observed(case, "mask", "size")
+    assert whole.size is not None
+    mask = whole.evidence.mask
+    session = case.open(mask=mask, size=whole.size.given)
+    state = place_all(session, case)
+    assert state["alignment"]["also_used"] == "mask, known width and height"
+    assert stored(case)["mask"] == "m.mask.png"
+    assert stored(case)["size"] == whole.size.given
+    live, _ = session.live(session.photos[0])
+    points = session.registry.xyz(keypoint for keypoint, _ in case.clicks)
+    view = View(
+        case.instance.camera,
+        [uv for _, uv in case.clicks],
+        ids=[keypoint for keypoint, _ in case.clicks],
+        sigma=live.sigma,
+        mask=mask,
+    )
+    from cadalign import Model
+
+    assert isinstance(live, LiveShape)
+    assert stored(case)["fit"]["sigma"] == live.sigma > 1
+    model = Model(
+        points_3d=points,
+        ids=[k for k, _ in case.clicks],
+        mesh=session.model.scene.mesh,
+        scale_prior_sigma=LIKELY_STRETCH,
+    )
+    expected = align(model, view, size=Size(**whole.size.given))
+    assert live.shown is not None
+    np.testing.assert_allclose(live.shown.covariance, expected.covariance, rtol=1e-9)
+
+
+def test_options_of_a_single_photo_are_refused_for_a_folder(case: Case) -> None:
+    with pytest.raises(CadalignError, match="--size: is of a single photo"):
+        case.open(image=case.folder, size={"width": 1.0})
+
+
+def test_unknown_focal_length_is_assumed_beside_evidence(case: Case) -> None:
+    whole = observed(case, "up")
+    camera = whole.camera
+    unknown = Camera.without_focal(camera.width, camera.height)
+    replace(whole, camera=unknown).save(case.observation)
+    session = case.open(camera=None)
+    shown = page_state(session, 0)["alignment"]
+    assert any("focal length is assumed" in note for note in shown["notes"])
+    session.act(0, {"do": "focal", "known": True, "pixels": camera.fx})
+    assert "gravity" in page_state(session, 0)["alignment"]["also_used"]
+    assert (case.folder / "photo_fit" / "fit.json").exists()

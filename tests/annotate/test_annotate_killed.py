@@ -1,0 +1,88 @@
+"""Killed at random moments, the annotator loses nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.annotating import Case, place_all
+from support.killing import content, kill_at_random
+
+from cadalign.annotate.document import Pair
+from cadalign.annotate.objects.unfinished import LeftOut
+from cadalign.annotate.page_state import page_state
+from cadalign.io import files
+
+
+@pytest.mark.long
+def test_killed_at_random_moments_it_loses_nothing(case: Case) -> None:
+    rounds = list(kill_at_random(case, rounds=5, seed=1))
+    lost = [(each.found, each.expected) for each in rounds if each.lost]
+    assert lost == []
+    assert sum(each.answered for each in rounds) > 0
+
+
+class Stop(BaseException):
+    """The end of a process in the middle of a write."""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "action", ["place_keypoint", "release", "move", "delete", "undo", "rename"]
+)
+def test_stopped_before_any_write_an_action_is_done_or_not(
+    case: Case, action: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file that an action writes is the last one, in turn."""
+    arguments: dict[str, dict[str, Any]] = {
+        "place_keypoint": {"keypoint": case.clicks[4][0]},
+        "release": {"pair": 2},
+        "move": {"pair": 5, "uv": [50.0, 60.0]},
+        "delete": {"pair": 5},
+        "rename": {"pair": 1, "name": "knee"},
+    }
+    write, written = files.write_whole, [0]
+
+    def stopping(path: Path, how: Any, *, after: int = -1) -> None:
+        if written[0] == after:
+            raise Stop
+        written[0] += 1
+        write(path, how)
+
+    for number in range(9):
+        for path in case.folder.glob("photo*.json"):
+            path.unlink()
+        session = case.open(prepared=False)
+        place_all(session, case, count=4)
+        session.act(0, {"do": "place_uv", "uv": case.clicks[4][1]})
+        before = content(page_state(session, 0))
+        written[0] = 0
+        with monkeypatch.context() as patched:
+            for module in ("cadalign.io.files",):
+                patched.setattr(
+                    f"{module}.write_whole",
+                    lambda path, how, n=number: stopping(path, how, after=n),
+                )
+            stopped = False
+            try:
+                session.act(0, {"do": action, **arguments.get(action, {})})
+            except Stop:
+                stopped = True
+        after = content(page_state(session, 0))
+        found = content(page_state(case.open(prepared=False), 0))
+        assert found in (before, after), (number, json.dumps([before, found, after], indent=1))
+        if not stopped:
+            return
+    pytest.fail("it never came to an end")
+
+
+def test_a_pair_that_is_in_both_files_is_one(case: Case) -> None:
+    session = case.open(prepared=False)
+    place_all(session, case, count=3)
+    state = session.photos[0]
+    half = Pair(9, uv=state.document.pairs[1].uv)
+    state.files._write_unfinished(LeftOut((half, Pair(10, uv=(1.0, 2.0)))))
+    pairs = case.open(prepared=False).photos[0].document.pairs
+    assert [pair.uv for pair in pairs[3:]] == [(1.0, 2.0)]

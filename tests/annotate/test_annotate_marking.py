@@ -1,0 +1,189 @@
+"""Masks, vertical edges and known lengths: used as by `cadalign fit`, saved, and undone."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from support.annotating import Case, flat, place_all
+
+from cadalign import Camera
+from cadalign.annotate.evidence import MaskDrawing, Stroke, find_up
+from cadalign.annotate.masks import decode_runs, draw_mask, encode_runs
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.cli import main
+from cadalign.errors import CadalignError
+from cadalign.io.images import read_grey
+from cadalign.render import cast_geometry
+
+pytestmark = pytest.mark.long
+
+
+def true_mask(case: Case) -> np.ndarray:
+    instance = case.instance
+    assert instance.scene is not None
+    return cast_geometry(instance.scene, instance.camera, instance.cam_from_model).mask
+
+
+def true_verticals(case: Case, noise: float = 0.0) -> list[tuple[tuple[float, float], ...]]:
+    """Vertical edges about the object, as the photo shows them."""
+    instance = case.instance
+    rng = np.random.default_rng(0)
+    edges = []
+    for x, z in ((-0.4, -0.4), (0.4, -0.4), (0.4, 0.4)):
+        ends = instance.cam_from_model.apply(np.array([[x, -0.3, z], [x, 0.3, z]]))
+        uv = instance.camera.project(ends) + noise * rng.normal(size=(2, 2))
+        edges.append(tuple((float(u), float(v)) for u, v in uv))
+    return edges
+
+
+def inside(case: Case, edges: list[Any]) -> list[Any]:
+    camera = case.instance.camera
+    low, high = np.zeros(2), np.array([camera.width - 1, camera.height - 1])
+    return [tuple(tuple(np.clip(end, low, high).tolist()) for end in edge) for edge in edges]
+
+
+def agree_with_fit(
+    session: Session, case: Case, capsys: pytest.CaptureFixture[str]
+) -> dict[str, Any]:
+    """The page's alignment, which `cadalign fit` must find in the saved file."""
+    live, _ = session.live(session.photos[0])
+    assert live.shown is not None, live.message
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command, page = json.loads(capsys.readouterr().out), live.shown.to_dict()
+    for name in ("alignment", "covariance", "std", "stretch"):
+        np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
+    return dict(page_state(session, 0)["alignment"])
+
+
+def test_strokes_are_drawn_over_each_other() -> None:
+    square = Stroke(points=((10, 10), (29, 10), (29, 29), (10, 29)))
+    mask = draw_mask(MaskDrawing(strokes=(square,)), 60, 50)
+    assert mask.sum() == 400
+    hole = Stroke(points=((20, 20),), radius=4, adds=False)
+    line = Stroke(points=((40, 5), (40, 45)), radius=3)
+    drawn = draw_mask(MaskDrawing(strokes=(square, hole, line)), 60, 50)
+    assert not drawn[20, 20]
+    assert drawn[25, 40]
+    assert not drawn[25, 45]
+    assert 400 - np.pi * 25 < drawn[:, :35].sum() < 400 - np.pi * 12
+    np.testing.assert_array_equal(decode_runs(encode_runs(drawn), 60, 50), drawn)
+    with pytest.raises(CadalignError, match="60 x 50 pixels"):
+        decode_runs((1, 2, 3), 60, 50)
+
+
+def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    session = case.open()
+    without = place_all(session, case, count=6)["alignment"]
+    runs = encode_runs(true_mask(case))
+    session.act(0, {"do": "mask_load", "runs": list(runs)})
+    shown = agree_with_fit(session, case, capsys)
+    assert shown["also_used"] == "mask"
+    assert shown["alignment"] != without["alignment"]
+    np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
+    # A part is taken away and given back.
+    session.act(0, {"do": "mask_paint", "points": [[320, 240]], "radius": 20, "adds": False})
+    assert not (read_grey(case.folder / "photo.mask.png") != 0)[240, 320]
+    session.act(0, {"do": "undo"})
+    np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
+    again = case.open(keypoints=None)
+    assert page_state(again, 0)["alignment"]["alignment"] == shown["alignment"]
+    again.act(0, {"do": "undo"})  # the mask, in the session before
+    assert page_state(again, 0)["alignment"]["also_used"] == ""
+    assert "mask" not in json.loads(case.observation.read_text())
+
+
+def test_mask_of_a_file_is_painted_over_without_changing_it(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    session.act(0, {"do": "mask_load", "runs": list(encode_runs(true_mask(case)))})
+    first = case.folder / "photo.mask.png"
+    before = first.read_bytes()
+    history = case.folder / "elsewhere"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("XDG_STATE_HOME", str(history))  # without the undo history
+        again = case.open(keypoints=None)
+        again.act(0, {"do": "mask_paint", "points": [[10, 10]], "radius": 5})
+        assert first.read_bytes() == before
+        assert json.loads(case.observation.read_text())["mask"] == "photo.mask-2.png"
+        assert (read_grey(case.folder / "photo.mask-2.png") != 0)[10, 10]
+    # Masks are no photos of the folder.
+    names = [state.photo.path.name for state in case.open(image=case.folder).photos]
+    assert names == ["photo.png"]
+
+
+def test_box_is_cut_out(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    truth = true_mask(case)
+    rows, columns = np.nonzero(truth)
+    corners = [
+        [float(columns.min() - 8), float(rows.min() - 8)],
+        [float(columns.max() + 8), float(rows.max() + 8)],
+    ]
+    session.act(0, {"do": "mask_cut", "corners": corners})
+    found = read_grey(case.folder / "photo.mask.png") != 0
+    box = np.zeros_like(truth)
+    box[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+    overlap, plain = ((mask & truth).sum() / (mask | truth).sum() for mask in (found, box))
+    assert overlap > max(0.75, plain + 0.1)
+    agree_with_fit(session, case, capsys)
+    with pytest.raises(CadalignError, match="too small"):
+        session.act(0, {"do": "mask_cut", "corners": [[1, 1], [2, 2]]})
+
+
+def test_vertical_edges_tell_gravity(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    edges = inside(case, true_verticals(case))
+    assert "another" in session.act(0, {"do": "vertical", "ends": edges[0]}).message
+    assert page_state(session, 0)["alignment"]["also_used"] == ""
+    for edge in edges[1:]:
+        session.act(0, {"do": "vertical", "ends": edge})
+    shown = agree_with_fit(session, case, capsys)
+    assert shown["also_used"] == "gravity"
+    stored = json.loads(case.observation.read_text())
+    wanted = case.instance.cam_from_model.rotation @ [0, 1, 0]
+    assert np.degrees(np.arccos(np.clip(np.dot(stored["up"], wanted), -1, 1))) < 6
+    again = case.open(keypoints=None)
+    assert len(page_state(again, 0)["evidence"]["verticals"]) == 3
+    again.act(0, {"do": "gravity_clear"})
+    assert "up" not in json.loads(case.observation.read_text())
+
+
+def test_direction_and_deviation_of_vertical_edges() -> None:
+    camera = Camera.from_fov(640, 480, fov_x=60.0)
+    rng = np.random.default_rng(1)
+    up = np.array([0.1, -0.9, 0.2])
+    up /= np.linalg.norm(up)
+    errors = []
+    for _ in range(300):
+        edges = []
+        for x in (-1.0, 0.4, 1.1):
+            ends = np.array([x, 0.6, 4.0]) + np.outer([0.0, 1.6], up)
+            uv = camera.project(ends) + rng.normal(size=(2, 2))
+            edges.append(tuple(map(tuple, uv.tolist())))
+        found = find_up(tuple(edges), camera)
+        assert found is not None
+        angle = np.degrees(np.arccos(np.clip(found[0] @ up, -1, 1)))
+        errors.append(angle / found[1])
+    # Deviations are of the worst direction, and not below half a degree.
+    assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 1.2
+    assert find_up(((((100.0, 100.0)), (100.0, 300.0)),) * 2, camera) is None
+
+
+def test_known_length_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    session.act(0, {"do": "lengths", "height": 0.91, "sigma": 0.01})
+    assert agree_with_fit(session, case, capsys)["also_used"] == "known height"
+    evidence = page_state(case.open(keypoints=None), 0)["evidence"]
+    assert evidence["lengths"] == {"width": None, "height": 0.91, "length": None}
+    assert evidence["length_sigma"] == 0.01
+    with pytest.raises(CadalignError, match="is no length"):
+        session.act(0, {"do": "lengths", "width": -1})
+    session.act(0, {"do": "lengths"})
+    assert "size" not in json.loads(case.observation.read_text())

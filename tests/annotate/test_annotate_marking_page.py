@@ -1,0 +1,138 @@
+"""The page in Chromium: masks and vertical edges are drawn, lengths typed, by mouse or keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+from support.annotating import Case, place_all, place_of_pixel, served, wait
+
+from cadalign.annotate.page_state import mask_pixels
+from cadalign.annotate.session import Session
+from cadalign.io.images import write_image
+
+pytestmark = pytest.mark.long
+
+IDLE = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
+)
+TOOL = "What a click in the photo marks"
+
+
+@pytest.fixture
+def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
+    session = case.open()
+    place_all(session, case, count=5)
+    context = browser.new_context(viewport={"width": 1366, "height": 768})
+    errors: list[str] = []
+    with served(session) as access:
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(access.url)
+        wait(page, IDLE)
+        yield page, session
+        context.close()
+    assert errors == []
+
+
+def drag(page: Page, *places: tuple[float, float]) -> None:
+    page.mouse.move(*place_of_pixel(page, places[0]))
+    page.mouse.down()
+    for place in places[1:]:
+        page.mouse.move(*place_of_pixel(page, place), steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(50)
+    wait(page, IDLE)
+
+
+def used(page: Page) -> str:
+    wait(page, IDLE)
+    return str(page.evaluate("annotator.state.alignment.also_used"))
+
+
+def test_mask_is_painted_taken_away_and_cleared(opened: tuple[Page, Session]) -> None:
+    page, session = opened
+    page.get_by_label(TOOL).select_option("brush")
+    drag(page, (250, 200), (400, 200))
+    painted = mask_pixels(session, 0)
+    assert painted[200, 320]
+    assert not painted[300, 320]
+    assert len(session.photos[0].document.pairs) == 5
+    page.keyboard.down("Shift")
+    drag(page, (320, 180), (320, 220))
+    page.keyboard.up("Shift")
+    assert not mask_pixels(session, 0)[200, 320]
+    page.keyboard.press("Control+z")
+    wait(page, "annotator.api.idle && annotator.state.can_redo")
+    assert mask_pixels(session, 0)[200, 320]
+    wait(page, "!!annotator.photo.marking.tinted")
+
+    page.keyboard.press("g")
+    for place in ((300, 300), (420, 300), (420, 400), (300, 400)):
+        page.mouse.click(*place_of_pixel(page, place))
+    page.keyboard.press("c")
+    wait(page, IDLE)
+    assert mask_pixels(session, 0)[350, 350]
+    assert "mask" in used(page)
+    page.get_by_role("button", name="Mask, gravity, known size (1 used)").click()
+    page.get_by_role("button", name="Clear the mask").click()
+    wait(page, "annotator.api.idle && annotator.state.evidence.mask === null")
+    assert used(page) == ""
+    page.keyboard.press("Escape")
+    assert page.get_by_label(TOOL).input_value() == "points"
+
+
+def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> None:
+    page, session = opened
+    page.keyboard.press("x")
+    points = case.instance.points_2d
+    low = np.maximum(points.min(axis=0) - 25, 4)
+    high = np.minimum(points.max(axis=0) + 25, (634, 474))
+    drag(page, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+    assert used(page) == "mask", page.locator("[role=alert]").inner_text()
+    cut = mask_pixels(session, 0)
+    assert 0.05 < cut[int(low[1]) : int(high[1]), int(low[0]) : int(high[0])].mean() < 0.98
+    given = np.zeros_like(cut)
+    given[100:400, 150:450] = True
+    file = case.folder.parent / "given.png"
+    write_image(file, np.where(given, 255, 0).astype(np.uint8))
+    page.get_by_label("Mask file").set_input_files(file)
+    for _ in range(200):
+        if (mask_pixels(session, 0) == given).all():
+            break
+        page.wait_for_timeout(30)
+    np.testing.assert_array_equal(mask_pixels(session, 0), given)
+    write_image(file, np.zeros((10, 12), dtype=np.uint8))
+    page.get_by_label("Mask file").set_input_files(file)
+    wait(page, "document.querySelector('[role=alert]').textContent.includes('12 x 10 pixels')")
+
+
+def test_edges_and_lengths_by_keys_alone(opened: tuple[Page, Session], case: Case) -> None:
+    page, session = opened
+    page.locator("section[aria-label=Photo] canvas").focus()
+    page.keyboard.press("u")
+    for number in range(2):
+        page.keyboard.press("Enter")
+        for _ in range(3):
+            page.keyboard.press("ArrowUp")
+        page.keyboard.press("Enter")
+        wait(
+            page,
+            f"annotator.api.idle && annotator.state.evidence.verticals.length === {number + 1}",
+        )
+        for key in ("ArrowDown",) * 3 + ("ArrowRight",) * 4:
+            page.keyboard.press(key)
+    # Marked by the middle of the view, which the arrows pan.
+    (first, second) = session.photos[0].document.evidence.verticals
+    assert abs(first[0][0] - first[1][0]) < 1e-6
+    assert abs(first[0][0] - second[0][0]) > 20
+    assert "gravity" in used(page)
+
+    page.get_by_role("button", name="Mask, gravity, known size").press("Enter")
+    height = page.get_by_label("Known height (along y)")
+    height.fill("0.9")
+    height.press("Enter")
+    wait(page, "annotator.api.idle && annotator.state.evidence.lengths.height === 0.9")
+    assert "known height" in used(page)

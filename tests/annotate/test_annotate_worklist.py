@@ -1,0 +1,193 @@
+"""Work lists: natural order, states, thumbnails, filter and keys; detections and exports."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from playwright.sync_api import Browser
+from support.annotating import Case, place, place_of_pixel, served, wait
+
+from cadalign.annotate.exporting import coco_of, glb_of
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.annotate.worklist import FILE
+from cadalign.annotate.worklist_state import worklist_state
+from cadalign.cli import main
+from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+from cadalign.errors import CadalignError
+
+pytestmark = pytest.mark.long
+
+IDLE = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
+)
+
+
+def folder_of(case: Case, *names: str) -> None:
+    for name in names:
+        shutil.copy(case.photo, case.folder / name)
+
+
+def test_photos_come_in_natural_order_with_states(case: Case) -> None:
+    folder_of(case, "photo 10.png", "photo 9.png", "photo 2.png")
+    session = case.open(image=case.folder)
+    listed = worklist_state(session)
+    assert [each["name"] for each in listed] == [
+        "photo 2.png",
+        "photo 9.png",
+        "photo 10.png",
+        "photo.png",
+    ]
+    assert {each["state"] for each in listed} == {"to do"}
+    assert not (case.folder / FILE).exists()
+    for keypoint, uv in case.clicks[:6]:
+        place(session, keypoint, uv, image=3)
+    session.act(0, {"do": "mark", "mark": "done"})
+    session.act(1, {"do": "mark", "mark": "skipped"})
+    session.act(1, {"do": "mark"})
+    session.act(2, {"do": "mark", "mark": "skipped"})
+    again = worklist_state(case.open(image=case.folder))
+    assert [each["state"] for each in again] == ["done", "to do", "skipped", "begun"]
+    assert again[3]["pairs"] == 6
+    assert 0 < again[3]["rms"] < 5
+    assert again[0]["rms"] is None
+
+
+def test_files_that_are_no_work_list_are_refused(case: Case) -> None:
+    (case.folder / FILE).write_text(json.dumps({"format": "other", "photos": {}}))
+    with pytest.raises(CadalignError, match="not a cadalign work list"):
+        case.open()
+
+
+def test_list_is_filtered_and_gone_through_by_keys(browser: Browser, case: Case) -> None:
+    folder_of(case, "1.png", "2.png", "3.png")
+    session = case.open(image=case.folder)
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    errors: list[str] = []
+    with served(session) as access:
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(access.url)
+        wait(page, IDLE)
+        page.keyboard.press("d")
+        wait(page, f"{IDLE} && annotator.state.image.number === 1")
+        page.keyboard.press("k")
+        wait(page, f"{IDLE} && annotator.state.image.number === 2")
+        page.keyboard.press("w")
+        dialog = page.get_by_role("dialog", name="Photos")
+        dialog.wait_for()
+        assert dialog.get_by_role("listitem").count() == 4
+        page.evaluate("document.querySelector('.thumbs img').decode()")
+        dialog.get_by_label("Photos to show").select_option("to do")
+        assert dialog.get_by_role("listitem").count() == 2
+        assert "done (1)" in dialog.inner_text()
+        dialog.get_by_role("button", name="photo.png").press("Enter")
+        wait(page, f"{IDLE} && annotator.state.image.number === 3")
+        page.keyboard.press("PageUp")
+        wait(page, f"{IDLE} && annotator.state.image.number === 2")
+        page.keyboard.press("PageUp")  # the others are done and skipped
+        wait(page, "document.querySelector('[role=alert]').textContent.includes('No other photo')")
+        context.close()
+    assert errors == []
+
+
+def detections(case: Case, session: Session, names: list[str], shift: float) -> dict[str, Any]:
+    """COCO annotations of the visible keypoints in photos of these names."""
+    keypoints = [session.registry[keypoint].name for keypoint, _ in case.clicks]
+    values = [value for _, (u, v) in case.clicks for value in (u + shift, v, 0.9)]
+    images = [{"id": row, "file_name": name} for row, name in enumerate(names)]
+    return {
+        "images": images,
+        "categories": [{"id": 1, "keypoints": keypoints}],
+        "annotations": [
+            {"image_id": image["id"], "category_id": 1, "keypoints": values} for image in images
+        ],
+    }
+
+
+def test_detections_are_proposed_and_taken(case: Case) -> None:
+    folder_of(case, "other.png")
+    file = case.folder / "found.json"
+    file.write_text(json.dumps(detections(case, case.open(), ["photo.png"], 1.0)))
+    session = case.open(image=case.folder, detections=file)
+    other, photo = session.photos
+    assert other.proposals == ()
+    count = len(case.clicks)
+    assert len(page_state(session, 1)["proposals"]) == count
+    keypoint, (u, v) = case.clicks[2]
+    session.act(1, {"do": "accept", "keypoints": [keypoint]})
+    (pair,) = photo.document.pairs
+    assert (pair.keypoint, pair.uv) == (keypoint, (u + 1, v))
+    assert len(page_state(session, 1)["proposals"]) == count - 1
+    session.act(1, {"do": "accept"})
+    state = page_state(session, 1)
+    assert state["proposals"] == []
+    assert state["alignment"]["status"] == "done"
+    session.act(1, {"do": "undo"})  # all at once
+    assert len(photo.document.pairs) == 1
+    assert "Nothing is proposed" in session.act(0, {"do": "accept"}).message
+    file.write_text(json.dumps(detections(case, case.open(), ["elsewhere.png"], 1.0)))
+    with pytest.raises(CadalignError, match="no keypoint of the model"):
+        case.open(image=case.folder, detections=file)
+
+
+def test_annotations_are_exported_as_coco_and_glb(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder_of(case, "other.png", "skipped.png")
+    session = case.open(image=case.folder)
+    for image in (0, 1):
+        for keypoint, uv in case.clicks[image : 5 + image]:
+            place(session, keypoint, uv, image=image)
+    session.act(2, {"do": "mark", "mark": "skipped"})
+    data = coco_of(session)
+    assert [image["file_name"] for image in data["images"]] == ["other.png", "photo.png"]
+    to = case.folder.parent / "all.json"
+    command = ["annotate", str(case.folder), str(case.model), "--export", str(to)]
+    assert main([*command, "--camera", str(case.camera)]) == 0
+    assert json.loads(to.read_text()) == data
+    read = read_image_keypoints(to)
+    assert [each.image for each in read] == ["other.png", "photo.png"]
+    assert (read[0].scores > 0).tolist() == [True] * 5 + [False]
+    np.testing.assert_allclose(read[1].points_2d[1:], [uv for _, uv in case.clicks[1:6]])
+
+    scene = trimesh.load(io.BytesIO(glb_of(session, 1)), file_type="glb")
+    assert len(scene.geometry) > 0
+    session.act(1, {"do": "lengths", "height": 0.9, "sigma": 0.02})
+    assert glb_of(session, 1)[:4] == b"glTF"
+    with pytest.raises(CadalignError, match="no alignment yet"):
+        glb_of(session, 2)
+
+
+def test_proposals_are_taken_in_the_page(browser: Browser, case: Case) -> None:
+    file = case.folder / "found.json"
+    file.write_text(json.dumps(detections(case, case.open(), ["photo.png"], 0.0)))
+    session = case.open(detections=file)
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    errors: list[str] = []
+    with served(session) as access:
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(access.url)
+        wait(page, IDLE)
+        keypoint, uv = case.clicks[3]
+        x, y = place_of_pixel(page, uv)
+        page.mouse.click(x + 3, y)
+        wait(page, f"{IDLE} && annotator.state.pairs.length === 1")
+        assert session.photos[0].document.pairs[0].keypoint == keypoint
+        page.keyboard.press("a")
+        wait(page, f"{IDLE} && annotator.state.pairs.length === {len(case.clicks)}")
+        with page.expect_download() as coco:
+            page.get_by_role("link", name="All keypoints (COCO)").click()
+        assert json.loads(coco.value.path().read_text()) == coco_of(session)
+        with page.expect_download() as glb:
+            page.get_by_role("link", name="Aligned model (GLB)").click()
+        assert glb.value.suggested_filename == "photo.glb"
+        context.close()
+    assert errors == []

@@ -1,0 +1,155 @@
+"""`cadalign export`: fits of files, as they are written and found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from support.exported import CAMERA, KEYPOINTS, POSE, photo_of, turned, wedge
+
+from cadalign import FitResult, Model, View, align, fit
+from cadalign.cli import main
+from cadalign.datasets import load_mesh
+from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ImageEvidence, ObservedImage
+
+MORE = np.vstack([KEYPOINTS, wedge().vertices[2:5], [[0.1, 0.2, 0.3]]])
+
+
+@pytest.fixture
+def observed(tmp_path: Path) -> Path:
+    """An observation with photo and model, in ``photo.json``."""
+    write_image(tmp_path / "000007.png", photo_of(CAMERA))
+    plain = AlignedObject((ExportView(CAMERA, POSE),), mesh=wedge())
+    options = ExportOptions(frame="model")
+    export_object(tmp_path / "stretched.obj", plain, options=options)
+    path = tmp_path / "wedge.obj"
+    text = (tmp_path / "stretched.obj").read_text().splitlines()
+    rows = iter(wedge().vertices.tolist())
+    lines = [
+        "v " + " ".join(map(str, next(rows))) if line.startswith("v ") else line for line in text
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    pixels = CAMERA.project(POSE.apply(MORE))
+    image = tmp_path / "000007.png"
+    Observation(MORE, pixels, CAMERA, image=image, model=path).save(tmp_path / "photo.json")
+    return tmp_path / "photo.json"
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert main(["export", *map(str, arguments)]) == 1
+    return capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_a_fit_is_exported_with_photo_and_model(
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", str(observed)]) == 0
+    result = tmp_path / "photo_fit" / "fit.json"
+    assert main(["export", str(result), "--to", str(tmp_path / "out" / "wedge.glb")]) == 0
+    scene = trimesh.load(tmp_path / "out" / "wedge.glb")
+    assert set(scene.geometry) == {"wedge_0", "wedge_1", "photo_0"}
+    assert main(["export", str(result), "--to", str(tmp_path / "wedge.ply"), "--metres", "2"]) == 0
+    mesh = load_mesh(tmp_path / "wedge.ply")
+    np.testing.assert_allclose(mesh.vertices, 2 * POSE.apply(wedge().vertices), atol=1e-4)
+    assert main(["export", str(result), "--to", str(tmp_path / "cam"), "--format", "colmap"]) == 0
+    assert (tmp_path / "cam" / "images.txt").read_text().split()[-1] == "000007.png"
+    assert "COLMAP's text files" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_says_what_is_missing(
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", str(observed), "--out", str(tmp_path / "elsewhere")]) == 0
+    result = tmp_path / "elsewhere" / "fit.json"
+    to = ("--to", tmp_path / "a.glb")
+    assert "--observation: " in refusal(capsys, result, *to)
+    given = ("--observation", observed)
+    assert main(["export", str(result), *map(str, (*to, *given))]) == 0
+    said = refusal(capsys, result, "--to", tmp_path / "a.json", *given)
+    assert "the name does not tell the format" in said
+    said = refusal(capsys, result, *to, *given, "--format", "x3d")
+    assert "--format: unknown format 'x3d'" in said
+    assert "--frame: the views have no known motion" in refusal(
+        capsys, result, *to, *given, "--frame", "rig"
+    )
+    said = refusal(capsys, result, *to, *given, "--frame", "world")
+    assert "--frame: the camera's pose in the world is not known" in said
+    pose = tmp_path / "pose.txt"
+    pose.write_text("1 0 0 0\n0 1 0\n")
+    said = refusal(capsys, result, *to, *given, "--frame", "world", "--world", pose)
+    assert f"{pose}: " in said
+    result.write_text(result.read_text()[:200])
+    assert f"{result}, line" in refusal(capsys, result, *to, *given)
+    assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to, *given)
+
+
+def test_an_observation_that_was_changed_is_refused(
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", str(observed)]) == 0
+    data = json.loads(observed.read_text())
+    data["keypoints"].pop()
+    observed.write_text(json.dumps(data))
+    said = refusal(capsys, tmp_path / "photo_fit" / "fit.json", "--to", tmp_path / "a.glb")
+    assert f"{observed}: 8 keypoints, but the fit has 7" in said or "the fit has 8" in said
+
+
+@pytest.mark.long
+def test_views_and_warped_mesh_of_a_joint_fit(tmp_path: Path, observed: Path) -> None:
+    first = Observation.load(observed)
+    view, motion = turned(ExportView(CAMERA, POSE), 0.4)
+    rng = np.random.default_rng(0)
+    object_points = MORE + rng.normal(0, 0.03, MORE.shape)
+    images = [
+        ObservedImage(
+            MORE,
+            CAMERA.project(pose.apply(object_points)),
+            CAMERA,
+            image=first.image,
+            evidence=ImageEvidence(cam_from_rig=matrix),
+        )
+        for pose, matrix in ((POSE, np.eye(4)), (view.cam_from_model, motion))
+    ]
+    path = tmp_path / "two.json"
+    Observation(**vars(images[0]), model=first.model, others=(images[1],)).save(path)
+    assert main(["fit", str(path), "--shape-sigma", "0.05"]) == 0
+    result = tmp_path / "two_fit" / "fit.json"
+    target = tmp_path / "rig.ply"
+    assert main(["export", str(result), "--to", str(target), "--frame", "rig"]) == 0
+    mesh = load_mesh(target)
+    # Keypoints 0 and 1 are vertices of the wedge; the object's are where the mesh was warped to.
+    placed = POSE.apply(object_points)
+    assert np.linalg.norm(mesh.vertices[[0, 1]] - placed[[0, 1]], axis=1).max() < 0.02
+    assert (
+        np.linalg.norm(POSE.apply(wedge().vertices)[[0, 1]] - placed[[0, 1]], axis=1).max() > 0.02
+    )
+    assert main(["export", str(result), "--to", str(tmp_path / "transforms.json")]) == 0
+    assert len(json.loads((tmp_path / "transforms.json").read_text())["frames"]) == 2
+
+
+def test_results_export_themselves(tmp_path: Path) -> None:
+    pixels = CAMERA.project(POSE.apply(MORE))
+    plain = fit(MORE, pixels, CAMERA)
+    path = plain.export(tmp_path / "plain.ply", mesh=wedge())
+    np.testing.assert_allclose(
+        load_mesh(path).vertices, plain.alignment.apply(wedge().vertices), atol=1e-5
+    )
+    again = FitResult.from_dict(plain.to_dict())
+    again.export(tmp_path / "a.coco.json", mesh=wedge())
+    coco = json.loads((tmp_path / "a.coco.json").read_text())
+    assert coco["annotations"][0]["keypoints"][2::3] == [2] * len(MORE)
+    view = View(CAMERA, pixels)
+    joint = align(Model(points_3d=MORE, mesh=wedge()), view)
+    path = joint.export(tmp_path / "joint.obj", view)
+    np.testing.assert_allclose(
+        load_mesh(path).vertices, joint.alignment.apply(wedge().vertices), atol=1e-5
+    )

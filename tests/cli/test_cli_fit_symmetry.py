@@ -1,0 +1,149 @@
+"""`cadalign fit` of a symmetric model, and its overlay of the model over the photo."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from support.refusals import refusal_line
+
+from cadalign import Alignment, Camera
+from cadalign.cli import main
+from cadalign.datasets import load_mesh
+from cadalign.geometry.rotations import angle_between, rotation_from_vector
+from cadalign.geometry.symmetry_group import FACING
+from cadalign.io.images import read_image, write_image
+from cadalign.io.observation import Observation
+from cadalign.render import Scene, cast_geometry
+
+UP = np.array([0.0, 1.0, 0.0])
+CAMERA = Camera(320, 240, 450.0, 450.0, 159.5, 119.5)
+HALF = np.array([0.5, 0.8, 0.5])
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF
+TILTED = FACING @ rotation_from_vector(np.array([0.5, 0.0, 0.0]))
+TRUTH = Alignment(TILTED @ rotation_from_vector(0.4 * UP), [0.1, 0.0, 5.0], [1.0, 1.2, 1.0])
+QUARTER = rotation_from_vector(np.pi / 2 * UP)
+
+
+def write_observation(folder: Path, name: str = "box.json", **fields: Any) -> Path:
+    """A box of a square base, its photo grey, its keypoints exact."""
+    trimesh.creation.box(2 * HALF).export(folder / "box.obj")
+    write_image(folder / "photo.png", np.full((240, 320, 3), 90, np.uint8))
+    points = fields.pop("points", CORNERS)
+    given: dict[str, Any] = {
+        "model": folder / "box.obj",
+        "image": folder / "photo.png",
+        "fit_options": {"stretch": "y"},
+        **fields,
+    }
+    Observation(points, CAMERA.project(TRUTH.apply(CORNERS)), CAMERA, **given).save(folder / name)
+    return folder / name
+
+
+def with_symmetry(path: Path, symmetry: Any) -> Path:
+    path.write_text(json.dumps({**json.loads(path.read_text()), "symmetry": symmetry}))
+    return path
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "symmetry",
+    ["__SYM_ROTATE_UP_4", {"axis": [0, 1, 0], "fold": 4}, "bop"],
+)
+@pytest.mark.parametrize("flags", [[], ["--shape-sigma", "0.02"]])
+def test_turned_labels_give_the_same_alignment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], symmetry: Any, flags: list[str]
+) -> None:
+    if symmetry == "bop":
+        turns = [np.eye(4), np.eye(4), np.eye(4)]
+        for step, turn in enumerate(turns, 1):
+            turn[:3, :3] = rotation_from_vector(step * np.pi / 2 * UP)
+        symmetry = {"symmetries_discrete": [turn.ravel().tolist() for turn in turns]}
+    rotations = []
+    for name, points in (("a.json", CORNERS), ("b.json", CORNERS @ QUARTER.T)):
+        path = with_symmetry(write_observation(tmp_path, name, points=points), symmetry)
+        assert main(["fit", str(path), *flags]) == 0
+        printed = capsys.readouterr().out
+        assert "symmetry     4 alignments are equal under the model's symmetry" in printed
+        fit = json.loads((tmp_path / f"{path.stem}_fit" / "fit.json").read_text())
+        rotations.append(np.array(fit["alignment"]["rotation"]))
+    assert angle_between(*rotations) < 0.01
+    assert angle_between(rotations[0], TRUTH.rotation) < 0.5
+
+
+def test_an_observation_keeps_its_symmetry(tmp_path: Path) -> None:
+    path = with_symmetry(write_observation(tmp_path), "__SYM_ROTATE_UP_2")
+    read = Observation.load(path)
+    read.save(tmp_path / "again.json")
+    again = Observation.load(tmp_path / "again.json")
+    assert read.symmetry is not None
+    assert again.symmetry is not None
+    np.testing.assert_array_equal(read.symmetry.motions, again.symmetry.motions)
+    assert Observation.load(write_observation(tmp_path)).symmetry is None
+
+
+def test_what_is_no_symmetry_is_refused_by_file_and_field(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = with_symmetry(write_observation(tmp_path), {"axis": [0, 1, 0], "fold": -1})
+    line = refusal_line(capsys, "fit", path)
+    assert "box.json" in line
+    assert "symmetry.fold: '-1' is no number of rotations" in line
+
+
+@pytest.mark.parametrize("flags", [[], ["--shape-sigma", "0.02"]])
+def test_the_overlay_shows_the_model_over_the_photo(tmp_path: Path, flags: list[str]) -> None:
+    path = write_observation(tmp_path)
+    target = tmp_path / "pictures" / "over.png"
+    target.parent.mkdir()
+    options = ["--overlay", str(target), "--overlay-opacity", "1"]
+    assert main(["fit", str(path), *options, *flags]) == 0
+    picture = read_image(target, CAMERA)
+    mesh = load_mesh(tmp_path / "box.obj")
+    mask = cast_geometry(Scene(mesh), CAMERA, TRUTH).mask
+    changed = (np.abs(picture.astype(int) - 90) > 3).any(axis=2)
+    assert changed[mask].mean() > 0.99
+
+
+@pytest.mark.slow
+def test_the_overlay_of_every_view_is_written(tmp_path: Path) -> None:
+    first = write_observation(tmp_path)
+    view = json.loads(first.read_text())
+    several = {name: view.pop(name) for name in ("model", "fit")}
+    path = tmp_path / "views.json"
+    path.write_text(json.dumps({**several, "views": [view, view]}))
+    assert main(["fit", str(path), "--overlay", str(tmp_path / "o.png")]) == 0
+    assert sorted(each.name for each in tmp_path.glob("o*.png")) == ["o.png", "o_1.png"]
+
+
+@pytest.mark.slow
+def test_of_several_files_each_has_its_overlay_in_its_folder(tmp_path: Path) -> None:
+    paths = [str(write_observation(tmp_path, name)) for name in ("a.json", "b.json")]
+    flags = ["--out", str(tmp_path / "fits"), "--overlay", "model.png"]
+    assert main(["fit", *paths, *flags]) == 0
+    found = [each.relative_to(tmp_path) for each in tmp_path.rglob("model.png")]
+    assert sorted(map(str, found)) == ["fits/a/model.png", "fits/b/model.png"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "without_model", "message"),
+    [
+        ([], True, "--overlay: "),
+        (["--overlay-opacity", "2"], False, "--overlay-opacity: 2.0 is not from 0 to 1"),
+    ],
+)
+def test_overlays_that_cannot_be_drawn_are_refused_before_the_fit(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
+    without_model: bool,
+    message: str,
+) -> None:
+    path = write_observation(tmp_path, **({"model": None} if without_model else {}))
+    line = refusal_line(capsys, "fit", path, "--overlay", tmp_path / "o.png", *flags)
+    assert message in line
+    assert not (tmp_path / "box_fit").exists()

@@ -1,0 +1,96 @@
+"""Help of every command: each option is described once, and its default told once."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from functools import cache
+
+import pytest
+
+from cadalign.cli import main
+
+PATHS = (
+    *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
+    *("library build", "library show", "shape learn", "shape show"),
+    *("evaluate keypointnet", "evaluate unseen", "evaluate evidence", "evaluate photos"),
+    *("evaluate correspondences", "evaluate retrieval", "evaluate show"),
+    *("simulate noise", "simulate points", "simulate outliers", "simulate runtime"),
+)
+
+
+@cache
+def printed(path: str) -> str:
+    """What a command prints for --help, without colours, in one column."""
+    out = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
+        patch.setenv("COLUMNS", "96")
+        with pytest.raises(SystemExit):
+            main([*path.split(), "--help"])
+    return re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue())
+
+
+def subcommands(path: str) -> set[str]:
+    """Names of what stands below a command, from its usage line."""
+    usage, _, rest = printed(path).partition("\n\n")
+    found = re.search(r"\{([a-z,-]+)\}", usage)
+    return set(found.group(1).split(",")) if found and "subcommands" in rest else set()
+
+
+def options(path: str) -> dict[str, str]:
+    """The options of a command and what the help says of each, on one line."""
+    found: dict[str, str] = {}
+    name = ""
+    for line in printed(path).splitlines():
+        text = line.replace("│", " ").rstrip()
+        start = re.match(r"  (--?[a-z][\w-]*|[A-Z][A-Z_]*)\b", text)
+        if start:
+            name = start.group(1)
+            found[name] = ""
+        elif not text.startswith("   "):
+            name = ""
+        if name:
+            found[name] += " " + text.strip()
+    return {name: re.sub(r"\s+", " ", text) for name, text in found.items()}
+
+
+@pytest.mark.long
+def test_paths_are_all_commands() -> None:
+    below = {path for name in subcommands("") for path in _leaves(name)}
+    assert below == set(PATHS)
+
+
+def _leaves(path: str) -> list[str]:
+    names = sorted(subcommands(path))
+    return [leaf for name in names for leaf in _leaves(f"{path} {name}")] or [path]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_every_option_is_described(path: str) -> None:
+    assert options(path)
+    for name, text in options(path).items():
+        rest = re.sub(r"\((default|required|repeatable|optional)[^()]*\)", "", text)
+        words = re.findall(r"(?<![-{|,])\b[a-z]{2,}\b", rest)
+        assert len(words) >= 2, (name, text)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_no_default_is_told_twice(path: str) -> None:
+    for name, text in options(path).items():
+        stated = re.findall(r"\(default: ([^()]*)\)", text)
+        told = stated and stated[0].strip() not in ("", "None", "False", "True")
+        assert not (told and re.search(r"\bby default\b|\bdefaults? (is|to)\b", text)), (name, text)
+        assert len(stated) <= 1, (name, text)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_no_description_stands_twice(path: str) -> None:
+    every: dict[str, str] = {}
+    for name, text in options(path).items():
+        described = re.sub(r"\([^()]*\)", "", text)
+        for sentence in re.split(r"(?<=[.;]) ", described):
+            words = " ".join(re.findall(r"[a-z]{2,}", sentence.replace(name, "")))
+            if len(words.split()) >= 4:
+                assert words not in every, (name, every.get(words), sentence)
+                every[words] = name

@@ -1,0 +1,120 @@
+"""What the commands import, and what starting them costs: nothing that a call does not use."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.timing import Measure, ratio, timed_process
+
+from cadalign.cli import COMMANDS
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+
+pytestmark = pytest.mark.long
+
+HEAVY = {
+    *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "joblib", "markdown_it", "matplotlib"),
+    *("numba", "numpy", "open3d", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
+    *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
+    *("starlette", "trimesh", "uvicorn"),
+}
+IN_EVERY_FIT = {"numba", "numpy"}
+
+
+def imported_by(*arguments: str, code: int = 0) -> set[str]:
+    """Of the heavy packages, those that a command imports in a process of its own."""
+    program = (
+        "import json, sys\nfrom cadalign.cli import main\n"
+        "try:\n    code = main(sys.argv[1:])\nexcept SystemExit as stop:\n    code = stop.code\n"
+        "print('\\n' + json.dumps([code, sorted(sys.modules)]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    found, modules = json.loads(done.stdout.splitlines()[-1])
+    assert (found or 0) == code, done.stderr
+    return HEAVY & set(modules)
+
+
+@pytest.fixture(scope="module")
+def observation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An observation file that names a photo and an OBJ model with a material library."""
+    folder = tmp_path_factory.mktemp("observed")
+    problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+    camera = problem.camera
+    photo, model = folder / "photo.jpg", folder / "model.obj"
+    write_image(photo, np.full((camera.height, camera.width, 3), 180, dtype=np.uint8))
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in problem.points_3d)
+    model.write_text(f"mtllib model.mtl\n{vertices}usemtl red\nf 1 2 3\nf 2 3 4\nf 5 6 7 8\n")
+    (folder / "model.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=model).save(
+        folder / "seen.json"
+    )
+    imported_by("fit", str(folder / "seen.json"))  # compiling imports more than reading code does
+    return folder / "seen.json"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["fti"]])
+def test_the_list_of_commands_imports_nothing_heavy(arguments: list[str]) -> None:
+    assert imported_by(*arguments, code=2 if arguments == ["fti"] else 0) == set()
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_of_a_command_imports_no_more_than_numpy(command: str) -> None:
+    assert imported_by(command, "--help") <= {"numpy", "rich"}
+
+
+def test_the_list_of_commands_has_the_first_sentence_of_each() -> None:
+    for command in COMMANDS.values():
+        paragraph = str(command.load().__doc__).split("\n\n")[0]
+        assert " ".join(paragraph.split()) == command.summary
+
+
+def test_a_fit_without_picture_imports_the_solvers_alone(observation: Path) -> None:
+    assert imported_by("fit", str(observation), "--json", "--no-picture") == IN_EVERY_FIT
+
+
+def test_a_fit_imports_what_draws_its_picture_besides(observation: Path) -> None:
+    found = imported_by("fit", str(observation))
+    assert found - {"embreex"} == {*IN_EVERY_FIT, "PIL", "cv2"}
+
+
+@pytest.mark.parametrize("flag", ["--similar", "--robust"])
+def test_other_fits_import_no_mesh_library(observation: Path, flag: str) -> None:
+    assert "trimesh" not in imported_by("fit", str(observation), flag)
+
+
+# --- times -----------------------------------------------------------------------------------
+
+
+def command_line(*arguments: str) -> Measure:
+    """Measure a command in a process of its own, once Python has started."""
+    program = (
+        "import contextlib, io\nfrom cadalign.cli import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):\n"
+        f"    main({list(arguments)!r})\n"
+    )
+    return timed_process(f"exec({program!r})")
+
+
+# What no fit can do without, and what the limits below are ratios to.
+LIBRARIES = timed_process("import numpy, numba")
+
+
+@pytest.mark.timing
+@pytest.mark.parametrize(
+    ("arguments", "limit"),
+    [(["--help"], 0.8), (["fit", "--json", "--no-picture"], 2.6), (["fit"], 3.2)],
+)
+def test_warm_commands_are_quick(observation: Path, arguments: list[str], limit: float) -> None:
+    files = [str(observation)] if arguments[0] == "fit" else []
+    measure = command_line(*arguments, *files)
+    measure()  # compiles what is not yet on disk
+    assert ratio(measure, LIBRARIES, below=limit) < limit

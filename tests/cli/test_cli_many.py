@@ -1,0 +1,180 @@
+"""`cadalign observe --every` and `cadalign fit` of many files, options of both, and messages."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cadalign import Alignment, Camera, FitResult, __version__
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign.io.observation import Observation
+
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
+POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+POSES = [Alignment(np.eye(3), [0.1 * k, 0, 6.0], [1, 1.2, 0.8]) for k in range(3)]
+NAMES = [f"corner {n}" for n in range(8)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A COCO file of three objects in two photos, the model's keypoints, and a matrix K."""
+    entries = []
+    for number, pose in enumerate(POSES):
+        seen = CAMERA.project(pose.apply(POINTS))
+        flat = np.column_stack([seen, np.ones(8)]).ravel().tolist()
+        entries.append({"image_id": 1 + number // 2, "category_id": 1, "keypoints": flat})
+    images = [
+        {"id": 1, "file_name": "a.png", "width": 640, "height": 480},
+        {"id": 2, "file_name": "b.png", "width": 640, "height": 480},
+    ]
+    names = [{"id": 1, "name": "thing", "keypoints": NAMES}]
+    data = {"images": images, "annotations": entries, "categories": names}
+    for number, entry in enumerate(entries):
+        entry["id"] = number
+        entry["num_keypoints"] = 8
+    (tmp_path / "found.json").write_text(json.dumps(data))
+    rows = zip(NAMES, POINTS.tolist(), strict=True)
+    keypoints = tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in rows)
+    ModelKeypoints(keypoints).save(tmp_path / "model.keypoints.json")
+    np.savetxt(tmp_path / "K.txt", CAMERA.matrix)
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    return tmp_path
+
+
+def observe(folder: Path, *options: str) -> list[str]:
+    files = [str(folder / "found.json"), str(folder / "model.keypoints.json")]
+    return ["observe", *files, "--camera", str(folder / "K.txt"), *options]
+
+
+@pytest.mark.slow
+def test_every_object_of_a_file_becomes_an_observation_and_is_fitted(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(observe(folder, "--every", "--image", str(folder))) == 0
+    written = folder / "found_observations"
+    assert sorted(path.name for path in written.iterdir()) == ["a_0.json", "a_1.json", "b.json"]
+    first = Observation.load(written / "a_0.json")
+    assert first.camera == CAMERA
+    assert first.image == folder / "a.png"
+    (written / "broken.json").write_text("{")
+    (written / "notes.json").write_text("{}")
+    assert main(["fit", str(written)]) == 3
+    text = capsys.readouterr().out
+    assert "a_1.json" in text
+    assert "not valid JSON" in text
+    out = folder / "found_observations_fit"
+    with (out / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [Path(row["file"]).name for row in rows] == [
+        "a_0.json",
+        "a_1.json",
+        "b.json",
+        "broken.json",
+    ]
+    assert [bool(row["error"]) for row in rows] == [False, False, False, True]
+    for name, pose in zip(("a_0", "a_1", "b"), POSES, strict=True):
+        found = FitResult.load(out / name / "fit.json")
+        np.testing.assert_allclose(found.alignment.scale, pose.scale, atol=1e-4)
+    page = (out / "index.html").read_text()
+    assert page.count("<img") == 3
+    assert page.index("b.json") < page.index("broken.json")
+
+
+def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
+    assert main(observe(folder, "--every")) == 0
+    files = [str(folder / "found_observations" / f"{name}.json") for name in ("a_0", "b")]
+    assert main(["fit", *files, "--out", str(folder / "out"), "--stretch", "y"]) == 0
+    assert FitResult.load(folder / "out" / "b" / "fit.json").stretched_axes == "y"
+
+
+def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
+    assert main(observe(folder, "--every")) == 0
+    path = folder / "found_observations" / "b.json"
+    np.save(folder / "K.npy", CAMERA.matrix * [[1.1], [1.1], [1]])
+    flags = ["--camera", str(folder / "K.npy"), "--pixel-origin", "corner"]
+    assert main(["fit", str(path), *flags]) == 0
+    camera = FitResult.load(path.with_name("b_fit") / "fit.json").camera
+    assert camera.fx == pytest.approx(770)
+    assert camera.cx == pytest.approx(1.1 * 319.5 - 0.5)
+
+
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"cadalign {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (
+            ["fit", "{folder}/a.png"],
+            "{folder}/a.png: a photo, not an observation, which is a JSON file with camera and "
+            "keypoints; mark keypoints with `cadalign annotate a.png MODEL`, which writes one, or "
+            "use a detector's with `cadalign observe`",
+        ),
+        (["fit", "{folder}/empty"], "{folder}/empty: the folder holds no observation; "),
+        (
+            ["observe", "{folder}/found.json", "{folder}/model.keypoints.json"],
+            "--image: 2 images; choose one of a.png, b.png",
+        ),
+        (
+            ["observe", "{folder}/found.json", "{folder}/model.keypoints.json", "--image", "a.png"],
+            "--object: 2 objects in the image, and no scores to choose by; choose one, 0 to 1",
+        ),
+        (
+            ["observe", "{folder}/found.json", "{folder}/other.keypoints.json", "--every",
+             "--object", "1"],
+            "--object: is for one photo; leave out --every",
+        ),
+        (
+            ["observe", "{folder}/found.json", "{folder}/other.keypoints.json", "--image", "b.png"],
+            "{folder}/found.json: annotations[2]: the model has no keypoint 'corner 4'; "
+            "it has corner 0, corner 1, corner 2, corner 3; --ignore-unknown leaves out what "
+            "it has not",
+        ),
+        (
+            ["observe", "{folder}/found.json", "{folder}/model.keypoints.json", "--every",
+             "--pixel-origin", "corner", "--out", "{folder}/out"],
+            "--pixel-origin: given without --camera; give both",
+        ),
+    ],
+)  # fmt: skip
+def test_messages_name_what_the_user_typed(
+    folder: Path,
+    arguments: list[str],
+    text: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "empty").mkdir()
+    Image.new("RGB", (640, 480)).save(folder / "b.png")
+    model = ModelKeypoints.load(folder / "model.keypoints.json")
+    ModelKeypoints(model.keypoints[:4]).save(folder / "other.keypoints.json")
+    assert main([word.format(folder=folder) for word in arguments]) == 1
+    shown = capsys.readouterr().err
+    assert text.format(folder=folder) in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["annotate"], "--image: no photo is given; cadalign annotate PHOTO MODEL"),
+        (["annotate", "photo.jpg"], "--model: no model is given; cadalign annotate PHOTO MODEL"),
+        (["annotate", "a.jpg", "b.jpg", "m.obj"], "PHOTO MODEL: m.obj is one file too many"),
+        (["fit"], "OBSERVATION"),
+    ],
+)
+def test_missing_arguments_exit_with_2(
+    arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert text in capsys.readouterr().err

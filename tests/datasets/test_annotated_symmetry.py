@@ -1,0 +1,37 @@
+"""Symmetries of KeypointNet's annotation in the form that fits and metrics take."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
+from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
+from cadalign.geometry.symmetry_group import SymmetryGroup
+
+Y = np.array([0.0, 1.0, 0.0])
+
+
+def test_annotated_quarters_make_a_group_of_four():
+    """A stool's seat corners and feet, off the origin, each annotated as one rotation."""
+    square = np.array([[1, 0, 1], [1, 0, -1], [-1, 0, -1], [-1, 0, 1]])
+    xyz = np.concatenate([square, 0.8 * square + Y]) * 0.2 + [0.1, 0.3, 0]
+    turned = (RotationalSymmetry((0, 1, 2, 3)), RotationalSymmetry((4, 5, 6, 7)))
+    symmetry = annotated_symmetry(xyz, Symmetries(rotations=turned))
+    assert len(SymmetryGroup.of(symmetry).rotations) == 4
+    for motion in symmetry.motions:
+        moved = xyz @ motion[:3, :3].T + motion[:3, 3]
+        gaps = np.linalg.norm(moved[:, None] - xyz, axis=2)
+        np.testing.assert_allclose(gaps.min(axis=1), 0, atol=1e-9)
+
+
+def test_a_circle_makes_an_axis():
+    rim = np.array([[0.5, 1, 0], [-0.5, 1, 0], [0, 1, 0.5]])
+    circle = Circle(center=Y, normal=Y, radius=0.5)
+    symmetries = Symmetries(rotations=(RotationalSymmetry((0, 1, 2), circle=circle),))
+    symmetry = annotated_symmetry(np.concatenate([rim, [[0, 0, 0]]]), symmetries)
+    (axis,) = symmetry.axes
+    np.testing.assert_allclose(np.abs(axis.direction), Y, atol=1e-12)
+
+
+def test_without_annotation_there_is_none():
+    assert annotated_symmetry(np.eye(3), Symmetries()).is_trivial

@@ -1,0 +1,110 @@
+"""The documentation site: snippets run, examples are valid, it builds without a warning."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoints
+from cadalign.io.observation import Observation
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+MADE = ("_build", "auto_tutorials")
+
+
+def pages() -> list[Path]:
+    return [page for page in PAGES if not set(page.relative_to(DOCS).parts) & set(MADE)]
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(
+        rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+
+
+def named(page: Path) -> str:
+    return page.relative_to(DOCS).as_posix()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [p for p in pages() if blocks(p, "python")], ids=named)
+def test_snippets_run(page: Path) -> None:
+    names: dict[str, Any] = {}
+    for block in blocks(page, "python"):
+        exec(compile(block, named(page), "exec"), names)
+
+
+@pytest.mark.parametrize("page", pages(), ids=named)
+def test_named_commands_exist(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = "\n".join(blocks(page, "sh"))
+    for command in sorted(set(re.findall(r"^cadalign ([a-z]+)", lines, flags=re.MULTILINE))):
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        assert stop.value.code == 0, command
+        assert command in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("page", pages(), ids=named)
+def test_links_and_anchors_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!https?:)([^)\s]*)\)", text_of(page)):
+        path, _, anchor = target.partition("#")
+        if path.startswith("../schemas/"):
+            continue  # written when the site is built
+        linked = page if not path else (page.parent / path)
+        if linked.parent.name == "auto_tutorials":  # written from the tutorials
+            source = "GALLERY_HEADER.rst" if linked.stem == "index" else f"{linked.stem}.py"
+            linked = DOCS / "tutorials" / source
+        assert linked.exists() or linked.with_suffix(".md").exists(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.+)$", text_of(linked), flags=re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles}
+
+
+def example(name: str) -> Any:
+    return json.loads(blocks(DOCS / "formats" / f"{name}.md", "json")[0])
+
+
+def test_examples_of_formats_are_read(tmp_path: Path) -> None:
+    observation = Observation.from_dict(example("observation"), folder=tmp_path)
+    assert observation.evidence.up is not None
+    path = tmp_path / "chair.keypoints.json"
+    model = example("model_keypoints")
+    model["keypoints"] = model["keypoints"][:1]  # the other one needs the mesh
+    path.write_text(json.dumps(model), encoding="utf-8")
+    assert ModelKeypoints.load(path).names == ("seat, front left",)
+
+
+@pytest.mark.long
+def test_site_builds_and_its_schemas_accept_the_examples(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx_gallery", reason='needs pip install -e ".[docs]"')
+    jsonschema = pytest.importorskip("jsonschema")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    # A copy, since tutorials leave what they made beside their sources.
+    source = tmp_path / "docs"
+    subprocess.run(["cp", "-r", str(DOCS), str(source)], check=True)
+    built = subprocess.run(
+        [*command, str(source), str(tmp_path / "site")],
+        env={**os.environ, "MPLBACKEND": "agg", "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert built.returncode == 0, built.stderr[-3000:]
+    for name in ("observation", "model_keypoints"):
+        text = (tmp_path / "site" / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8")
+        jsonschema.validate(example(name), json.loads(text))
+    fetched = r'(?:src|href)="(?:https?:)?//[^"]+\.(?:js|css|woff2?)"'
+    assert not re.search(fetched, (tmp_path / "site" / "index.html").read_text(encoding="utf-8"))

@@ -1,0 +1,78 @@
+"""`cadalign evaluate photos` on samples of the public data sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign.evaluation.api import run
+from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.photos.spec import SPEC
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
+
+pytestmark = pytest.mark.long
+
+
+def evaluated(root: Path, out: Path, **options: Any) -> Run:
+    """A finished run; skips where the sample is not there."""
+    if not root.is_dir():
+        pytest.skip(f"CADALIGN_DATA has no {root.name}")
+    options = {"pictures": 3, **options}
+    run(PhotosOptions(root, **options), RunFolder(out), workers=0, dask=None)
+    return SPEC.open(out)
+
+
+def line_of(found: Run, group: str, method: str) -> dict[str, Any]:
+    """The summary of a method on a category."""
+    (line,) = (
+        each for each in SPEC.summarize(found) if (each.group, each.method) == (group, method)
+    )
+    return line.values
+
+
+@pytest.mark.long
+def test_cars_have_their_yaw_and_metric_depth(real_data: Path, tmp_path: Path) -> None:
+    found = evaluated(
+        real_data / "real/kitti_cars", tmp_path, methods=("epnp", "rigid", "stretched", "shape")
+    )
+    ours, epnp = (line_of(found, "Car", method) for method in ("shape", "epnp"))
+    assert ours["instances"] >= 29
+    assert ours["failed"] == 0
+    assert ours["yaw_error_deg"] <= 2.2
+    assert ours["yaw_error_deg_90"] <= 5
+    assert ours["depth_error_relative"] <= 0.065
+    assert ours["yaw_error_deg"] <= epnp["yaw_error_deg"]
+    assert ours["depth_error_relative"] <= epnp["depth_error_relative"]
+
+
+def test_chairs_of_scan2cad_are_aligned(real_data: Path, tmp_path: Path) -> None:
+    found = evaluated(real_data / "real/scan2cad", tmp_path, methods=("rigid", "similar"))
+    line = line_of(found, "chair", "similar")
+    assert (line["instances"], line["failed"], line["left_out"]) == (2, 0, 1)
+    assert line["rotation_error_deg"] <= 5
+    assert line["scan2cad_aligned"] == 1.0
+
+
+@pytest.mark.parametrize("name", ["lmo_multiview", "bop_samples"])
+def test_exact_models_are_found_with_simulated_keypoints(
+    real_data: Path, tmp_path: Path, name: str
+) -> None:
+    found = evaluated(real_data / "real" / name, tmp_path, methods=("rigid", "truth"))
+    truth, rigid = (line_of(found, "all", method) for method in ("truth", "rigid"))
+    assert truth["average_recall"] == 1.0
+    assert rigid["average_recall"] > 0.8
+    assert np.isfinite(rigid["mssd"])
+    assert set(found.column("source")) == {"simulated"}
+
+
+def test_photos_without_a_pose_are_fitted_and_drawn(real_data: Path, tmp_path: Path) -> None:
+    found = evaluated(real_data / "real/pascal3d", tmp_path, methods=("similar",), pictures=100)
+    statuses = found.column("status").tolist()
+    assert statuses.count("ok") == 4
+    assert statuses.count("left out") == 1  # a car without a model
+    assert statuses.count("failed") == 5  # photos that are not there
+    assert len(list((tmp_path / "thumbs").iterdir())) == 4

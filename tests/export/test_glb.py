@@ -1,0 +1,183 @@
+"""GLB files: what three.js, trimesh and Open3D make of them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from playwright.sync_api import Browser
+from support.exported import CAMERA, LENS, POSE, aligned, photo_of, turned
+from support.three_viewer import ThreeViewer, three_script
+
+from cadalign import Camera
+from cadalign.datasets import open as open_photos
+from cadalign.errors import DataError, InputError
+from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
+from cadalign.export.photo_plane import photo_plane
+from cadalign.render import Scene, cast_geometry
+from cadalign.render.views.silhouette import silhouette_iou
+
+LEAST_IOU = 0.99
+FINE = 6  # pixels of the browser's picture per pixel of the photo
+
+
+@pytest.fixture(scope="module")
+def three_code(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return three_script(tmp_path_factory.mktemp("three"))
+
+
+@pytest.fixture(scope="module")
+def three(browser: Browser, three_code: str) -> Iterator[ThreeViewer]:
+    viewer = ThreeViewer(browser, three_code)
+    yield viewer
+    assert not viewer.complaints
+
+
+def tree_of(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    (length,) = struct.unpack("<I", data[12:16])
+    tree: dict[str, Any] = json.loads(data[20 : 20 + length])
+    return tree
+
+
+def agrees(three: ThreeViewer, path: Path, exported: AlignedObject) -> float:
+    """IoU of the silhouette in three.js with that of the overlay."""
+    view = exported.views[0]
+    drawn = three.show(path, part="mask", width=FINE * view.camera.width)
+    cast = cast_geometry(Scene(exported.require_mesh()), view.camera, view.cam_from_model)
+    return silhouette_iou(est=drawn.at_pixels(view.camera)[..., 0] > 127, gt=cast.mask)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["off-centre", "distorted"])
+def test_three_shows_the_object_where_the_overlay_does(
+    three: ThreeViewer, tmp_path: Path, camera: Camera
+) -> None:
+    exported = aligned(tmp_path, camera=camera)
+    path = export_object(tmp_path / "wedge.glb", exported)
+    assert agrees(three, path, exported) >= LEAST_IOU
+    photo = three.show(path, part="photo", width=FINE * camera.width).at_pixels(camera)
+    gap = np.abs(photo.astype(int) - photo_of(camera))
+    assert gap.mean() < 1.0
+    assert np.quantile(gap, 0.999) <= 4
+    both = three.show(path, part="all", width=FINE * camera.width).at_pixels(camera)
+    mask = cast_geometry(Scene(exported.require_mesh()), camera, POSE).mask
+    assert np.abs(both.astype(int) - photo)[~mask].mean() < 1.0  # the photo stands behind
+
+
+@pytest.mark.long
+def test_three_agrees_on_real_photos(three: ThreeViewer, tmp_path: Path, real_data: Path) -> None:
+    photo = open_photos(real_data / "real" / "scan2cad")[0]
+    assert photo.camera is not None
+    compared = 0
+    for found in photo.objects:
+        pose = found.truth.cam_from_model
+        assert found.model is not None
+        assert pose is not None
+        view = ExportView(photo.camera, pose, photo.image)  # type: ignore[arg-type]
+        exported = AlignedObject((view,), mesh=found.model.load_mesh(), name="chair")
+        if not cast_geometry(Scene(exported.require_mesh()), photo.camera, pose).mask.any():
+            continue
+        path = export_object(tmp_path / f"{found.object_id}.glb", exported)
+        assert agrees(three, path, exported) >= LEAST_IOU
+        compared += 1
+    assert compared == 2
+
+
+def test_camera_holds_the_whole_photo_about_the_principal_point(tmp_path: Path) -> None:
+    path = export_object(tmp_path / "wedge.glb", aligned(tmp_path))
+    (camera,) = tree_of(path)["cameras"]
+    # Farthest borders: 320 - 0.5 - 140.3 = 179.2 px to the right, 131.2 + 0.5 = 131.7 px upwards.
+    across, down = 179.2 / 400, 131.7 / 390
+    assert camera["perspective"]["yfov"] == pytest.approx(2 * np.arctan(down))
+    assert camera["perspective"]["aspectRatio"] == pytest.approx(across / down)
+
+
+def test_trimesh_reads_mesh_texture_and_place(tmp_path: Path) -> None:
+    exported = aligned(tmp_path, metres=0.5)
+    path = export_object(tmp_path / "wedge.glb", exported)
+    scene = trimesh.load(path)
+    assert set(scene.geometry) == {"model_0", "model_1", "photo_0"}
+    scene.delete_geometry("photo_0")
+    expected = exported.placed_mesh("camera").bounds * 0.5 * [1, -1, -1]
+    np.testing.assert_allclose(scene.bounds, np.sort(expected, axis=0), atol=1e-6)
+    texture = exported.require_mesh().materials[0].texture
+    image = scene.geometry["model_0"].visual.material.baseColorTexture
+    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), texture)
+
+
+def test_colors_are_linear_light(tmp_path: Path) -> None:
+    tree = tree_of(export_object(tmp_path / "wedge.glb", aligned(tmp_path)))
+    (red,) = (each for each in tree["materials"] if each["name"] == "red")
+    srgb = np.array([0.8, 0.1, 0.2])
+    linear = [*((srgb + 0.055) / 1.055) ** 2.4, 1.0]
+    assert red["pbrMetallicRoughness"]["baseColorFactor"] == pytest.approx(linear, rel=1e-6)
+
+
+@pytest.mark.long
+def test_open3d_reads_the_object(tmp_path: Path) -> None:
+    open3d = pytest.importorskip("open3d", reason="open3d is not installed")
+    exported = aligned(tmp_path)
+    without_photo = replace(exported, views=(replace(exported.views[0], image=None),))
+    path = export_object(tmp_path / "wedge.glb", without_photo)
+    mesh = open3d.io.read_triangle_mesh(str(path))
+    expected = np.sort(exported.placed_mesh("camera").bounds * [1, -1, -1], axis=0)
+    np.testing.assert_allclose(mesh.get_min_bound(), expected[0], atol=1e-6)
+    np.testing.assert_allclose(mesh.get_max_bound(), expected[1], atol=1e-6)
+
+
+def test_every_view_has_a_camera_where_it_stands(tmp_path: Path) -> None:
+    exported = aligned(tmp_path)
+    other, cam_from_first = turned(exported.views[0], 0.4)
+    path = export_object(tmp_path / "two.glb", replace(exported, views=(*exported.views, other)))
+    tree = tree_of(path)
+    nodes = {each["name"]: each for each in tree["nodes"]}
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    first, second = (
+        np.reshape(nodes[f"camera_{number}"]["matrix"], (4, 4)).T for number in range(2)
+    )
+    np.testing.assert_allclose(first, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(second, flip @ np.linalg.inv(cam_from_first) @ flip, atol=1e-9)
+
+
+def test_world_frame_places_camera_and_object(tmp_path: Path) -> None:
+    world = np.eye(4)
+    world[:3, 3] = 1, 2, 3
+    exported = aligned(tmp_path, world_from_cam=world)
+    path = tmp_path / "world.glb"
+    export_object(path, exported, options=ExportOptions(frame="world"))
+    camera = next(each for each in tree_of(path)["nodes"] if "camera" in each)
+    place = np.reshape(camera["matrix"], (4, 4)).T[:3, 3]
+    np.testing.assert_allclose(place, [1, 2, 3], rtol=1e-14)  # a rotation and back rounds
+
+
+@pytest.mark.slow
+def test_undistorted_photo_keeps_its_corners() -> None:
+    plane = photo_plane(LENS, photo_of(LENS))
+    assert plane.image is not None
+    corners = LENS.normalize([[-0.5, -0.5], [319.5, 239.5]])
+    step = 1 / 300
+    assert (plane.low <= corners[0] + step).all()
+    assert (plane.high >= corners[1] - step).all()
+
+
+@pytest.mark.long
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="mesh: there is no mesh"):
+        export_object(tmp_path / "a.glb", aligned(tmp_path, mesh=None))
+    gone = replace(aligned(tmp_path).views[0], image=tmp_path / "gone.png")
+    with pytest.raises(DataError, match=r"gone\.png: no such file"):
+        export_object(tmp_path / "a.glb", replace(aligned(tmp_path), views=(gone,)))
+    small = replace(aligned(tmp_path).views[0], image=np.zeros((3, 4, 3), np.uint8))
+    with pytest.raises(InputError, match="the image is 4 x 3, the camera 320 x 240"):
+        export_object(tmp_path / "a.glb", replace(aligned(tmp_path), views=(small,)))
+    with pytest.raises(InputError, match="no rig"):
+        export_object(tmp_path / "a.glb", aligned(tmp_path), options=ExportOptions(frame="rig"))
+    assert not (tmp_path / "a.glb").exists()

@@ -1,0 +1,109 @@
+"""Metrics do not change under a model's symmetry or a change of the camera's frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cadalign import Alignment, Box, Symmetry
+from cadalign.geometry.metrics import (
+    alignment_box_iou,
+    box_iou,
+    box_iou_up_to_scale,
+    rotation_error,
+    scale_error,
+    translation_error,
+)
+from cadalign.geometry.rotations import rotation_from_vector
+
+pytestmark = pytest.mark.long
+
+BOUNDS = np.array([[-0.3, -0.5, -0.3], [0.3, 0.5, 0.3]])
+UP = np.array([0.0, 1.0, 0.0])
+
+vectors = st.tuples(*[st.floats(-1.5, 1.5)] * 3).map(np.array)
+rotations = vectors.map(rotation_from_vector)
+places = st.tuples(*[st.floats(-0.5, 0.5)] * 2, st.floats(2, 4)).map(np.array)
+stretches = st.floats(0.6, 1.6)
+
+
+@st.composite
+def alignments(draw: st.DrawFn) -> Alignment:
+    """Poses with the same stretch along x and z, which the rotations about y exchange."""
+    across = draw(stretches)
+    scale = np.array([across, draw(stretches), across])
+    return Alignment(draw(rotations), draw(places), scale)
+
+
+def turned(alignment: Alignment, angle: float) -> Alignment:
+    """The alignment of the model after a rotation about its y axis, which keeps its scales."""
+    rotation = alignment.rotation @ rotation_from_vector(angle * UP)
+    return Alignment(rotation, alignment.translation, alignment.scale)
+
+
+def errors(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> np.ndarray:
+    values = {"est": est, "gt": gt, "symmetry": symmetry}
+    scale = scale_error(**values)
+    return np.array([rotation_error(**values), translation_error(**values), *np.ravel(scale)])
+
+
+@settings(deadline=None, max_examples=60)
+@given(alignments(), alignments(), st.floats(-3, 3), st.floats(-3, 3))
+def test_errors_are_those_of_any_equal_alignments(
+    est: Alignment, gt: Alignment, first: float, second: float
+) -> None:
+    symmetry = Symmetry.around(UP, fold=None)
+    expected = errors(est, gt, symmetry)
+    # The angle of a rotation near 0 is known to the root of rounding.
+    np.testing.assert_allclose(
+        errors(turned(est, first), turned(gt, second), symmetry), expected, atol=1e-4
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(alignments(), alignments(), st.sampled_from([2, 3, 4, 6]), st.integers(0, 5))
+def test_errors_are_those_of_equal_alignments_of_a_discrete_symmetry(
+    est: Alignment, gt: Alignment, fold: int, step: int
+) -> None:
+    symmetry = Symmetry.around(UP, fold=fold)
+    expected = errors(est, gt, symmetry)
+    other = turned(gt, 2 * np.pi * step / fold)
+    np.testing.assert_allclose(errors(est, other, symmetry), expected, atol=1e-4)
+    assert expected[0] <= rotation_error(est=est, gt=gt) + 1e-4
+
+
+@settings(deadline=None, max_examples=60)
+@given(alignments(), alignments(), rotations, vectors)
+def test_errors_and_overlaps_are_those_in_any_frame(
+    est: Alignment, gt: Alignment, rotation: np.ndarray, shift: np.ndarray
+) -> None:
+    def moved(alignment: Alignment) -> Alignment:
+        place = rotation @ alignment.translation + shift
+        return Alignment(rotation @ alignment.rotation, place, alignment.scale)
+
+    frames = {"est": moved(est), "gt": moved(gt)}
+    np.testing.assert_allclose(
+        errors(frames["est"], frames["gt"], None), errors(est, gt, None), atol=1e-4
+    )
+    overlap = alignment_box_iou(**frames, bounds=BOUNDS)
+    assert overlap == pytest.approx(alignment_box_iou(est=est, gt=gt, bounds=BOUNDS), abs=1e-6)
+
+
+@settings(deadline=None, max_examples=40)
+@given(alignments(), alignments(), st.floats(0.2, 5), rotations)
+def test_overlap_up_to_scale_is_symmetric_and_without_scale_or_frame(
+    est: Alignment, gt: Alignment, factor: float, rotation: np.ndarray
+) -> None:
+    first, second = Box.from_model(BOUNDS, est), Box.from_model(BOUNDS, gt)
+    expected = box_iou_up_to_scale(est=first, gt=second)
+
+    def seen(box: Box, scale: float) -> Box:
+        place = scale * (rotation @ np.asarray(box.center))
+        return Box(place, rotation @ box.rotation, scale * np.asarray(box.extents))
+
+    found = box_iou_up_to_scale(est=seen(first, factor), gt=seen(second, 1.0))
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert box_iou_up_to_scale(est=second, gt=first) == pytest.approx(expected, abs=1e-5)
+    assert expected >= box_iou(est=first, gt=second) - 1e-6

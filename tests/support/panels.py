@@ -1,0 +1,230 @@
+"""A session in the annotator's page that opens every panel, by the keyboard alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, Page
+
+from cadalign.annotate.session import Session
+from cadalign.datasets import KeypointNet
+from cadalign.retrieval import Library
+from support.annotating import Case, wait
+
+IDLE = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle"
+    " && annotator.state.alignment.status !== 'preparing')"
+)
+WATCH_SHIFTS = """
+window.shifts = [];
+new PerformanceObserver((list) => {
+    for (const entry of list.getEntries()) {
+        const nodes = entry.sources.map(({ node, previousRect: a, currentRect: b }) =>
+            `${node?.outerHTML?.slice(0, 90) ?? node?.nodeValue} ${a.x},${a.y} -> ${b.x},${b.y}`);
+        window.shifts.push({ value: entry.value, input: entry.hadRecentInput, nodes });
+    }
+}).observe({ type: "layout-shift", buffered: true });
+"""
+"""Script that collects all layout shifts, those after an input by the user included."""
+
+AXE = """async () => {
+    const { violations } = await axe.run(document, { resultTypes: ["violations"] });
+    return violations.map(({ id, impact, nodes }) =>
+        ({ id, impact, nodes: nodes.map((each) => `${each.html}: ${each.failureSummary}`) }));
+}"""
+PHOTO, MODEL = "section[aria-label=Photo] canvas", "section[aria-label=Model] canvas"
+_POLLS = 4000
+_TWO_FRAMES = """async () => {
+    for (let k = 0; k < 2; k += 1) await new Promise((drawn) => requestAnimationFrame(drawn));
+}"""
+
+
+def prepare(case: Case, root: Path, *, photos: int = 3) -> Session:
+    """A folder of photos with a library of models and a detector's keypoints, opened."""
+    for number in range(2, photos + 1):
+        shutil.copy(case.photo, case.folder / f"photo_{number}.png")
+    names = [f"keypoint {number}" for number, _ in case.clicks]
+    points = [value for _, uv in case.clicks[:7] for value in (*uv, 2)]
+    points += [0, 0, 0] * (len(case.clicks) - 7)
+    found = {
+        "images": [{"id": 1, "file_name": case.photo.name, "width": 640, "height": 480}],
+        "categories": [{"id": 1, "name": "chair", "keypoints": names}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": points}],
+    }
+    (case.folder / "found.json").write_text(json.dumps(found))
+    library = case.folder / "chairs.library"
+    Library.from_dataset(KeypointNet(root).subset(categories=["chair"])).save(library)
+    return case.open(
+        image=case.folder, keypoints=None, detections=case.folder / "found.json", library=library
+    )
+
+
+@dataclass
+class Keyboard:
+    """A page used by its keys; ``seen`` is called in every panel with the panel's name."""
+
+    page: Page
+    seen: Callable[[str], None] = lambda name: None
+    visited: list[str] = field(default_factory=list)
+
+    def wait(self, condition: str = IDLE) -> None:
+        wait(self.page, condition, polls=_POLLS)
+
+    def keys(self, *keys: str, then: str = IDLE) -> None:
+        """Press keys where the focus is, and wait."""
+        for key in keys:
+            self.page.keyboard.press(key)
+            self.wait()
+        self.wait(then)
+
+    def press(self, selector: str, key: str = "Enter") -> None:
+        """Press a key on a control, which has the focus then."""
+        self.page.locator(selector).first.press(key)
+        self.wait()
+
+    def disclose(self, selector: str) -> None:
+        """Open what is folded. It pushes down what is below it, as asked, however late it comes."""
+        before = self.page.evaluate("window.shifts?.length ?? 0")
+        self.press(selector)
+        self.page.evaluate(_TWO_FRAMES)
+        self.page.wait_for_timeout(100)
+        self.page.evaluate("count => { if (window.shifts) window.shifts.length = count; }", before)
+
+    def type(self, selector: str, text: str) -> None:
+        self.page.locator(selector).first.press("Control+a")
+        self.page.keyboard.type(text)
+        self.page.keyboard.press("Enter")
+        self.wait()
+
+    def look(self, name: str) -> None:
+        self.visited.append(name)
+        self.page.wait_for_timeout(50)
+        self.seen(name)
+
+    def session(self) -> None:
+        """Open every panel, annotate a photo by all means, and go on to the next."""
+        for part in (
+            self._first, self._pairs, self._evidence, self._seeing, self._dialogs, self._end,
+        ):  # fmt: skip
+            part()
+
+    def _first(self) -> None:
+        self.look("empty")
+        self.keys("?")
+        self.look("help")
+        self.page.get_by_role("button", name="Show the tour").press("Enter")
+        for step in (1, 2, 3):
+            self.look(f"tour {step}")
+            self.keys("Enter")
+        self.page.locator(PHOTO).focus()
+
+    def _pairs(self) -> None:
+        self.keys("a", then=f"{IDLE} && annotator.state.alignment.status === 'done'")
+        self.wait("document.querySelectorAll('.ranking:not(.stale) li').length > 0")
+        self.look("aligned")
+        self.disclose(".how summary")
+        self.disclose(".keypoints-list > summary")
+        self.look("details")
+        self.keys("]")
+        self.type("td.name input", "left knee")
+        self.page.locator(PHOTO).focus()
+        self.keys("m")
+        self.look("mirrored")
+        self.keys("Delete", "]", *["Shift+ArrowRight"] * 16)
+        self.look("contradiction")
+        self.keys("Control+z", "Control+y", "Control+z")
+        self.page.locator(MODEL).focus()
+        self.keys("n", "Control+z")
+
+    def _evidence(self) -> None:
+        self.disclose("button[aria-expanded]")
+        self.look("evidence")
+        self.page.locator(PHOTO).focus()
+        self.keys("b", "Enter", "ArrowRight", "ArrowRight", "Enter")
+        self.look("brush")
+        self.keys("g", "Enter", "ArrowRight", "Enter", "ArrowDown", "Enter", "c")
+        self.look("polygon")
+        self.press("[aria-label='Clear the mask']")
+        self.page.locator(PHOTO).focus()
+        for edge in range(2):
+            self.keys(
+                "u", "Enter", "ArrowDown", "ArrowDown", "Enter", *["ArrowLeft"] * (3 * edge + 2)
+            )
+        self.look("vertical edges")
+        self.press("[aria-label='Clear the vertical edges']")
+        self.type("[aria-label='Known height (along y)']", "0.9")
+        self.look("known size")
+        self.page.locator(PHOTO).focus()
+        self.keys("Control+z", "p")
+
+    def _seeing(self) -> None:
+        self.keys("l", "1", "2", "5", "v", "f", "+", "-")
+        self.look("loupe")
+        self.keys("l", "o", "o")
+        self.look("box")
+        self.keys("o", "o", "r", then="!!annotator.model.result")
+        self.look("result in 3D")
+        self.keys("r")
+        self.press("section[aria-label=Photo] [aria-label='Zoom in']")
+        self.press(".priors input[type=checkbox]", "Space")
+        self.press(".priors input[type=checkbox]", "Space")
+
+    def _dialogs(self) -> None:
+        self.keys("w", then="document.querySelectorAll('dialog[open] .thumbs li').length > 0")
+        self.look("work list")
+        self.keys("Escape", "q")
+        self.wait("document.querySelectorAll('dialog[open] .models li').length > 0")
+        self.look("models")
+        before = self.page.evaluate("annotator.model.mesh.uuid")
+        number = self.page.evaluate(
+            "annotator.library.models.findIndex((each) => !each.current) + 1"
+        )
+        self.keys(str(number), then=f"{IDLE} && annotator.model.mesh.uuid !== '{before}'")
+        self.look("other model")
+        self.keys("q")
+        self.wait("document.querySelectorAll('dialog[open] .models li').length > 0")
+        self.keys("0")
+        self.page.locator(MODEL).focus()
+        self.page.evaluate("annotator.model.zoom(0.02)")
+        self.keys("Enter")
+        self.look("message")
+
+    def _end(self) -> None:
+        self.page.locator(PHOTO).focus()
+        self.keys("f", "k", then=f"{IDLE} && annotator.state.image.number === 1")
+        self.keys("PageUp", then=f"{IDLE} && annotator.state.image.number === 0")
+        self.keys("d", then=f"{IDLE} && annotator.state.image.number === 1")
+        self.look("next photo")
+
+
+def open_page(
+    browser: Browser,
+    address: str,
+    *,
+    width: int,
+    height: int,
+    scheme: Any,
+    scripts: tuple[str, ...],
+) -> Page:
+    """The annotator's page in a context of its own, with scripts that run before its own."""
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    page = context.new_page()
+    for script in scripts:
+        page.add_init_script(script)
+    page.goto(address)
+    Keyboard(page).wait()
+    return page
+
+
+def shifts(page: Page, *, also_after_input: bool) -> Iterator[dict[str, Any]]:
+    """Layout shifts so far, as `WATCH_SHIFTS` collects them."""
+    time.sleep(0.1)
+    for each in page.evaluate("window.shifts"):
+        if also_after_input or not each["input"]:
+            yield each

@@ -1,0 +1,120 @@
+"""A new user: an environment with the wheel alone, what it lists, and the documents' snippets."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from support.wheels import ROOT, Environment, build_wheel
+
+import cadalign
+
+pytestmark = pytest.mark.long
+
+DOCS = ROOT / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
+PAGES = [
+    page
+    for page in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    if not {"_build", "auto_tutorials"} & set(page.relative_to(ROOT).parts)
+    and "```python" in page.read_text(encoding="utf-8")
+]
+RUN_SNIPPETS = r"""
+import re, sys
+from pathlib import Path
+
+for page in sys.argv[1:]:
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", Path(page).read_text("utf-8"), re.DOTALL):
+        exec(compile(block, page, "exec"), names)
+    print("ran", page)
+"""
+IPYTHON = """
+from IPython.core.completer import provisionalcompleter
+from IPython.core.interactiveshell import InteractiveShell
+
+shell = InteractiveShell.instance()
+shell.Completer.use_jedi = {use_jedi}
+shell.run_cell("import cadalign")
+with provisionalcompleter():
+    for text in ("cadalign.fi", "cadalign.da"):
+        print(*(found.text.strip(".") for found in shell.Completer.completions(text, len(text))))
+"""
+
+
+@pytest.fixture(scope="module")
+def user(tmp_path_factory: pytest.TempPathFactory) -> Environment:
+    folder = tmp_path_factory.mktemp("user")
+    return Environment.with_wheel(build_wheel(folder), folder / "venv")
+
+
+def python(user: Environment, code: str) -> str:
+    return user.run("python", ["-c", code])
+
+
+@pytest.mark.long
+def test_package_and_command_are_those_of_the_wheel(user: Environment) -> None:
+    code = (
+        "import cadalign, cadalign.datasets; print(cadalign.__file__, cadalign.datasets.__file__)"
+    )
+    assert all(Path(path).is_relative_to(user.site) for path in python(user, code).split())
+    assert user.run("cadalign", ["--version"]).split() == ["cadalign", cadalign.__version__]
+    assert "fit" in user.run("cadalign", ["--help"])
+
+
+def test_listing_names_what_is_public(user: Environment) -> None:
+    listed = python(user, "import cadalign; print(*dir(cadalign))").split()
+    assert listed == sorted([*cadalign.__all__, "__version__"])
+
+
+@pytest.mark.long
+def test_help_describes_arguments_result_and_errors(user: Environment) -> None:
+    shown = python(user, "import cadalign; help(cadalign.fit)")
+    for part in ("points_3d", "Parameters", "Returns", "Raises", ">>> "):
+        assert part in shown
+    described = python(user, "import cadalign; help(cadalign)")
+    assert {"fit", "Library", "ShapeModel"} <= set(re.findall(r"\w+", described))
+
+
+@pytest.mark.long
+def test_jedi_completes_names_before_anything_runs(user: Environment) -> None:
+    pytest.importorskip("jedi")
+    code = (
+        "import jedi\n"
+        "def names(text):\n"
+        "    return {name.name for name in jedi.Script(text).complete()}\n"
+        "assert {'fit', 'fit_batch'} <= names('import cadalign\\ncadalign.fi')\n"
+        "assert 'retrieve' in names('import cadalign\\ncadalign.Library.re')\n"
+        "made = 'import cadalign\\ncadalign.Camera.from_fov(640, 480, 35.0).pro'\n"
+        "assert 'project' in names(made)\n"
+        "result = 'import cadalign\\ncadalign.fit([], [], None).ali'\n"
+        "assert 'alignment' in names(result)\n"
+    )
+    python(user, code)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("use_jedi", [False, True])
+def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
+    pytest.importorskip("IPython")
+    found = python(user, IPYTHON.format(use_jedi=use_jedi)).split()
+    assert {"fit", "fit_batch", "datasets"} <= set(found)
+
+
+@pytest.mark.long
+def test_snippets_of_readme_and_site_run(user: Environment) -> None:
+    ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
+    assert ran.count("ran ") >= len(PAGES) > 5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_tutorials_run(user: Environment, tutorial: Path) -> None:
+    user.run("python", [str(tutorial)])
+
+
+@pytest.mark.long
+def test_first_command_of_the_readme_writes_its_page(user: Environment) -> None:
+    user.run("cadalign", ["demo", "--per-category", "1", "--out", "demo"])
+    assert (user.home / "demo" / "index.html").is_file()

@@ -1,0 +1,88 @@
+"""The scripts start, and the worked example's files are what its page says."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cadalign.cli import main
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = sorted(
+    path
+    for path in (ROOT / "scripts").glob("*.py")
+    if "tyro.cli" in path.read_text() or "argparse" in path.read_text()
+)
+
+
+def run(script: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, str(script), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_every_script_starts(script: Path) -> None:
+    assert "usage: " in run(script, "--help")
+
+
+@pytest.mark.long
+def test_the_worked_photo_aligns_as_its_page_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = tmp_path / "chairs"
+    run(
+        ROOT / "scripts" / "align_other_chair.py",
+        *("--files", str(files)),
+        *("--out", str(tmp_path / "chairs.png")),
+    )
+    assert main(["fit", str(files / "photo.json"), "--out", str(tmp_path / "fit")]) == 0
+    page = (ROOT / "docs" / "photo_to_glb.md").read_text(encoding="utf-8")
+    printed = capsys.readouterr().out
+    for line in page.partition("```text\n")[2].partition("```")[0].splitlines():
+        assert line in printed
+
+
+class TestComparingRatios:
+    FIGURES = (
+        '{"fit": {"value": 9.0, "unit": "us", "ratio": 1.19}, "size": {"value": 3, "unit": "MB"}}'
+    )
+
+    def compare(self, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+        (folder / "measured.json").write_text(self.FIGURES)
+        script = ROOT / "scripts" / "compare_ratios.py"
+        named = ["--stored", str(folder / "stored.json"), *options]
+        return subprocess.run(
+            [sys.executable, str(script), str(folder / "measured.json"), *named],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    @pytest.mark.parametrize(("stored", "status"), [(1.0, 0), (0.98, 1)])
+    def test_a_fifth_worse_than_stored_fails(
+        self, stored: float, status: int, tmp_path: Path
+    ) -> None:
+        (tmp_path / "stored.json").write_text(f'{{"fit": {stored}}}')
+        done = self.compare(tmp_path)
+        assert done.returncode == status
+        assert ("more than 20% worse than stored: fit" in done.stdout) == bool(status)
+
+    def test_stored_ratios_are_compared_with_next_time(self, tmp_path: Path) -> None:
+        (tmp_path / "stored.json").write_text('{"other": 2.0}')
+        assert self.compare(tmp_path, "--store").returncode == 0
+        assert json.loads((tmp_path / "stored.json").read_text()) == {"fit": 1.19, "other": 2.0}
+        assert "(stored 1.19)" in self.compare(tmp_path).stdout

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
         join_keypoints,
     )
     from cadalign.datasets.detections.keypoint_files import read_image_keypoints
-    from cadalign.datasets.meshes.load import check_solid, flat_axes, load_mesh
     from cadalign.datasets.models.categories import SYNSETS
     from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
     from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
+    from cadalign.io.meshes.load import check_solid, flat_axes, load_mesh
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.cli.render import Render
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
@@ -17,6 +16,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
+from cadalign.io.meshes.load import load_mesh
 from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import keypoint_picture

@@ -16,7 +16,6 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
 from cadalign.datasets.models.annotations import entry_id, parse_entry, read_entries
 from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
@@ -25,6 +24,7 @@ from cadalign.datasets.models.locate import MeshLocator
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.meshes.load import load_mesh
 
 logger = logging.getLogger("cadalign")
 

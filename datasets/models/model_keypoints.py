@@ -33,7 +33,6 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.annotations import entry_id, parse_entry, require_unique
 from cadalign.datasets.models.keypointnet import AnnotatedModel
 from cadalign.datasets.models.keypoints import Keypoints
@@ -53,6 +52,7 @@ from cadalign.io.documents import (
     written_path,
 )
 from cadalign.io.files import write_json
+from cadalign.io.meshes.load import load_mesh
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1

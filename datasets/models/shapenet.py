@@ -9,10 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import overload
 
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.load import load_mesh
 
 # Where a model's mesh lies in its folder: version 2, then version 1.
 _MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))

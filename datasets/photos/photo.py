@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -19,6 +18,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.images import ByteImage, open_photo, read_photo
+from cadalign.io.meshes.load import load_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.photo import (
     CadModel,
@@ -41,6 +40,7 @@ from cadalign.io.documents import (
     Text,
 )
 from cadalign.io.files import damaged, reading
+from cadalign.io.meshes.load import load_mesh
 
 ANNOTATIONS = "pix3d.json"
 # The width of the sensor that focal lengths are for [mm].

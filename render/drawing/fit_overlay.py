@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image
+from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 from cadalign.render.drawing.color import ByteImage

@@ -30,10 +30,10 @@ from cadalign.annotate.objects.state import PhotoState
 from cadalign.annotate.objects.unfinished import LeftOut, StoredView
 from cadalign.annotate.objects.view_history import ViewHistory
 from cadalign.annotate.photos import Intrinsics, Photo, intrinsics_of
-from cadalign.datasets.meshes.load import load_mesh
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
+from cadalign.io.meshes.load import load_mesh
 
 logger = logging.getLogger("cadalign")
 

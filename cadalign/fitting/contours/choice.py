@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.errors import InputError
 from cadalign.fitting.contours.hull import ConvexSurface
 from cadalign.fitting.contours.surface import RigidSurface, Surface, WarpedSurface
 from cadalign.fitting.joint.model import Model
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
@@ -85,17 +86,4 @@ def _of_training(alone: TrainingShapes) -> tuple[Mesh, FloatArray, IntArray]:
     """The mesh of a training model, its keypoints, and their numbers in the shape."""
     source = alone.points_3d[0].astype(np.float64)
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
-    return _load(cast(Path, alone.mesh_paths[0])), source[known], known
-
-
-def _load(path: Path) -> Mesh:
-    """The triangles of a mesh file; their order and look don't matter to a silhouette."""
-    import trimesh  # takes long to import
-
-    try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
-        return Mesh(loaded.vertices, loaded.faces, source=str(path))
-    except CadalignError:
-        raise
-    except Exception as error:  # trimesh's readers raise all kinds
-        raise DataError(f"the mesh cannot be read ({brief(error)})", where=str(path)) from None
+    return load_mesh(cast(Path, alone.mesh_paths[0])), source[known], known

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.meshes.obj import read_obj
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.obj import read_obj
 
 
 def _read_ply(path: Path) -> Mesh:
     # Only here: trimesh takes longer to import than an OBJ file to be read.
-    from cadalign.datasets.meshes.scenes import read_ply
+    from cadalign.io.meshes.scenes import read_ply
 
     return read_ply(path)
 
 
 def _read_scene(path: Path) -> Mesh:
-    from cadalign.datasets.meshes.scenes import read_scene  # trimesh, as above
+    from cadalign.io.meshes.scenes import read_scene  # trimesh, as above
 
     return read_scene(path)
 

@@ -15,11 +15,11 @@ import trimesh
 from trimesh.visual.color import linear_to_srgb
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.meshes.mtl import WHITE, Texture, texture_array
-from cadalign.datasets.meshes.obj import fan_triangles
 from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.io.files import damaged
+from cadalign.io.meshes.mtl import WHITE, Texture, texture_array
+from cadalign.io.meshes.obj import fan_triangles
 
 _MAX_HEADER_LINES = 1000
 

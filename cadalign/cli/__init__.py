@@ -17,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from cadalign import __version__
+from cadalign.cli.help_texts import plain_help
 from cadalign.cli.options import UsageError
 from cadalign.errors import CadalignError
 
@@ -113,7 +114,14 @@ def _parse(arguments: list[str]) -> Any:
         with _defaults_taken_as_typed():
             command, prog = COMMANDS[name].load(), f"cadalign {name}"
             text = cleandoc(str(command.__doc__))
-            return tyro.cli(command, prog=prog, description=text, args=rest, config=config)
+            return tyro.cli(
+                command,
+                prog=prog,
+                description=text,
+                args=rest,
+                config=config,
+                registry=plain_help(),
+            )
     stubs = [
         Annotated[_Listed, tyro.conf.subcommand(name, description=each.summary)]
         for name, each in COMMANDS.items()

@@ -106,7 +106,9 @@ class Fit(ObservationCommand, CameraOptions, EvidenceOptions):
     """
 
     observations: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION ...")
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
     ]
     """JSON files with camera and keypoints, optionally image, model and further evidence; or a
     folder of such files."""

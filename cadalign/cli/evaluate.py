@@ -56,7 +56,7 @@ class RunCommand(JsonOption, RunOptions):
         with named_as_flags(self):
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             count = options.default_workers if self.workers is None else self.workers
-            workers = workers_of(count, self.dask)
+            workers = workers_of(count, self.dask, threads=options.threads)
             out = self.out or Path("runs") / options.run_name
             plan = spec.plan(options, RunFolder(out))
         with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:

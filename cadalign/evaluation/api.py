@@ -123,7 +123,9 @@ def run(
 
     ``workers`` and ``dask`` are those of `evaluate`; ``on_progress`` is told of every chunk.
     """
-    pool = workers_of(options.default_workers if workers is None else workers, dask)
+    pool = workers_of(
+        options.default_workers if workers is None else workers, dask, threads=options.threads
+    )
     plan = spec_named(options.experiment).plan(options, folder)
     execute(plan, folder, workers=pool, on_progress=on_progress)
 

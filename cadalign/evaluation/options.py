@@ -39,6 +39,11 @@ class ExperimentOptions:
         """Number of worker processes, unless another is given; see `RunOptions`."""
         return -1
 
+    @property
+    def threads(self) -> int:
+        """Number of threads of a run without workers."""
+        return 1
+
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
         for name, least in bounds.items():

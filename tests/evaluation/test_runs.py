@@ -106,6 +106,14 @@ def run_squares(
 
 
 @pytest.mark.long
+def test_threads_find_what_one_finds(tmp_path: Path) -> None:
+    alone = run_squares(tmp_path / "alone", Squares())
+    plan, folder = Plan(Squares(), range(100), {"value": 1}, 7), RunFolder(tmp_path / "shared")
+    execute(plan, folder, workers=workers_of(0, None, threads=3))
+    assert read_table(folder.results).to_pylist() == alone
+
+
+@pytest.mark.long
 def test_results_are_in_the_order_of_the_tasks_whatever_the_workers(tmp_path: Path) -> None:
     rows = run_squares(tmp_path / "none", Squares())
     assert [row["task"] for row in rows] == list(range(100))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from cadalign.evaluation.options import NoiseOption
 
+_THREADS = 2
+
 
 @dataclass(frozen=True)
 class DemoOptions(NoiseOption):
@@ -36,6 +38,11 @@ class DemoOptions(NoiseOption):
     def default_workers(self) -> int:
         """A demonstration is over before worker processes have started."""
         return 0
+
+    @property
+    def threads(self) -> int:
+        """Drawing, most of the work, lets go of the interpreter lock."""
+        return _THREADS
 
 
 OPTIONS = DemoOptions

@@ -15,7 +15,14 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar, cast
@@ -51,13 +58,25 @@ class Workers(Protocol):
         """Evaluate chunks; yields each with its result, in any order."""
 
 
+@dataclass(frozen=True)
 class InProcess:
-    """No workers: everything happens in this process, and a crash ends it."""
+    """No workers: everything happens in this process, in so many threads; a crash ends it.
+
+    Threads serve what lets go of the interpreter lock, such as drawing.
+    """
+
+    threads: int = 1
 
     def evaluate(
         self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
     ) -> Iterator[tuple[Chunk[T], Rows]]:
         """See `Workers.evaluate`."""
+        if self.threads > 1:
+            with ThreadPoolExecutor(self.threads) as pool:
+                yield from evaluate_on(
+                    lambda: pool, experiment, chunks, window=self.threads, deadly=()
+                )
+            return
         for chunk in chunks:
             yield chunk, evaluate_chunk(experiment, chunk.tasks)
 

@@ -66,8 +66,11 @@ def execute(
         shutil.rmtree(folder.parts, ignore_errors=True)
 
 
-def workers_of(count: int, dask: str | None) -> Workers:
-    """Choose workers by options; see `cadalign.evaluation.options.RunOptions`."""
+def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
+    """Choose workers by options; see `cadalign.evaluation.options.RunOptions`.
+
+    ``threads`` share the work of a run without workers.
+    """
     if dask is not None:
         from cadalign.evaluation.runs.cluster import DaskWorkers
 
@@ -78,7 +81,7 @@ def workers_of(count: int, dask: str | None) -> Workers:
             where="workers",
             fix="give 1 or more, -1 for one for each core, 0 for none",
         )
-    return LocalProcesses(count) if count else InProcess()
+    return LocalProcesses(count) if count else InProcess(threads)
 
 
 def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:

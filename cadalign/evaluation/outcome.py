@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from cadalign.errors import CadalignError, InputError, TooFewVisibleError
@@ -64,10 +64,6 @@ class Outcome:
     def timing(self) -> Row:
         """The row of the table of timings."""
         return {**self.names, "seconds": self.seconds}
-
-    def after(self, seconds: float) -> Outcome:
-        """The same outcome, with more time taken."""
-        return replace(self, seconds=(self.seconds or 0.0) + seconds)
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:

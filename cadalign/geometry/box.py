@@ -78,12 +78,13 @@ class Box:
         >>> box.center.tolist(), box.extents.tolist()
         ([0.0, 0.0, 4.0], [2.0, 4.0, 1.0])
         """
-        low, high = as_floats(bounds, name="bounds", shape=(2, 3))
-        extents = (high - low) * alignment.scale
-        (center,) = ((low + high) / 2)[None] @ alignment.linear.T + alignment.translation
+        bounds = as_floats(bounds, name="bounds", shape=(2, 3))
+        center, rotation, extents = oriented_box(
+            bounds, alignment.rotation, alignment.translation, alignment.scale
+        )
         # Python's numbers: NumPy's reductions of three take longer than the rest of this.
         valid = min(extents.tolist()) >= 0 and isfinite(sum(extents.tolist() + center.tolist()))
-        return cls(center, alignment.rotation, extents, is_valid=valid)
+        return cls(center, rotation, extents, is_valid=valid)
 
     @property
     def corners(self) -> FloatArray:
@@ -95,3 +96,17 @@ class Box:
         """The volume [model units cubed]."""
         width, height, length = self.extents.tolist()
         return float(width * height * length)
+
+
+def oriented_box(
+    bounds: FloatArray, rotation: FloatArray, translation: FloatArray, scale: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Centre, axes and side lengths of a placed model's box: the arrays of a `Box`.
+
+    Also of stacked models: ``bounds`` (..., 2, 3), ``rotation`` (..., 3, 3), ``translation`` and
+    ``scale`` (..., 3).
+    """
+    low, high = bounds[..., 0, :], bounds[..., 1, :]
+    linear = rotation * scale[..., None, :]
+    middle = ((low + high) / 2)[..., None, :] @ linear.swapaxes(-1, -2)
+    return middle[..., 0, :] + translation, rotation, (high - low) * scale

@@ -14,7 +14,14 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.pose_errors import (
+    box_ious,
+    have_volume,
+    rotation_errors,
+    scale_errors,
+    translation_errors,
+    translation_errors_up_to_scale,
+)
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
@@ -60,14 +67,14 @@ def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None =
     """
     if symmetry is not None:
         gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return angle_between(est.rotation, gt.rotation)
+    return float(rotation_errors(est=est, gt=gt))
 
 
 def translation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
     """Distance between the two translations [model units]."""
     if symmetry is not None:
         gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return float(np.linalg.norm(est.translation - gt.translation))
+    return float(translation_errors(est=est, gt=gt))
 
 
 def translation_error_up_to_scale(
@@ -88,9 +95,7 @@ def translation_error_up_to_scale(
     """
     if symmetry is not None:
         gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    square = float(est.translation @ est.translation)
-    factor = max(float(est.translation @ gt.translation) / square, 0.0) if square > 0 else 0.0
-    return float(np.linalg.norm(factor * est.translation - gt.translation))
+    return float(translation_errors_up_to_scale(est=est, gt=gt))
 
 
 def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> FloatArray:
@@ -104,7 +109,7 @@ def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = No
     """
     if symmetry is not None:
         gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return np.asarray(np.abs(est.scale - gt.scale) / gt.scale)
+    return scale_errors(est=est, gt=gt)
 
 
 def reprojection_error(
@@ -152,11 +157,7 @@ def box_iou(*, est: Box, gt: Box) -> float:
     0.333333333333
     """
     _check_volumes(est, gt)
-    # In a unit of about the boxes' own size no square under- or overflows.
-    unit = max(est.extents.tolist() + gt.extents.tolist())
-    intersection = _intersection_volume(est, gt, unit)
-    volumes = (est.volume + gt.volume) / unit**3
-    return float(min(max(intersection / (volumes - intersection), 0.0), 1.0))
+    return float(box_ious(est=est, gt=gt))
 
 
 def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
@@ -222,8 +223,7 @@ def alignment_box_iou(
 
 def _check_volumes(est: Box, gt: Box) -> None:
     for name, box in (("est", est), ("gt", gt)):
-        extents = box.extents.tolist()
-        if not min(extents) > 1e-9 * max(extents):
+        if not have_volume(box):
             raise InputError(
                 f"the box {box.extents.tolist()} has no volume",
                 where=name,
@@ -261,12 +261,3 @@ def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
             return None
         ends.append(equal * float(found.x[0]))
     return (ends[0], ends[1]) if ends[0] < ends[1] else None
-
-
-def _intersection_volume(first: Box, second: Box, unit: float) -> float:
-    """Volume of the intersection, in units of ``unit`` cubed."""
-    from cadalign.geometry.clipping import intersection_volume  # `import cadalign` compiles nothing
-
-    axes = np.ascontiguousarray(first.rotation.T @ second.rotation)
-    center = first.rotation.T @ (second.center - first.center) / unit
-    return intersection_volume(first.extents / unit, second.extents / unit, axes, center)

@@ -8,6 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.geometry.vectors import lengths
 
 
 def rotation_from_vector(vector: FloatArray) -> FloatArray:
@@ -89,9 +90,22 @@ def angle_between(first: FloatArray, second: FloatArray) -> float:
     >>> round(angle_between(np.eye(3), rotation_from_vector(np.array([0.0, 0.0, np.pi]))), 9)
     180.0
     """
-    chord = np.linalg.norm(first - second) / np.sqrt(8.0)
-    cosine = np.sqrt(max(0.0, (np.sum(first * second) + 1.0) / 4.0))
-    return float(np.degrees(2.0 * np.arctan2(chord, cosine)))
+    return float(angles_between(first, second))
+
+
+def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Angles (...) between matrices (..., 3, 3) [degrees], as `angle_between`.
+
+    Examples
+    --------
+    >>> turns = rotations_from_vectors(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]))
+    >>> angles_between(np.eye(3), turns).round(9).tolist()
+    [0.0, 180.0]
+    """
+    difference = first - second
+    chord = lengths(difference.reshape(*difference.shape[:-2], 9)) / np.sqrt(8.0)
+    cosine = np.sqrt(np.maximum(((first * second).sum(axis=(-2, -1)) + 1.0) / 4.0, 0.0))
+    return np.asarray(np.degrees(2.0 * np.arctan2(chord, cosine)))
 
 
 def nearest_rotation(matrix: FloatArray, *, tolerance: float = 1e-2) -> FloatArray:

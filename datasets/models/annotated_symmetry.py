@@ -98,13 +98,16 @@ def _axis_of_revolution(
 
 def _equivalent(count: int, symmetries: Symmetries) -> BoolArray:
     """Mask (k, k) of the keypoints that a rotation may take to one another."""
-    orbits = np.arange(count)
+    orbits = list(range(count))
     for first, second in symmetries.reflections:
-        orbits[orbits == orbits[second]] = orbits[first]
+        joined, left = orbits[first], orbits[second]
+        orbits = [joined if orbit == left else orbit for orbit in orbits]
+    labels = np.array(orbits)
     # A pair that mirrors each other joins with no third keypoint: that is one reflection only.
-    equivalent = (orbits[:, None] == orbits) & (np.bincount(orbits, minlength=count)[orbits] > 2)
+    equivalent = (labels[:, None] == labels) & (np.bincount(labels, minlength=count)[labels] > 2)
     for rotation in symmetries.rotations:
-        equivalent[np.ix_(rotation.keypoints, rotation.keypoints)] = True
+        rows = np.array(rotation.keypoints, dtype=np.int64)
+        equivalent[rows[:, None], rows] = True
     return np.asarray(equivalent | np.eye(count, dtype=bool))
 
 

@@ -7,12 +7,19 @@ import pytest
 
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, check_methods, fit_options, method_names
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, make_hull_instance
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    Instance,
+    make_hull_instances,
+)
+from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.metrics import rotation_error
 
@@ -43,9 +50,8 @@ def test_views_fill_the_image_and_stay_inside(seed: int) -> None:
     hull = KeypointHull(cloud(seed))
     rng = np.random.default_rng(seed)
     pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=6)
-    low, high = hull.bounds
-    corners = (low + high) / 2 + hull.corners
-    offset = np.abs(KEYPOINT_CAMERA.project(pose.apply(corners)) - [319.5, 239.5])
+    corners = Box.from_model(hull.bounds, pose).corners
+    offset = np.abs(KEYPOINT_CAMERA.project(corners) - [319.5, 239.5])
     share = (2 * offset / [640, 480]).max()
     assert 0.7 - 1e-9 <= share <= 0.95 + 1e-9
     assert visible.sum() >= 6
@@ -59,8 +65,8 @@ def test_a_view_off_the_principal_point_fills_as_much() -> None:
     camera = Camera(640, 480, 900.0, 800.0, 250.0, 300.0)
     hull = KeypointHull(cloud(3))
     pose, _ = sample_hull_view(hull, camera, rng=np.random.default_rng(1), min_visible=6)
-    corners = hull.bounds.mean(axis=0) + hull.corners
-    offset = np.abs(camera.project(pose.apply(corners)) - [319.5, 239.5])
+    corners = Box.from_model(hull.bounds, pose).corners
+    offset = np.abs(camera.project(corners) - [319.5, 239.5])
     assert 0.7 - 1e-9 <= (2 * offset / [640, 480]).max() <= 0.95 + 1e-9
 
 
@@ -72,16 +78,46 @@ def test_too_few_keypoints_are_an_error_that_says_how_many() -> None:
         sample_hull_view(KeypointHull(CUBE), KEYPOINT_CAMERA, rng=rng, min_visible=8)
 
 
-def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
-    instance = make_hull_instance(
-        KeypointHull(cloud()),
-        np.arange(14),
-        names=("chair", "a"),
-        noise_px=0.0,
-        min_visible=6,
-        seed=0,
-        view_index=0,
+def test_views_drawn_together_are_those_drawn_alone() -> None:
+    hulls = [KeypointHull(cloud(seed, count)) for seed, count in enumerate((14, 5, 9, 30))]
+    hulls.append(KeypointHull(CUBE))
+
+    def streams() -> list[np.random.Generator]:
+        return [np.random.default_rng(seed) for seed in range(len(hulls))]
+
+    together = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=streams(), min_visible=8)
+    for hull, rng, found in zip(hulls, streams(), together, strict=True):
+        (alone,) = sample_hull_views([hull], KEYPOINT_CAMERA, rngs=[rng], min_visible=8)
+        if isinstance(found, TooFewVisibleError):
+            assert str(found) == str(alone)
+            continue
+        assert not isinstance(alone, TooFewVisibleError)
+        assert found.cam_from_model == alone.cam_from_model
+        assert np.array_equal(found.visible, alone.visible)
+    kinds = [isinstance(found, TooFewVisibleError) for found in together]
+    assert kinds == [False, True, False, False, True]
+
+
+def task(model_id: str = "a", view: int = 0) -> KeypointTask:
+    return KeypointTask(
+        category="chair",
+        model_id=model_id,
+        view=view,
+        hull=KeypointHull(cloud()),
+        semantic_ids=np.arange(14),
+        symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+        model=None,
     )
+
+
+def instance_of(view: KeypointTask, *, noise_px: float, seed: int = 0) -> Instance:
+    (instance,) = make_hull_instances([view], noise_px=noise_px, min_visible=6, seed=seed)
+    assert isinstance(instance, Instance)
+    return instance
+
+
+def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
+    instance = instance_of(task(), noise_px=0.0)
     projected = instance.camera.project(instance.gt.apply(instance.points_3d))
     assert np.allclose(projected, instance.points_2d)
     result = fit(instance.points_3d, instance.points_2d, instance.camera)
@@ -92,22 +128,15 @@ def test_without_noise_the_truth_reprojects_exactly_and_is_found() -> None:
 
 
 def test_instances_follow_from_seed_and_names_alone() -> None:
-    def points(seed: int, model: str, view: int) -> FloatArray:
-        instance = make_hull_instance(
-            KeypointHull(cloud()),
-            np.arange(14),
-            names=("chair", model),
-            noise_px=1.0,
-            min_visible=6,
-            seed=seed,
-            view_index=view,
-        )
-        return instance.points_2d
-
-    first = points(0, "a", 0)
-    assert np.array_equal(first, points(0, "a", 0))
-    for other in (points(1, "a", 0), points(0, "b", 0), points(0, "a", 1)):
+    first = instance_of(task(), noise_px=1.0).points_2d
+    assert np.array_equal(first, instance_of(task(), noise_px=1.0).points_2d)
+    others = (task(), 1), (task("b"), 0), (task(view=1), 0)
+    for other in (instance_of(view, noise_px=1.0, seed=seed).points_2d for view, seed in others):
         assert first.shape != other.shape or not np.array_equal(first, other)
+    views = [task("b"), task(), task(view=1)]
+    together = make_hull_instances(views, noise_px=1.0, min_visible=6, seed=0)
+    assert isinstance(together[1], Instance)
+    assert np.array_equal(first, together[1].points_2d)
 
 
 @pytest.mark.long

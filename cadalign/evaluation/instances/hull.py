@@ -9,23 +9,24 @@ things such as chairs than rays cast at a mesh.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import TooFewVisibleError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
-# The ranges of `cadalign.render.sample_view`.
-_ELEVATION_DEG = (0.0, 60.0)
-_FILL = (0.7, 0.95)
+# The ranges of `cadalign.render.sample_view`: azimuth, the elevation's sine, share of the image.
+_LOWEST = np.array([-np.pi, 0.0, 0.7])
+_HIGHEST = np.array([np.pi, np.sin(np.radians(60.0)), 0.95])
 _ATTEMPTS = 100
 _SLACK = 0.01
-_SIGNS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +40,7 @@ class KeypointHull:
         """The keypoints' lowest and highest coordinates, (2, 3) float."""
         return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
 
-    @cached_property
-    def corners(self) -> FloatArray:
-        """The corners of the keypoints' box, from its middle, (8, 3) float."""
-        low, high = self.bounds
-        return np.asarray((high - low) * (_SIGNS - 0.5))
-
-    def visible_from(self, position: FloatArray) -> npt.NDArray[np.bool_]:
+    def visible_from(self, position: FloatArray) -> BoolArray:
         """Mask (k,) of the keypoints that count as visible from a place (3,) of the model."""
         if self._faces is None:
             return np.ones(len(self.xyz), dtype=bool)
@@ -54,7 +49,7 @@ class KeypointHull:
         return np.asarray((beside & facing).any(axis=1))
 
     @cached_property
-    def _faces(self) -> tuple[FloatArray, npt.NDArray[np.bool_]] | None:
+    def _faces(self) -> tuple[FloatArray, BoolArray] | None:
         """Planes (f, 4) of the faces, outward, and a mask (k, f) of those next to each keypoint."""
         from scipy.spatial import ConvexHull, QhullError
 
@@ -65,63 +60,116 @@ class KeypointHull:
         except QhullError:  # all in one plane
             return None
         depth = -(self.xyz @ planes[:, :3].T + planes[:, 3])
-        slack = _SLACK * float(np.linalg.norm(np.ptp(self.xyz, axis=0)))
+        low, high = self.bounds
+        slack = _SLACK * float(np.linalg.norm(high - low))
         return planes, depth <= depth.min(axis=1, keepdims=True) + slack
+
+
+class HullView(NamedTuple):
+    """A view: the pose, and a mask (k,) of the keypoints that count as visible."""
+
+    cam_from_model: Alignment
+    visible: BoolArray
 
 
 def sample_hull_view(
     hull: KeypointHull, camera: Camera, *, rng: np.random.Generator, min_visible: int
-) -> tuple[Alignment, npt.NDArray[np.bool_]]:
+) -> HullView:
     """Draw a view, as `cadalign.render.sample_view` does, in which enough keypoints count as seen.
 
-    Returns the pose and a mask (k,) of the visible keypoints; raises TooFewVisibleError if no view
-    shows enough of them. The camera has no lens distortion.
+    The camera has no lens distortion.
+
+    Raises
+    ------
+    TooFewVisibleError
+        If no view shows enough of the keypoints.
     """
-    count = len(hull.xyz)
-    best = 0
-    if count >= min_visible:
-        low, high = np.sin(np.radians(_ELEVATION_DEG))
-        middle = hull.bounds.mean(axis=0)
-        for _ in range(_ATTEMPTS):
-            azimuth = rng.uniform(-np.pi, np.pi)
-            rotation = _upright_rotation(azimuth, float(np.arcsin(rng.uniform(low, high))))
-            center = _framed_center(hull.corners @ rotation.T, camera, fill=rng.uniform(*_FILL))
-            translation = center - rotation @ middle
-            visible = hull.visible_from(-rotation.T @ translation)
-            if visible.sum() >= min_visible:
-                return Alignment(rotation, translation, np.ones(3), is_valid=True), visible
-            best = max(best, int(visible.sum()))
+    (found,) = sample_hull_views([hull], camera, rngs=[rng], min_visible=min_visible)
+    if isinstance(found, TooFewVisibleError):
+        raise found
+    return found
+
+
+def sample_hull_views(
+    hulls: Sequence[KeypointHull],
+    camera: Camera,
+    *,
+    rngs: Sequence[np.random.Generator],
+    min_visible: int,
+) -> list[HullView | TooFewVisibleError]:
+    """Draw a view of each hull as `sample_hull_view` does, from its own random stream."""
+    counts = [len(hull.xyz) for hull in hulls]
+    found: dict[int, HullView] = {}
+    best = [0] * len(hulls)
+    left = [k for k, count in enumerate(counts) if count >= min_visible]
+    for _ in range(_ATTEMPTS if left else 0):
+        draws = np.array([rngs[k].random(3) for k in left])
+        bounds = np.array([hulls[k].bounds for k in left])
+        poses = _framed_poses(_LOWEST + (_HIGHEST - _LOWEST) * draws, bounds, camera)
+        for k, rotation, translation, position in zip(left, *poses, strict=True):
+            visible = hulls[k].visible_from(position)
+            best[k] = max(best[k], int(np.count_nonzero(visible)))
+            if best[k] >= min_visible:
+                pose = Alignment(rotation, translation, np.ones(3), is_valid=True)
+                found[k] = HullView(pose, visible)
+        left = [k for k in left if k not in found]
+        if not left:
+            break
+    return [
+        found[k] if k in found else _too_few(count, best[k], min_visible)
+        for k, count in enumerate(counts)
+    ]
+
+
+def _too_few(count: int, best: int, min_visible: int) -> TooFewVisibleError:
     found = f"the best of {_ATTEMPTS} views shows {best}" if best else f"there are only {count}"
-    raise TooFewVisibleError(
+    return TooFewVisibleError(
         f"{min_visible} keypoints should be visible, but {found}",
         where="keypoints",
         fix="lower min_visible, or leave this model out",
     )
 
 
-def _upright_rotation(azimuth: float, elevation: float) -> FloatArray:
-    """Model to camera, the model's y axis up in the image; angles [rad] as in `look_at`."""
-    sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
-    sin_e, cos_e = np.sin(elevation), np.cos(elevation)
-    return np.array(
-        [
-            [cos_a, 0.0, -sin_a],
-            [sin_e * sin_a, -cos_e, sin_e * cos_a],
-            [-cos_e * sin_a, -sin_e, -cos_e * cos_a],
-        ]
-    )
+def _framed_poses(
+    drawn: FloatArray, bounds: FloatArray, camera: Camera
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations (n, 3, 3), translations (n, 3) and camera positions (n, 3) of framed views.
+
+    ``drawn`` (n, 3) are azimuth, sine of the elevation, and share of the image to fill; ``bounds``
+    (n, 2, 3) those of the models.
+    """
+    low, high = bounds[:, 0], bounds[:, 1]
+    rotations = _upright_rotations(drawn[:, 0], np.arcsin(drawn[:, 1]))
+    corners = (high - low)[:, None] * _CORNERS @ rotations.transpose(0, 2, 1)
+    centers = _framed_centers(corners, camera, fill=drawn[:, 2])
+    middles = ((low + high) / 2)[:, :, None]
+    translations = centers - (rotations @ middles)[:, :, 0]
+    positions = -(rotations.transpose(0, 2, 1) @ translations[:, :, None])[:, :, 0]
+    return rotations, translations, positions
 
 
-def _framed_center(corners: FloatArray, camera: Camera, *, fill: float) -> FloatArray:
-    """Place in the camera frame of a box's centre, for its corners to fill a share of the image.
+def _upright_rotations(azimuths: FloatArray, elevations: FloatArray) -> FloatArray:
+    """Model to camera (n, 3, 3), the model's y axis up in the image; angles [rad] of `look_at`."""
+    sin_a, cos_a = np.sin(azimuths), np.cos(azimuths)
+    sin_e, cos_e = np.sin(elevations), np.cos(elevations)
+    rows = [
+        *(cos_a, np.zeros_like(sin_a), -sin_a),
+        *(sin_e * sin_a, -cos_e, sin_e * cos_a),
+        *(-cos_e * sin_a, -sin_e, -cos_e * cos_a),
+    ]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
-    ``corners`` (8, 3) are relative to the centre. The corner X of a box at depth d on the ray a
+
+def _framed_centers(corners: FloatArray, camera: Camera, *, fill: FloatArray) -> FloatArray:
+    """Places (n, 3) in the camera frame of boxes' centres, to fill shares (n,) of the image.
+
+    ``corners`` (n, 8, 3) are relative to the centres. The corner X of a box at depth d on the ray a
     through the image's centre lies f |X - a X_z| / (X_z + d) off it; solved for d, for each corner
     and direction, the largest d keeps all of them inside.
     """
     size = np.array([camera.width, camera.height])
     focal = np.array([camera.fx, camera.fy])
     ray = ((size - 1) / 2 - (camera.cx, camera.cy)) / focal
-    across = np.abs(corners[:, :2] - ray * corners[:, 2:])
-    depth = float((2 * focal * across / (size * fill) - corners[:, 2:]).max())
-    return depth * np.append(ray, 1.0)
+    across = np.abs(corners[..., :2] - ray * corners[..., 2:])
+    depths = 2 * focal * across / (size * fill[:, None, None]) - corners[..., 2:]
+    return np.asarray(depths.max(axis=(1, 2))[:, None] * np.append(ray, 1.0))

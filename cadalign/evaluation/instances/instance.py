@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.errors import TooFewVisibleError
+from cadalign.evaluation.instances.hull import HullView, KeypointHull, sample_hull_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -105,77 +106,106 @@ def make_instance(
     rng = instance_rng(seed, model.category, model.model_id, str(view_index))
     xyz = model.keypoints.xyz
     view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
-    return _stretched(
-        xyz,
-        model.keypoints.semantic_ids,
-        view.visible,
-        cam_from_model=view.cam_from_model,
-        bounds=scene.bounds,
-        noise_px=noise_px,
-        rng=rng,
-        visibility=RAYS,
-        scene=scene,
-    )
+    ids = model.keypoints.semantic_ids
+    seen = _Seen(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
+    (instance,) = _stretched([seen], noise_px=noise_px, scene=scene)
+    return instance
 
 
-def make_hull_instance(
-    hull: KeypointHull,
-    semantic_ids: IntArray,
-    *,
-    names: tuple[str, str],
-    noise_px: float,
-    min_visible: int,
-    seed: int,
-    view_index: int,
-) -> Instance:
-    """Draw a view, a stretch and keypoint noise, as `make_instance`, for a model without a mesh.
+class AnnotatedView(Protocol):
+    """A view of a model of which only the keypoints are known."""
 
-    Which keypoints are seen, and the model's box, follow from the keypoints alone; see
-    `cadalign.evaluation.instances.hull`. ``names`` are category and model id.
+    @property
+    def category(self) -> str:
+        """Name of the category."""
+
+    @property
+    def model_id(self) -> str:
+        """The model's id."""
+
+    @property
+    def view(self) -> int:
+        """Index of the view."""
+
+    @property
+    def hull(self) -> KeypointHull:
+        """The keypoints."""
+
+    @property
+    def semantic_ids(self) -> IntArray:
+        """Their semantic ids."""
+
+
+def make_hull_instances(
+    views: Sequence[AnnotatedView], *, noise_px: float, min_visible: int, seed: int
+) -> list[Instance | TooFewVisibleError]:
+    """Draw views, stretches and keypoint noise, as `make_instance`, for models without a mesh.
+
+    Which keypoints are seen, and a model's box, follow from the keypoints alone; see
+    `cadalign.evaluation.instances.hull`. An error takes the place of an instance that no view shows
+    enough keypoints of.
     """
-    rng = instance_rng(seed, *names, str(view_index))
-    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
-    return _stretched(
-        hull.xyz,
-        semantic_ids,
-        visible,
-        cam_from_model=pose,
-        bounds=hull.bounds,
-        noise_px=noise_px,
-        rng=rng,
-        visibility=HULL,
-        scene=None,
-    )
+    rngs = [instance_rng(seed, each.category, each.model_id, str(each.view)) for each in views]
+    hulls = [each.hull for each in views]
+    sampled = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=rngs, min_visible=min_visible)
+    seen = [
+        _Seen(
+            found.cam_from_model,
+            each.hull.xyz[found.visible],
+            each.semantic_ids[found.visible],
+            each.hull.bounds,
+            rng,
+        )
+        for each, rng, found in zip(views, rngs, sampled, strict=True)
+        if isinstance(found, HullView)
+    ]
+    instances = iter(_stretched(seen, noise_px=noise_px, scene=None))
+    return [next(instances) if isinstance(each, HullView) else each for each in sampled]
 
 
-def _stretched(
-    xyz: FloatArray,
-    semantic_ids: IntArray,
-    visible: npt.NDArray[np.bool_],
-    *,
-    cam_from_model: Alignment,
-    bounds: FloatArray,
-    noise_px: float,
-    rng: np.random.Generator,
-    visibility: str,
-    scene: Scene | None,
-) -> Instance:
-    """The instance of a view, with a stretch and noise drawn for it."""
-    stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
-    seen = xyz[visible]
-    in_camera = seen @ cam_from_model.linear.T + cam_from_model.translation
-    projected = KEYPOINT_CAMERA.pixels_from_normalized(perspective(in_camera))
-    return Instance(
-        camera=KEYPOINT_CAMERA,
-        cam_from_model=cam_from_model,
-        points_3d=seen * stretch,
-        points_2d=projected + noise_px * rng.standard_normal(projected.shape),
-        semantic_ids=semantic_ids[visible],
-        bounds=bounds * stretch,
-        gt=Alignment(
-            cam_from_model.rotation, cam_from_model.translation, 1 / stretch, is_valid=True
-        ),
-        visibility=visibility,
-        scene=scene,
-        diagonal=1.0 if scene is None else float(np.linalg.norm(np.ptp(bounds, axis=0))),
+class _Seen(NamedTuple):
+    """The visible keypoints (n, 3) of a model in a view, and the model's bounds (2, 3)."""
+
+    cam_from_model: Alignment
+    xyz: FloatArray
+    semantic_ids: IntArray
+    bounds: FloatArray
+    rng: np.random.Generator
+
+
+def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) -> list[Instance]:
+    """The instances of views, with a stretch and noise drawn for each."""
+    if not views:
+        return []
+    low, high = STRETCH_RANGE
+    stretches = np.ones((len(views), 3))
+    stretches[:, 1:] = low + (high - low) * np.array([view.rng.random(2) for view in views])
+    bounds = np.array([view.bounds for view in views])
+    in_camera = [
+        view.xyz @ view.cam_from_model.linear.T + view.cam_from_model.translation for view in views
+    ]
+    exact = KEYPOINT_CAMERA.pixels_from_normalized(perspective(np.concatenate(in_camera)))
+    noise = np.concatenate([view.rng.standard_normal((len(view.xyz), 2)) for view in views])
+    points_2d = np.split(
+        exact + noise_px * noise, np.cumsum([len(view.xyz) for view in views[:-1]])
     )
+    diagonal = 1.0 if scene is None else float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+    return [
+        Instance(
+            camera=KEYPOINT_CAMERA,
+            cam_from_model=view.cam_from_model,
+            points_3d=view.xyz * stretch,
+            points_2d=observed,
+            semantic_ids=view.semantic_ids,
+            bounds=stretched_bounds,
+            gt=Alignment(
+                view.cam_from_model.rotation, view.cam_from_model.translation, scale, is_valid=True
+            ),
+            visibility=HULL if scene is None else RAYS,
+            scene=scene,
+            diagonal=diagonal,
+        )
+        for view, stretch, scale, stretched_bounds, observed in zip(
+            views, stretches, 1 / stretches, bounds * stretches[:, None], points_2d, strict=True
+        )
+    ]

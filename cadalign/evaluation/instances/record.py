@@ -34,6 +34,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
@@ -45,7 +46,6 @@ from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import dense_json
 
 RECORD_COLUMNS: Columns = (
     ("category", str),
@@ -58,6 +58,8 @@ _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
 _WARP_DIGITS = 6
 _LONGEST_NAME = 200  # bytes
+# Several times as fast as the standard library's; numbers that are not finite become null.
+_ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
 
@@ -116,7 +118,7 @@ def record_of(
         ],
     }
     row = {name: outcomes[0].names[name] for name in ("category", "model_id", "view")}
-    return {**row, "exhibit": dense_json(record)}
+    return {**row, "exhibit": _ENCODER.encode(record).decode()}
 
 
 def record_stem(category: str, model_id: str, view: int = 0) -> str:

@@ -40,6 +40,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,11 +48,12 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, SHAPE, fit_options, has_statistics
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
+from cadalign.evaluation.instances.errors import POSE_ERRORS, estimate_errors
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
     load_scene,
-    make_hull_instance,
+    make_hull_instances,
     make_instance,
 )
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
@@ -60,36 +62,32 @@ from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
-from cadalign.evaluation.outcome import (
-    Outcome,
-    alignment_errors,
-    overlap,
-    overlap_up_to_scale,
-    reason_of,
-)
+from cadalign.evaluation.outcome import FAILED, Outcome, overlap_up_to_scale, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.fitting.fit import fit, fit_batch
+from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-from cadalign.geometry.metrics import translation_error_up_to_scale
-from cadalign.geometry.projection import perspective
+
+if TYPE_CHECKING:
+    from cadalign.datasets import AnnotatedModel
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
-_POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
 COLUMNS: Columns = (
     *_NAMES,
     *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
     *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
     *(("box_iou", float), ("rms_px", float), ("symmetry", str)),
-    *((f"sym_{name}", float) for name in _POSE_ERRORS),
+    *((f"sym_{name}", float) for name in POSE_ERRORS),
     ("translation_error_up_to_scale", float),
 )
 """Columns of every run."""
 REQUIRED_COLUMNS: Columns = COLUMNS[:-1]
 """Those that all runs have; earlier ones lack the last."""
+_Usable = tuple[KeypointTask, Instance]
 
 
 @dataclass(frozen=True)
@@ -134,75 +132,92 @@ class KeypointNetExperiment:
 
     def evaluate(self, tasks: Sequence[KeypointTask]) -> Rows:
         """A row for every task and method, and a record for every instance."""
-        instances: list[Instance | Exception] = []
-        extra = []
-        for task in tasks:
-            start = time.perf_counter()
-            try:
-                instances.append(self._instance(task))
-            except Exception as error:
-                instances.append(error)
-            extra.append(time.perf_counter() - start)
+        start = time.perf_counter()
+        instances = self._instances(tasks)
+        # The first method's rows bear the time of making the instances.
+        share = (time.perf_counter() - start) / len(tasks)
         answers_of: list[list[tuple[Outcome, Estimate]]] = [[] for _ in tasks]
         for method in (*self.options.methods, SHAPE):
             places = [
                 k for k, task in enumerate(tasks) if method in self.methods_for(task.category)
             ]
+            if not places:
+                continue
+            extra = share if method == self.options.methods[0] else 0.0
             chosen = [tasks[k] for k in places], [instances[k] for k in places]
-            for k, answer in zip(places, self._evaluate_method(method, *chosen), strict=True):
+            answers = self._evaluate_method(method, *chosen, extra=extra)
+            for k, answer in zip(places, answers, strict=True):
                 answers_of[k].append(answer)
         outcomes, records = [], []
-        for k, (instance, answers) in enumerate(zip(instances, answers_of, strict=True)):
+        for instance, answers in zip(instances, answers_of, strict=True):
             found = [outcome for outcome, _ in answers]
-            # The first method's row bears the time of making the instance.
-            outcomes += [found[0].after(extra[k]), *found[1:]]
+            outcomes += found
             if isinstance(instance, Instance):
                 records.append(record_row(instance, found, [estimate for _, estimate in answers]))
         return Rows.of(outcomes, records)
 
     def failure(self, task: KeypointTask, reason: str) -> Rows:
         """A failed row for every method."""
+        known = _known(task)
         methods = self.methods_for(task.category)
-        return Rows.of(_failure(task, method, reason) for method in methods)
+        return Rows.of(Outcome.failure(reason, task.names(each), **known) for each in methods)
 
-    def _instance(self, task: KeypointTask) -> Instance:
-        if task.problem:
-            raise DataError(task.problem)
+    def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
+        """The instance of every task, or why there is none."""
         names = ("noise_px", "min_visible", "seed")
-        how = {name: getattr(self.options, name) for name in names} | {"view_index": task.view}
-        if task.model is not None:
-            return make_instance(task.model, scene=_scene_of(task.model), **how)
-        model = (task.category, task.model_id)
-        return make_hull_instance(task.hull, task.semantic_ids, names=model, **how)
+        how = {name: getattr(self.options, name) for name in names}
+        plain = [task for task in tasks if not task.problem and task.model is None]
+        of_hulls = iter(make_hull_instances(plain, **how))
+        instances: list[Instance | Exception] = []
+        for task in tasks:
+            if task.problem:
+                instances.append(DataError(task.problem))
+            elif task.model is None:
+                instances.append(next(of_hulls))
+            else:
+                instances.append(_with_mesh(task, task.model, **how))
+        return instances
 
     def _evaluate_method(
-        self, method: str, tasks: Sequence[KeypointTask], instances: Sequence[Instance | Exception]
+        self,
+        method: str,
+        tasks: Sequence[KeypointTask],
+        instances: Sequence[Instance | Exception],
+        *,
+        extra: float,
     ) -> list[tuple[Outcome, Estimate]]:
-        """One method's outcome, and the estimate it is of, for every task."""
-        pairs = zip(tasks, instances, strict=True)
-        usable = [(task, each) for task, each in pairs if isinstance(each, Instance)]
+        """One method's outcome, and the estimate it is of, for every task.
+
+        ``extra`` is the time [s] that each has taken before.
+        """
         start = time.perf_counter()
+        usable = [
+            (task, instance)
+            for task, instance in zip(tasks, instances, strict=True)
+            if isinstance(instance, Instance)
+        ]
         if method == SHAPE:
-            estimates = iter([self._aligned(task, instance) for task, instance in usable])
+            estimates = [self._aligned(*pair) for pair in usable]
         else:
-            estimates = iter(self._estimates(method, [instance for _, instance in usable]))
-        share = (time.perf_counter() - start) / max(len(usable), 1)
-        answers: list[tuple[Outcome, Estimate]] = []
+            estimates = self._estimates(method, [instance for _, instance in usable])
+        drawn = self.drawn_in is not None and method == self.options.methods[0]
+        answers = iter(zip(self._results(usable, estimates, drawn=drawn), estimates, strict=True))
+        seconds = (time.perf_counter() - start) / max(len(usable), 1) + extra
+        outcomes: list[tuple[Outcome, Estimate]] = []
         for task, instance in zip(tasks, instances, strict=True):
+            names = task.names(method)
             if isinstance(instance, Exception):
-                outcome = Outcome.without_instance(instance, task.names(method), **_known(task))
-                answers.append((outcome, DataError(outcome.reason)))
+                outcome = Outcome.without_instance(instance, names, **_known(task))
+                outcomes.append((outcome, DataError(outcome.reason)))
                 continue
-            start = time.perf_counter()
-            estimate = next(estimates)
-            try:
-                outcome = self._outcome(task, instance, method, estimate)
-            except AbortError:
-                raise
-            except Exception as error:
-                outcome = _failure(task, method, reason_of(error), instance)
-            answers.append((outcome.after(share + time.perf_counter() - start), estimate))
-        return answers
+            result, estimate = next(answers)
+            facts = _facts(task, instance)
+            if isinstance(result, Exception):
+                outcome = Outcome(names, facts, FAILED, reason_of(result), seconds)
+            else:
+                outcome = Outcome(names, facts | result, seconds=seconds)
+            outcomes.append((outcome, estimate))
+        return outcomes
 
     def _estimates(self, method: str, instances: Sequence[Instance]) -> list[Estimate]:
         """A method's estimate of every instance."""
@@ -240,65 +255,72 @@ class KeypointNetExperiment:
         except CadalignError as error:
             return error
 
-    def _outcome(
-        self, task: KeypointTask, instance: Instance, method: str, estimate: Estimate
-    ) -> Outcome:
-        if isinstance(estimate, CadalignError):
-            return _failure(task, method, str(estimate), instance)
-        alignment = pose_of(estimate)
-        is_first = method == self.options.methods[0]
-        if self.drawn_in is not None and instance.scene is not None and is_first:
-            _draw(self.drawn_in, task, instance, alignment)
-        metrics = _errors(alignment, instance, instance.gt, instance.gt_box)
-        truth = task.symmetry.nearest_truth(est=alignment, gt=instance.gt)
-        aware = metrics
-        if truth is not instance.gt:
-            aware = _errors(alignment, instance, truth, Box.from_model(instance.bounds, truth))
-        return Outcome(
-            task.names(method),
-            {
-                **_facts(task, instance),
-                **metrics,
-                "rms_px": estimate.rms
-                if isinstance(estimate, AlignedShape)
-                else _rms(instance, alignment),
-                "translation_error_up_to_scale": translation_error_up_to_scale(
-                    est=alignment, gt=instance.gt
-                )
-                / instance.diagonal,
-                **{f"sym_{name}": aware[name] for name in _POSE_ERRORS},
-                **self._overlap_up_to_scale(instance, alignment),
-            },
+    def _results(
+        self, usable: Sequence[_Usable], estimates: Sequence[Estimate], *, drawn: bool
+    ) -> list[Row | Exception]:
+        """Metrics by column of each estimate, or why there are none; pictures, if ``drawn``."""
+        results: dict[int, Row | Exception] = {}
+        found: dict[int, FitResult | AlignedShape | Alignment] = {}
+        for k, ((task, instance), estimate) in enumerate(zip(usable, estimates, strict=True)):
+            if isinstance(estimate, CadalignError):
+                results[k] = estimate
+            elif drawn and (problem := self._draw(task, instance, pose_of(estimate))):
+                results[k] = problem
+            else:
+                found[k] = estimate
+        rows = estimate_errors(
+            [pose_of(estimate) for estimate in found.values()],
+            [usable[k][1] for k in found],
+            [usable[k][0].symmetry for k in found],
         )
+        for (k, estimate), row in zip(found.items(), rows, strict=True):
+            results[k] = row
+            if isinstance(row, Exception):
+                continue
+            if isinstance(estimate, AlignedShape):
+                row["rms_px"] = estimate.rms
+            if self.shapes.paths:  # it takes longer than most methods
+                row[BOX_IOU_UP_TO_SCALE.key] = _overlap_up_to_scale(usable[k][1], estimate)
+        return [results[k] for k in range(len(usable))]
 
-    def _overlap_up_to_scale(self, instance: Instance, est: Alignment) -> Row:
-        """The box IoU up to scale by column, which takes longer than most methods."""
-        if not self.shapes.paths:
-            return {}
-        box = Box.from_model(instance.bounds, est)
-        return {BOX_IOU_UP_TO_SCALE.key: overlap_up_to_scale(est=box, gt=instance.gt_box)}
+    def _draw(
+        self, task: KeypointTask, instance: Instance, estimate: Alignment
+    ) -> Exception | None:
+        """Draw an estimate; the reason if that fails."""
+        from cadalign.evaluation.instances.drawing import draw_instance
+
+        if self.drawn_in is None or instance.scene is None:
+            return None
+        names = {"category": task.category, "model_id": task.model_id}
+        try:
+            draw_instance(self.drawn_in, instance, estimate, view=task.view, **names)
+        except (OSError, DataError) as error:
+            raise AbortError(
+                f"the overlay cannot be written: {error}",
+                fix="free some space, and start the same command again: the run goes on",
+            ) from None
+        except Exception as error:
+            return error
+        return None
 
 
 # Views of one model come one after another.
 _scene_of = lru_cache(maxsize=1)(load_scene)
 
 
-def _errors(
-    est: Alignment, instance: Instance, gt: Alignment, gt_box: Box
-) -> dict[str, float | None]:
-    """Errors of an estimate by column, from one of the truths that look the same."""
-    box = Box.from_model(instance.bounds, est)
-    return {
-        **alignment_errors(est=est, gt=gt, length=instance.diagonal),
-        "box_iou": overlap(est=box, gt=gt_box),
-    }
+def _with_mesh(task: KeypointTask, model: AnnotatedModel, **how: Any) -> Instance | Exception:
+    """The instance of a model with a mesh, or why there is none."""
+    try:
+        return make_instance(model, scene=_scene_of(model), view_index=task.view, **how)
+    except Exception as error:
+        return error
 
 
-def _rms(instance: Instance, est: Alignment) -> float:
-    """Root mean square residual [px]; also of the bound's estimates behind the camera."""
-    points = (instance.points_3d @ est.linear.T) + est.translation
-    pixels = instance.camera.pixels_from_normalized(perspective(points))
-    return float(np.sqrt(((pixels - instance.points_2d) ** 2).sum(axis=1).mean()))
+def _overlap_up_to_scale(
+    instance: Instance, estimate: FitResult | AlignedShape | Alignment
+) -> float | None:
+    box = Box.from_model(instance.bounds, pose_of(estimate))
+    return overlap_up_to_scale(est=box, gt=instance.gt_box)
 
 
 def _facts(task: KeypointTask, instance: Instance) -> Row:
@@ -316,23 +338,3 @@ def _facts(task: KeypointTask, instance: Instance) -> Row:
 def _known(task: KeypointTask) -> Row:
     """The facts where there is no instance."""
     return {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-
-
-def _failure(
-    task: KeypointTask, method: str, reason: str, instance: Instance | None = None
-) -> Outcome:
-    known = _known(task) if instance is None else _facts(task, instance)
-    return Outcome.failure(reason, task.names(method), **known)
-
-
-def _draw(folder: RunFolder, task: KeypointTask, instance: Instance, estimate: Alignment) -> None:
-    from cadalign.evaluation.instances.drawing import draw_instance
-
-    names = {"category": task.category, "model_id": task.model_id}
-    try:
-        draw_instance(folder, instance, estimate, view=task.view, **names)
-    except (OSError, DataError) as error:
-        raise AbortError(
-            f"the overlay cannot be written: {error}",
-            fix="free some space, and start the same command again: the run goes on",
-        ) from None

@@ -57,21 +57,23 @@ class KeypointTask:
         cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
     ) -> KeypointTask:
         """The first view of a dataset's model; a malformed one gives a task with a problem."""
-        blank = cls(
-            category=category,
-            model_id=model_id,
-            view=0,
-            hull=KeypointHull(np.empty((0, 3))),
-            semantic_ids=np.empty(0, dtype=np.int64),
-            symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
-            model=None,
-        )
         try:
             model = dataset[category, model_id]
         except CadalignError as error:
-            return replace(blank, problem=str(error))
-        return replace(
-            blank,
+            return cls(
+                category=category,
+                model_id=model_id,
+                view=0,
+                hull=KeypointHull(np.empty((0, 3))),
+                semantic_ids=np.empty(0, dtype=np.int64),
+                symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+                model=None,
+                problem=str(error),
+            )
+        return cls(
+            category=category,
+            model_id=model_id,
+            view=0,
             hull=KeypointHull(model.keypoints.xyz),
             semantic_ids=model.keypoints.semantic_ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
@@ -117,7 +119,8 @@ class KeypointTasks(Sequence[KeypointTask]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         place, view = divmod(range(len(self))[index], self._views)
-        return replace(self._describe(place), view=view)
+        first = self._describe(place)
+        return first if view == 0 else replace(first, view=view)
 
     def fingerprint(self) -> str:
         """Hash of the annotations: a run must not go on with others."""

@@ -1,0 +1,107 @@
+"""Errors of many estimates at once, by column of the result table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+from cadalign.evaluation.instances.instance import Instance
+from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.pose_errors import (
+    Alignments,
+    Boxes,
+    box_ious,
+    have_volume,
+    rotation_errors,
+    scale_errors,
+    translation_errors,
+    translation_errors_up_to_scale,
+)
+from cadalign.geometry.projection import perspective
+
+POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
+"""Errors that the symmetries of a model bear on."""
+
+
+@np.errstate(all="ignore")
+def estimate_errors(
+    estimates: Sequence[Alignment],
+    instances: Sequence[Instance],
+    symmetries: Sequence[SymmetryGroup],
+) -> list[Row | InputError]:
+    """Errors of an estimate of each instance; the reason where one is not finite.
+
+    The instances are of one camera; ``symmetries`` are those of their models.
+    """
+    if not estimates:
+        return []
+    est, gt = Alignments.of(estimates), Alignments.of([each.gt for each in instances])
+    bounds = np.array([each.bounds for each in instances])
+    diagonals = np.array([each.diagonal for each in instances])
+    plain = _pose_errors(est, gt, bounds, diagonals)
+    up_to_scale = translation_errors_up_to_scale(est=est, gt=gt) / diagonals
+    scales = scale_errors(est=est, gt=gt)
+    columns = {
+        **plain,
+        "scale_y_error": scales[:, 1],
+        "scale_z_error": scales[:, 2],
+        "translation_error_up_to_scale": up_to_scale,
+        "rms_px": _rms_px(estimates, instances),
+        **{f"sym_{name}": values.copy() for name, values in plain.items()},
+    }
+    turned = [k for k, symmetry in enumerate(symmetries) if not symmetry.is_trivial]
+    if turned:
+        nearest = [
+            symmetries[k].nearest_truth(est=estimates[k], gt=instances[k].gt) for k in turned
+        ]
+        some = Alignments(*(array[turned] for array in est))
+        aware = _pose_errors(some, Alignments.of(nearest), bounds[turned], diagonals[turned])
+        for name, values in aware.items():
+            columns[f"sym_{name}"][turned] = values
+    cells = {name: values.tolist() for name, values in columns.items()}
+    for name in ("box_iou", "sym_box_iou"):
+        cells[name] = [None if np.isnan(value) else value for value in cells[name]]
+    rows: list[Row | InputError] = [
+        dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True)
+    ]
+    packed = np.concatenate([each.reshape(len(rows), -1) for each in est], axis=1)
+    for k in np.flatnonzero(~np.isfinite(packed).all(axis=1)).tolist():
+        rows[k] = InputError("the estimate has NaN or infinite values", where="estimate")
+    return rows
+
+
+def _pose_errors(
+    est: Alignments, gt: Alignments, bounds: FloatArray, diagonals: FloatArray
+) -> dict[str, FloatArray]:
+    """The columns `POSE_ERRORS`; the box IoU of a model without volume is NaN."""
+    boxes, gt_boxes = Boxes.from_models(bounds, est), Boxes.from_models(bounds, gt)
+    solid = have_volume(boxes) & have_volume(gt_boxes)
+    ious = np.full(len(bounds), np.nan)
+    ious[solid] = box_ious(
+        est=Boxes(*(array[solid] for array in boxes)),
+        gt=Boxes(*(array[solid] for array in gt_boxes)),
+    )
+    return {
+        "rotation_error_deg": rotation_errors(est=est, gt=gt),
+        "translation_error": translation_errors(est=est, gt=gt) / diagonals,
+        "box_iou": ious,
+    }
+
+
+def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> FloatArray:
+    """Root mean square residuals (n,) [px]; also of the bound's estimates behind the camera."""
+    pairs = zip(estimates, instances, strict=True)
+    placed = [each.points_3d @ est.linear.T + est.translation for est, each in pairs]
+    camera = instances[0].camera
+    projected = camera.pixels_from_normalized(perspective(np.concatenate(placed)))
+    observed = np.concatenate([each.points_2d for each in instances])
+    squares = ((projected - observed) ** 2).sum(axis=1)
+    ends = np.cumsum([len(each.points_2d) for each in instances]).tolist()
+    means = [squares[start:end].mean() for start, end in pairwise([0, *ends])]
+    return np.sqrt(means)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,11 +11,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote as url_quote
 
+import msgspec
+
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import dense_json, reading, write_text, write_whole, writing
-from cadalign.report.instances import InstanceName, InstanceTable
+from cadalign.report.instances import InstanceTable
 
 INLINE_LIMIT = 60_000_000
 """A page that would be larger has its pictures in files beside it [bytes]."""
@@ -49,6 +50,8 @@ class AssetStore:
     meshes: dict[str, Any] = field(default_factory=dict)
     records: dict[str, str] = field(default_factory=dict)
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
+    _calls: list[list[str]] = field(default_factory=list)
+    _exhibit_files: list[str] = field(default_factory=list)
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
         """Take in the pictures and records of runs, and enter their keys in the table."""
@@ -59,31 +62,36 @@ class AssetStore:
                     for old in self.assets.glob(pattern):
                         old.unlink()
         for index, run in enumerate(runs):
+            pictures, thumbs = _Files.of(run.folder.pictures), _Files.of(run.folder.thumbs)
+            previews = _Files.of(run.folder.previews)
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
                 if place is None:
                     continue
+                stem = record_stem(*name)
                 keys = {
-                    "picture": self._image(run.folder.pictures, name, self.pictures),
-                    "mesh": self._mesh(run, name),
+                    "picture": self._image(pictures, stem, self.pictures),
+                    "mesh": self._mesh(previews, record_stem(*name[:2])),
                 }
-                thumb = self._image(run.folder.thumbs, name, self.thumbs)
+                thumb = self._image(thumbs, stem, self.thumbs)
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
-                # As text: there may be many.
                 record = _object(row["exhibit"], run.folder.records)
-                self.records[str(place)] = dense_json({**keys, **record})
+                self._keep(place, msgspec.json.encode({**keys, **record}).decode())
 
     def to_dict(self) -> dict[str, Any]:
         """The page's part of it; writes the files that are beside the page."""
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
-            exhibits = {key: json.loads(text) for key, text in self.records.items()}
+            exhibits = {key: msgspec.json.decode(text) for key, text in self.records.items()}
             return {**found, "exhibits": exhibits, "meshes": self.meshes}
+        for index, calls in enumerate(self._calls):
+            if calls or not self._exhibit_files[index]:
+                self._write_records(index)
         return {
             **found,
-            "exhibit_files": self._write_records(),
+            "exhibit_files": self._exhibit_files,
             "exhibits_per_file": _PER_FILE,
             "mesh_files": {
                 key: self._write_script(
@@ -93,26 +101,27 @@ class AssetStore:
             },
         }
 
-    def _image(self, folder: Path, name: InstanceName, store: dict[str, str]) -> str | None:
+    def _image(self, files: _Files, stem: str, store: dict[str, str]) -> str | None:
         """Store a picture of an instance; its key, None where there is none."""
-        data = _read(folder / f"{record_stem(*name)}.webp")
+        data = files.read(f"{stem}.webp")
         if data is None:
             return None
-        digest = (folder.name, hashlib.sha256(data).digest())  # compared runs show the same ones
+        kind = files.folder.name
+        digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
         if digest not in self._known:
             key = str(len(store))
-            store[key] = self._stored(data, f"{folder.name[:-1]}_{int(key):06d}.webp")
+            store[key] = self._stored(data, f"{kind[:-1]}_{int(key):06d}.webp")
             self._known[digest] = key
         return self._known[digest]
 
-    def _mesh(self, run: Run, name: InstanceName) -> str | None:
-        data = _read(run.folder.previews / f"{record_stem(*name[:2])}.json")
+    def _mesh(self, files: _Files, stem: str) -> str | None:
+        data = files.read(f"{stem}.json")
         if data is None:
             return None
         digest = ("mesh", hashlib.sha256(data).digest())
         if digest not in self._known:
             key = f"m{len(self.meshes)}"
-            self.meshes[key] = _object(data, run.folder.previews)
+            self.meshes[key] = _object(data, files.folder)
             self._known[digest] = key
         return self._known[digest]
 
@@ -123,16 +132,23 @@ class AssetStore:
         write_whole(self.assets / name, lambda path: path.write_bytes(data))
         return self._address(name)
 
-    def _write_records(self) -> list[str]:
-        files: list[list[str]] = []
-        for key, text in self.records.items():
-            index = int(key) // _PER_FILE
-            files += [[] for _ in range(index + 1 - len(files))]
-            files[index].append(f"cadalignExhibit({key}, {text})")
-        return [
-            self._write_script(f"exhibits_{index:04d}.js", calls)
-            for index, calls in enumerate(files)
-        ]
+    def _keep(self, place: int, record: str) -> None:
+        """Keep an instance's record as text; beside a page, a file is written once it is full."""
+        if self.assets is None:
+            self.records[str(place)] = record
+            return
+        index = place // _PER_FILE
+        while len(self._calls) <= index:
+            self._calls.append([])
+            self._exhibit_files.append("")
+        self._calls[index].append(f"cadalignExhibit({place}, {record})")
+        if len(self._calls[index]) == _PER_FILE:
+            self._write_records(index)
+
+    def _write_records(self, index: int) -> None:
+        """Write a file of records."""
+        calls, self._calls[index] = self._calls[index], []
+        self._exhibit_files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
 
     def _write_script(self, name: str, calls: Sequence[str]) -> str:
         assert self.assets is not None
@@ -146,19 +162,34 @@ class AssetStore:
         return url_quote(f"{Path(folder).as_posix()}/{name}")
 
 
-def _read(path: Path) -> bytes | None:
-    """A file's bytes; None where there is none."""
-    if not path.is_file():
-        return None
-    with reading(path):
-        return path.read_bytes()
+@dataclass(frozen=True)
+class _Files:
+    """A folder's files; their names are read once, as asking for thousands takes seconds."""
+
+    folder: Path
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, folder: Path) -> _Files:
+        if not folder.is_dir():
+            return cls(folder, frozenset())
+        with reading(folder), os.scandir(folder) as entries:
+            return cls(folder, frozenset(entry.name for entry in entries if entry.is_file()))
+
+    def read(self, name: str) -> bytes | None:
+        """A file's bytes; None where there is none."""
+        if name not in self.names:
+            return None
+        path = self.folder / name
+        with reading(path):
+            return path.read_bytes()
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:
     """The JSON object that a text of a file is."""
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
+        found = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         found = None
     if not isinstance(found, dict):
         what = f"{quote(text)} is not an object of JSON"

@@ -331,17 +331,36 @@ def test_with_assets_everything_large_is_in_a_folder(
     assert all(url.startswith("a%20b%23c%25_assets/") for url in urls)
     names = {url.removeprefix("a%20b%23c%25_assets/") for url in urls}
     assert names == {path.name for path in written.assets.iterdir()}
-    (script,) = outside["exhibit_files"]
-    assert outside["exhibits_per_file"] >= 8
-    text = (written.assets / script.split("/")[1]).read_text(encoding="utf-8")
-    calls = re.findall(r"^cadalignExhibit\((\d+), (.*)\);$", text, re.M)
-    assert {key: json.loads(exhibit) for key, exhibit in calls} == payload["exhibits"]
+    assert exhibits_beside(written.assets, outside) == payload["exhibits"]
     for key, url in outside["mesh_files"].items():
         text = (written.assets / url.split("/")[1]).read_text(encoding="utf-8")
         found = re.fullmatch(r'cadalignMesh\("(\w+)", (.*)\);\n', text)
         assert found is not None
         assert found[1] == key
         assert json.loads(found[2]) == payload["meshes"][key]
+
+
+def exhibits_beside(assets: Path, outside: dict[str, Any]) -> dict[str, Any]:
+    """The exhibits of a page that has them in files, each in the file that the page looks in."""
+    found = {}
+    for index, script in enumerate(outside["exhibit_files"]):
+        text = (assets / script.split("/")[1]).read_text(encoding="utf-8")
+        for key, exhibit in re.findall(r"^cadalignExhibit\((\d+), (.*)\);$", text, re.M):
+            assert int(key) // outside["exhibits_per_file"] == index
+            found[key] = json.loads(exhibit)
+    return found
+
+
+def test_records_of_many_instances_are_shared_out_among_files(tmp_path: Path) -> None:
+    data = annotations(tmp_path / "data", ["a", "b", "c"])
+    run = evaluate(data, tmp_path / "run", methods=("aepnp",), views_per_model=50)
+    inside = report(tmp_path, run)["exhibits"]
+    assert len(inside) == 150
+    written = write_report([run], tmp_path / "report.html", assets=True)
+    assert written.assets is not None
+    outside = embedded_payload(written.path)
+    assert len(outside["exhibit_files"]) == 3
+    assert exhibits_beside(written.assets, outside) == inside
 
 
 def test_a_page_that_would_be_too_large_has_its_pictures_beside_it(

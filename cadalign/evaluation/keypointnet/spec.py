@@ -21,7 +21,9 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Reference, Spec, on_datasets
 
-_CHUNK, _CHUNK_DRAWN = 64, 8
+# A chunk is three files: with few instances in each, large runs spend their time on files.
+_CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK = 64, 8, 256
+_LARGE = 10_000
 
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
@@ -48,7 +50,8 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),
     }
-    return Plan(experiment, tasks, config, _CHUNK_DRAWN if drawn else _CHUNK)
+    large = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
+    return Plan(experiment, tasks, config, _CHUNK_DRAWN if drawn else large)
 
 
 def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:

@@ -20,6 +20,7 @@ from cadalign.evaluation.runs.tables import (
     DONE_ANEW,
     Columns,
     checked,
+    read_groups,
     read_table,
     uncompressed_bytes,
 )
@@ -138,9 +139,8 @@ class Run:
     def records(self, columns: Columns) -> Iterator[dict[str, Any]]:
         """Rows of the table of instance records; none of runs that keep none."""
         for path in self._record_files():
-            yield from checked(
-                read_table(path, fix=_RECORDS_FIX), columns, path=path, fix=_RECORDS_FIX
-            ).to_pylist()
+            for table in read_groups(path, fix=_RECORDS_FIX):
+                yield from checked(table, columns, path=path, fix=_RECORDS_FIX).to_pylist()
 
     def record_bytes(self) -> int:
         """Rough size of the instance records."""

@@ -20,7 +20,7 @@ Columns = tuple[tuple[str, type], ...]
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
-ROW_GROUP = 1 << 16
+ROW_GROUP = 1 << 14
 _TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
@@ -54,6 +54,18 @@ def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
         str(table.schema)  # names that are no text are noticed when they are looked at
         table.validate(full=True)
         return table
+
+
+def read_groups(path: Path, *, fix: str) -> Iterator[pa.Table]:
+    """Read a Parquet file by its row groups, of which memory holds one at a time.
+
+    Errors are those of `read_table`.
+    """
+    with _reading(path, fix), pq.ParquetFile(path) as file:
+        for index in range(file.num_row_groups):
+            table = file.read_row_group(index, use_threads=False)
+            table.validate(full=True)
+            yield table
 
 
 def uncompressed_bytes(path: Path, *, fix: str) -> int:

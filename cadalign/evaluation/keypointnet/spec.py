@@ -23,7 +23,7 @@ from cadalign.evaluation.spec import Reference, Spec, on_datasets
 
 # A chunk is three files: with few instances in each, large runs spend their time on files.
 _CHUNK, _CHUNK_DRAWN, _LARGE_CHUNK = 64, 8, 256
-_LARGE = 10_000
+_LARGE = 5_000  # views
 
 
 def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:

@@ -87,7 +87,8 @@ class DaskWorkers:
                     fix="start some with `dask worker ADDRESS`",
                 ) from None
             threads = sum(client.nthreads().values())
-            executor = client.get_executor()
+            # Named by chance: to name a chunk by its content takes longer than to evaluate it.
+            executor = client.get_executor(pure=False)
             try:
                 yield from evaluate_on(
                     lambda: executor,

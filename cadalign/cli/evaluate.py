@@ -134,7 +134,7 @@ def _commands() -> Any:
 class Evaluate:
     """Evaluate methods on a dataset."""
 
-    what: Annotated[Any, tyro.conf.arg(constructor_factory=_commands)]
+    what: Annotated[Any, tyro.conf.arg(name="", constructor_factory=_commands)]
 
     def run(self) -> int:
         """Run the evaluation that was chosen; returns its exit code."""

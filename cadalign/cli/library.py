@@ -71,10 +71,11 @@ class LibraryShow:
 class LibraryCommand:
     """Build and inspect libraries of CAD models."""
 
-    library: (
+    library: Annotated[
         Annotated[LibraryBuild, tyro.conf.subcommand("build")]
-        | Annotated[LibraryShow, tyro.conf.subcommand("show")]
-    )
+        | Annotated[LibraryShow, tyro.conf.subcommand("show")],
+        tyro.conf.arg(name=""),
+    ]
 
     def run(self) -> int:
         """Run the chosen command; returns its exit code."""

@@ -96,10 +96,11 @@ class ShapeShow(JsonOption):
 class ShapeCommand:
     """Learn and inspect the shapes of categories."""
 
-    shape: (
+    shape: Annotated[
         Annotated[ShapeLearn, tyro.conf.subcommand("learn")]
-        | Annotated[ShapeShow, tyro.conf.subcommand("show")]
-    )
+        | Annotated[ShapeShow, tyro.conf.subcommand("show")],
+        tyro.conf.arg(name=""),
+    ]
 
     def run(self) -> int:
         """Run the chosen command; returns its exit code."""

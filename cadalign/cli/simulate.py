@@ -30,7 +30,7 @@ def _commands() -> Any:
 class Simulate:
     """Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF."""
 
-    what: Annotated[Any, tyro.conf.arg(constructor_factory=_commands)]
+    what: Annotated[Any, tyro.conf.arg(name="", constructor_factory=_commands)]
 
     def run(self) -> int:
         """Run the simulation that was chosen; returns its exit code."""

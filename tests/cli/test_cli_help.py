@@ -107,3 +107,6 @@ def test_no_description_stands_twice(path: str) -> None:
             if len(words.split()) >= 4:
                 assert words not in every, (name, every.get(words), sentence)
                 every[words] = name
+    text = " ".join(printed(path).replace("│", " ").split())
+    first_sentence = " ".join(printed(path).split("\n\n")[1].split()).split(". ")[0]
+    assert text.count(first_sentence) == 1

@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -208,6 +208,7 @@ class KeypointNetExperiment:
             names = task.names(method)
             if isinstance(instance, Exception):
                 outcome = Outcome.without_instance(instance, names, **_known(task))
+                outcome = replace(outcome, seconds=extra or None)
                 outcomes.append((outcome, DataError(outcome.reason)))
                 continue
             result, estimate = next(answers)

@@ -13,12 +13,10 @@ Prints the figures and writes them to a JSON file. It needs the tests' packages 
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,11 +25,12 @@ import numpy as np
 import tyro
 from common import SeededBenchmark, write_results
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from support.annotating import Case, make_case, place, place_of_pixel, place_twenty, served
+from support.chromium import chromium
 from support.killing import kill_at_random
 from support.panels import (
     AXE,
@@ -120,7 +119,7 @@ def main(arguments: Arguments) -> None:
         "pictures": take_pictures,
     }
     results: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder, launched() as browser:
+    with tempfile.TemporaryDirectory() as folder, chromium() as browser:
         os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
         for part in arguments.parts:
             place = Path(folder) / part
@@ -130,20 +129,6 @@ def main(arguments: Arguments) -> None:
             results[part]["load"] = [round(before, 1), round(os.getloadavg()[0], 1)]
             print(part, results[part], flush=True)
     write_results(arguments.out, results)
-
-
-@contextmanager
-def launched() -> Iterator[Browser]:
-    """A headless Chromium that draws WebGL in software."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    program = next(filter(None, map(shutil.which, names)), None)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=program,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-        )
-        yield browser
-        browser.close()
 
 
 # --- times -----------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ The photo and the model are those of `align_other_chair.py`, whose files are nee
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -16,11 +15,14 @@ from pathlib import Path
 
 import tyro
 from common import Picture
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from support.chromium import chromium
 
 from cadalign.io.observation import Observation
 
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.mesh
     && annotator.photo.picture)"""
 
@@ -44,16 +46,12 @@ def main(arguments: Arguments) -> None:
     try:
         assert server.stdout is not None
         url = server.stdout.readline().strip()
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(
-                executable_path=shutil.which("chromium"), args=FLAGS
-            )
+        with chromium() as browser:
             page = browser.new_page(viewport={"width": 1280, "height": 960}, color_scheme="light")
             page.goto(url)
             wait(page)
             arguments.out.parent.mkdir(parents=True, exist_ok=True)
             page.screenshot(path=arguments.out)
-            browser.close()
     finally:
         server.terminate()
         server.wait()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from playwright.sync_api import Browser, Error, expect, sync_playwright
+from playwright.sync_api import Browser, Error, expect
+from support.chromium import chromium
 
 from cadalign.datasets import write_sample_dataset
 
@@ -80,17 +81,11 @@ def sample_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Not for the whole session: an event loop runs while Playwright does, and other tests need theirs.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """A headless Chromium that draws WebGL in software; tests are skipped where there is none."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    program = next(filter(None, map(shutil.which, names)), None)
-    with sync_playwright() as playwright:
+    """See `chromium`; tests are skipped where there is none."""
+    with ExitStack() as stack:
         try:
-            launched = playwright.chromium.launch(
-                executable_path=program,
-                args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-            )
+            launched = stack.enter_context(chromium())
         except Error as error:
             reason = error.message.strip().splitlines()[0]
             pytest.skip(f"no Chromium here ({reason}); on Debian: apt-get install chromium")
         yield launched
-        launched.close()

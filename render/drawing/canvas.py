@@ -52,7 +52,9 @@ class Canvas:
     def __init__(self, image: ByteImage) -> None:
         rows, columns = image.shape[:2]
         self._zoom = 2 if min(rows, columns) < _SMALL_SIDE else 1
-        self.image: ByteImage = np.repeat(np.repeat(image, self._zoom, 0), self._zoom, 1)
+        size = (columns * self._zoom, rows * self._zoom)
+        enlarged = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_NEAREST)
+        self.image: ByteImage = np.asarray(enlarged, dtype=np.uint8)
         self.unit = float(self._zoom * max(0.5, min(rows, columns) / 480))
 
     def place(self, points: FloatArray) -> FloatArray:

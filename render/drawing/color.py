@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -29,16 +32,26 @@ def srgb_from_linear(linear: LinearArray) -> LinearArray:
 
 def bytes_from_linear(linear: LinearArray) -> ByteImage:
     """Encode linear light (any shape) to sRGB bytes."""
-    # A table over the square root, which spreads the dark values about as sRGB does.
-    grid = (np.arange(_STEPS + 1, dtype=np.float32) / np.float32(_STEPS)) ** 2
-    table = (srgb_from_linear(grid) * 255 + np.float32(0.5)).astype(np.uint8)
     index = (np.sqrt(np.clip(linear, 0, 1)) * np.float32(_STEPS) + np.float32(0.5)).astype(np.int32)
-    return np.asarray(table[index])
+    return np.asarray(_encoded_squares()[index])
 
 
 def linear_from_bytes(image: ByteImage) -> LinearArray:
     """Decode sRGB bytes (any shape) to linear light; float32."""
-    return np.asarray(linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))[image])
+    return np.asarray(_decoded_bytes()[image])
+
+
+@cache
+def _encoded_squares() -> ByteImage:
+    """The bytes of the squares of 0 to 1, which spread the dark values about as sRGB does."""
+    grid = (np.arange(_STEPS + 1, dtype=np.float32) / np.float32(_STEPS)) ** 2
+    return np.asarray((srgb_from_linear(grid) * 255 + np.float32(0.5)).astype(np.uint8))
+
+
+@cache
+def _decoded_bytes() -> LinearArray:
+    """The linear light of every byte."""
+    return linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
 
 
 def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
@@ -51,11 +64,18 @@ def composite(color: ByteImage, background: npt.ArrayLike) -> ByteImage:
         raise InputError("not whole numbers from 0 to 255", where="background")
     result: ByteImage = np.empty(shape, dtype=np.uint8)
     result[:] = behind
+    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(color[:, :, 3]))
+    block = slice(top, top + height), slice(left, left + width)
+    _put_before(result[block], color[block])
+    return result
+
+
+def _put_before(behind: ByteImage, color: ByteImage) -> None:
+    """Put an image with opacity (h, w, 4) before a picture (h, w, 3), in place."""
     opacity = color[:, :, 3]
-    result[opacity == 255] = color[:, :, :3][opacity == 255]
+    np.copyto(behind, color[:, :, :3], where=(opacity == 255)[:, :, None])
     mixed = (opacity > 0) & (opacity < 255)
     share = opacity[mixed, None] / np.float32(255)
-    front = linear_from_bytes(color[:, :, :3][mixed])
-    light = front * share + linear_from_bytes(result[mixed]) * (1 - share)
-    result[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))
-    return result
+    light = linear_from_bytes(color[mixed, :3]) * share
+    light += linear_from_bytes(behind[mixed]) * (1 - share)
+    behind[mixed] = bytes_from_linear(np.asarray(light, dtype=np.float32))

@@ -97,7 +97,7 @@ class PosedScene:
         """The faces' unit normals in the camera frame, (m, 3) float32, on the side that is seen."""
 
     def prepare_color(self) -> None:
-        """Make now what `light` needs, before several threads ask for it at once."""
+        """Make now what `light_of_hits` needs, before several threads ask for it at once."""
         _ = self.scene.surface, self.scene.is_smooth, self.scene.single_corner_normals
         _ = self.scene.barycentric_gradients
 
@@ -136,9 +136,31 @@ class PosedScene:
             (points_cam - self._alignment.translation) @ columns, directions @ columns, reach=reach
         )
 
-    def light(self, normalized: FloatArray, studio: Studio) -> LinearArray:
-        """Colour seen in normalised directions (n, 2), cast anew; see `light_of_hits`."""
-        return self.light_of_hits(normalized, *self.cast(normalized), studio)
+    def mean_light(
+        self,
+        normalized: FloatArray,
+        valid: npt.NDArray[np.bool_],
+        studio: Studio,
+        *,
+        samples: int,
+    ) -> LinearArray:
+        """Mean colour of each ``samples`` successive normalised directions (n, 2), cast anew.
+
+        Linear light, premultiplied, and opacity: (n / samples, 4) float32. Directions that are not
+        ``valid`` see nothing.
+        """
+        face, depth = self.cast(normalized)
+        face[~valid] = -1
+        surface = self.scene.surface
+        if surface.varies or not surface.opaque:
+            light = self.light_of_hits(normalized, face, depth, studio)
+            return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
+        # A triangle of one colour looks the same all over a pixel: one of its hits stands for all.
+        chosen, share = _one_of_each(face.reshape(-1, samples))
+        light = self.light_of_hits(normalized[chosen], face[chosen], depth[chosen], studio)
+        light *= share[:, None]
+        begins = np.searchsorted(chosen // samples, np.arange(len(face) // samples))
+        return np.asarray(np.add.reduceat(light, begins, axis=0))
 
     def light_of_hits(
         self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
@@ -225,6 +247,22 @@ class PosedScene:
         rows = normals @ self._normal_matrix.T
         rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-30)
         return (rows * self._side[:, None]).astype(np.float32)
+
+
+def _one_of_each(faces: FaceArray) -> tuple[npt.NDArray[np.int64], LinearArray]:
+    """A place of each triangle in each row (n, k), row by row, and its share of the row.
+
+    Places count in the flattened array.
+    """
+    order = np.argsort(faces, axis=1)
+    ordered = np.take_along_axis(faces, order, axis=1)
+    begins = np.ones(faces.shape, dtype=bool)
+    begins[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
+    firsts = np.flatnonzero(begins)
+    count = faces.shape[1]
+    places = firsts - firsts % count + order.ravel()[firsts]
+    shares = np.diff(firsts, append=faces.size).astype(np.float32) / np.float32(count)
+    return places, shares
 
 
 def pose_scene(

@@ -137,10 +137,8 @@ class RaycastRenderer:
         def draw(part: IntArray) -> None:
             pixels = (part[:, None] + offsets).reshape(-1, 2)
             rays, valid = posed.camera.normalize_where_valid(pixels)
-            light = posed.light(rays, self.studio)
-            light[~valid] = 0
-            light = light.reshape(len(part), samples, 4)
-            color[part[:, 1], part[:, 0]] = _encode(light.mean(axis=1))
+            light = posed.mean_light(rays, valid, self.studio, samples=samples)
+            color[part[:, 1], part[:, 0]] = _encode(light)
 
         in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
 

@@ -25,7 +25,11 @@ class Surface:
         if mesh.vertex_colors is not None:
             color = mesh.vertex_colors.astype(np.float32)
             color[:, :3] = linear_from_srgb(color[:, :3])
-            self._corner_color = color[mesh.faces]
+            corners = color[mesh.faces]
+            if (corners == corners[:, :1]).all():
+                self._face_color = corners[:, 0]
+            else:
+                self._corner_color = corners
         self._face_material = mesh.face_material
         self._corner_uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
         self._textures: dict[int, LinearArray] = {}

@@ -219,6 +219,8 @@ def test_grey_and_rgba_images_are_taken():
     image = draw_overlay(rgba, CAMERA)
     assert image[0, 0].tolist() == [10, 20, 30]
     assert image[0, 639].min() > 200
+    mirrored = np.arange(480 * 640 * 3, dtype=np.uint8).reshape(480, 640, 3)[:, ::-1, ::-1]
+    np.testing.assert_array_equal(draw_overlay(mirrored, CAMERA), mirrored)
 
 
 @pytest.mark.parametrize(

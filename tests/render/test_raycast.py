@@ -276,6 +276,30 @@ def test_materials_belong_to_faces():
         assert median.argmax() == channel
 
 
+@pytest.mark.parametrize("crease_angle", [5, 60])
+def test_triangles_of_one_colour_are_drawn_as_if_every_sample_were_shaded(crease_angle):
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    colors = np.random.default_rng(0).uniform(0, 1, (len(sphere.faces), 4))
+    colors[:, 3] = 1
+    vertices = np.array(sphere.triangles).reshape(-1, 3)
+    colors = np.repeat(colors, 3, axis=0)
+    hidden, mixed = (
+        np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]),
+        np.eye(4)[[3, 1, 2]] + [0, 0, 0, 1],
+    )
+    drawn = []
+    for more, of_more in ((hidden, np.ones((3, 4))), (hidden, np.clip(mixed, 0, 1))):
+        corners, all_colors = np.concatenate([vertices, more]), np.concatenate([colors, of_more])
+        mesh = Mesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=all_colors)
+        scene = Scene(mesh, crease_angle=crease_angle)
+        drawn.append((scene.surface.varies, RaycastRenderer().render(scene, CAMERA, _front_view())))
+    assert [varies for varies, _ in drawn] == [False, True]
+    one, every = (frame.color.astype(int) for _, frame in drawn)
+    np.testing.assert_array_equal(one[:, :, 3], every[:, :, 3])
+    assert np.abs(one - every).max() <= (1 if crease_angle == 5 else 6)
+    assert np.abs(one - every).mean() < 0.1
+
+
 def test_a_transparent_sheet_lets_what_is_behind_show():
     front = _facing_quad().vertices + np.array([0, 0, 0.5])
     vertices = np.concatenate([_facing_quad().vertices, front])
@@ -353,6 +377,8 @@ def test_composite_keeps_the_background_and_blends_in_linear_light():
     clear, full = frame.color[:, :, 3] == 0, frame.color[:, :, 3] == 255
     np.testing.assert_array_equal(result[clear], photo[clear])
     np.testing.assert_array_equal(result[full], frame.color[full][:, :3])
+    turned = replace(frame, color=frame.color[::-1, ::-1]).composite(photo[::-1, ::-1])
+    np.testing.assert_array_equal(turned[::-1, ::-1], result)
     half = replace(frame, color=np.full((1, 1, 4), (255, 255, 255, 128), dtype=np.uint8))
     # Half of the light of white is 188 in sRGB.
     assert half.composite((0, 0, 0))[0, 0].tolist() == [188] * 3

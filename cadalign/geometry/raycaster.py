@@ -91,8 +91,8 @@ class RayCaster:
         Its number is -1 and its distance infinite where there is none; ``start`` and distances,
         both (n,), count in the directions' own lengths.
         """
-        face = self._first_faces(origin, directions, start)
-        return face, self._distances(origin, directions, face)
+        face = self.first_faces(origin, directions, start=start)
+        return face, self.distances(origin, directions, face)
 
     def normals(self, face: FaceArray | npt.NDArray[np.int64]) -> FloatArray:
         """Unit normals (n, 3) of triangles (n,)."""
@@ -100,7 +100,7 @@ class RayCaster:
 
     def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
-        return np.asarray(self._first_faces(origin, directions, None) >= 0)
+        return np.asarray(self.first_faces(origin, directions) >= 0)
 
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
@@ -114,10 +114,10 @@ class RayCaster:
             unit.astype(np.float32), (directions / self._radius).astype(np.float32), reach
         )
 
-    def _first_faces(
-        self, origin: FloatArray, directions: FloatArray, start: FloatArray | None
+    def first_faces(
+        self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
     ) -> FaceArray:
-        """The triangles that the engine finds, (n,) int32."""
+        """Find the first triangle on each ray as `first_hits` does, without its distance."""
         origin = (origin - self._center) / self._radius
         length = np.sqrt(np.einsum("nk,nk->n", directions, directions))
         unit = directions / length[:, None]
@@ -135,8 +135,11 @@ class RayCaster:
             origins.astype(np.float32, copy=False), unit.astype(np.float32)
         )
 
-    def _distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
-        """Ray parameters at the planes of their triangles, (n,) float."""
+    def distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
+        """Measure how far rays (n, 3) from one point go to their triangles (n,); see `first_hits`.
+
+        Triangles are those of `first_faces`; (n,) float, infinite where there is none (-1).
+        """
         distance = np.full(len(face), np.inf)
         hit = np.flatnonzero(face >= 0)
         found, along = face[hit], directions[hit]

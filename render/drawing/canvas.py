@@ -83,7 +83,9 @@ class Canvas:
     def line(self, points: FloatArray, color: Color, *, width: float, dashed: bool = False) -> None:
         """Draw a line through (n, 2) pixels; its width is in units."""
         parts = _dashes(points, 7 * self.unit, 5 * self.unit) if dashed else [points]
-        fixed = [_fixed_point(part) for part in parts]
+        fixed = np.split(
+            _fixed_point(np.concatenate(parts)), np.cumsum([len(part) for part in parts[:-1]])
+        )
         for shade, thickness in self._strokes(color, width=width, casing=_LINE_CASING):
             cv2.polylines(self.image, fixed, False, shade, thickness, cv2.LINE_AA, _SHIFT)
 
@@ -222,10 +224,13 @@ def _dashes(points: FloatArray, dash: float, gap: float) -> list[FloatArray]:
     count = min(max(1, round((total + gap) / (dash + gap))), 1000)
     pitch = (total + gap) / count
     begins = np.arange(count) * pitch
-    ends = begins + (pitch - gap)
-    result = []
-    for begin, end in zip(begins, ends, strict=True):
-        between = reached[(reached > begin) & (reached < end)]
-        at = np.concatenate([[begin], between, [max(end, begin)]])
-        result.append(np.column_stack([np.interp(at, reached, points[:, axis]) for axis in (0, 1)]))
-    return result
+    ends = np.maximum(begins + (pitch - gap), begins)
+    first = np.searchsorted(reached, begins, side="right")
+    last = np.searchsorted(reached, ends, side="left")
+    at = [
+        np.concatenate([[begin], reached[low:high], [end]])
+        for begin, end, low, high in zip(begins, ends, first, last, strict=True)
+    ]
+    every = np.concatenate(at)
+    drawn = np.column_stack([np.interp(every, reached, points[:, axis]) for axis in (0, 1)])
+    return np.split(drawn, np.cumsum([len(part) for part in at[:-1]]))

@@ -105,10 +105,13 @@ class PosedScene:
         self, normalized: FloatArray, *, start: FloatArray | None = None
     ) -> tuple[FaceArray, FloatArray]:
         """Find what is seen in normalised directions (n, 2): triangles and depths, both (n,)."""
-        face, depth = self._caster.first_hits(
-            self._origin, self._directions(normalized), start=start
-        )
-        return np.where(face >= 0, self._shown[face], np.int32(-1)), depth
+        directions = self._directions(normalized)
+        face, depth = self._caster.first_hits(self._origin, directions, start=start)
+        return self._as_shown(face), depth
+
+    def _as_shown(self, face: FaceArray) -> FaceArray:
+        """Triangles that were hit, (n,): of coincident ones those wound to the camera."""
+        return np.where(face >= 0, self._shown[face], np.int32(-1))
 
     def seen_sides(self, face_id: npt.NDArray[np.int32]) -> tuple[bool, bool]:
         """Tell if any triangle in an image is seen from its front, and any from its back."""
@@ -149,17 +152,21 @@ class PosedScene:
         Linear light, premultiplied, and opacity: (n / samples, 4) float32. Directions that are not
         ``valid`` see nothing.
         """
-        face, depth = self.cast(normalized)
+        directions = self._directions(normalized)
+        face = self._caster.first_faces(self._origin, directions)
         face[~valid] = -1
         surface = self.scene.surface
         if surface.varies or not surface.opaque:
-            light = self.light_of_hits(normalized, face, depth, studio)
+            depth = self._caster.distances(self._origin, directions, face)
+            light = self.light_of_hits(normalized, self._as_shown(face), depth, studio)
             return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
         # A triangle of one colour looks the same all over a pixel: one of its hits stands for all.
         chosen, share = _one_of_each(face.reshape(-1, samples))
-        light = self.light_of_hits(normalized[chosen], face[chosen], depth[chosen], studio)
+        face = face[chosen]
+        depth = self._caster.distances(self._origin, directions[chosen], face)
+        light = self.light_of_hits(normalized[chosen], self._as_shown(face), depth, studio)
         light *= share[:, None]
-        begins = np.searchsorted(chosen // samples, np.arange(len(face) // samples))
+        begins = np.searchsorted(chosen // samples, np.arange(len(directions) // samples))
         return np.asarray(np.add.reduceat(light, begins, axis=0))
 
     def light_of_hits(

@@ -62,7 +62,7 @@ def on_annotations(root: Path, count: int, method: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Used:
-    """What a run took: wall clock and processor time [s], and its largest process [MB]."""
+    """Wall clock and processor time of a run [s], and its largest process [MB]."""
 
     wall: float
     processor: float
@@ -70,7 +70,7 @@ class Used:
 
 
 def used_by_run(root: Path, *options: str, views: int) -> Used:
-    """What the command took, with its workers; a folder of its own is removed."""
+    """Run the command in a folder of its own, and measure it with its workers."""
     with tempfile.TemporaryDirectory() as folder:
         call = ["evaluate", "keypointnet", str(root), f"--views-per-model={views}", *options]
         call += [f"--out={folder}/run", "--json"]

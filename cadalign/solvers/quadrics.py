@@ -1,4 +1,4 @@
-"""Where three homogeneous quadrics in four unknowns meet, for the minimal solver.
+"""Common roots of three homogeneous quadrics in four unknowns, for the minimal solver.
 
 Two unknowns are eliminated by the identities between the monomials y^2, yz and z^2, after Kukelova,
 Heller, Fitzgibbon, "Efficient intersection of three quadrics", 2016; the roots of the remaining

@@ -101,14 +101,13 @@ def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
     for picture in pictures:
         for ending in ("png", "pdf"):
             _copy(folder.figures / f"{picture}.{ending}", plan.out / "figures")
-    head = ["", *kind.methods]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     shown = [summary for summary in summaries if summary["metric"] == keys[0]]
-    for value in kind.values:
-        cells = [f"{s['median']:.3g}" for s in shown if s["value"] == value]
-        lines.append(f"| {value:g} | {' | '.join(cells)} |")
+    rows = [
+        [f"{value:g}", *(f"{s['median']:.3g}" for s in shown if s["value"] == value)]
+        for value in kind.values
+    ]
+    table = _markdown(["", *kind.methods], rows, words=0)
     images = "\n".join(f"![{picture}](figures/{picture}.png)" for picture in pictures)
-    table = "\n".join(lines)
     return (
         f"## Simulation: {name}\n\n{images}\n\n"
         f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
@@ -143,7 +142,7 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
         table = _table_rows(summaries)
         rows += [[name, *row] for row in table]
         sections.append(
-            f"### {_DATASETS[name]}\n\n{_markdown(table)}\n\n"
+            f"### {_DATASETS[name]}\n\n{_markdown(_HEAD, table, words=2)}\n\n"
             f"![rotation errors](figures/{name}_categories_rotation_error_deg.png)\n"
         )
     write_text(plan.out / "table1.csv", csv_text([["dataset", *_HEAD], *rows]))
@@ -161,7 +160,8 @@ _HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z
 def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
     """The rows of Table 1: our medians, and the paper's beneath where it states them."""
     rows = []
-    for category in dict.fromkeys(summary.group for summary in summaries):
+    categories = dict.fromkeys(summary.group for summary in summaries)
+    for category in sorted(categories, key=lambda name: name != ALL):
         of_category = [summary for summary in summaries if summary.group == category]
         for summary in of_category:
             ratio = metrics.OVER_BOUND.text(summary["over_limit"])
@@ -176,9 +176,10 @@ def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
     return rows
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    lines = [_HEAD, ["---"] * len(_HEAD), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int) -> str:
+    """A table whose first columns, so many, hold words, and the others numbers."""
+    marks = [":---"] * words + ["---:"] * (len(head) - words)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, marks, *rows))
 
 
 def _copy(source: Path, folder: Path, name: str | None = None) -> None:

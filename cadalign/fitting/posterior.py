@@ -17,6 +17,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.fitting import f_distribution
 from cadalign.fitting.chi_square import upper_quantile
 from cadalign.fitting.likelihood import Likelihood
 from cadalign.fitting.problems import distinct_rows
@@ -67,10 +68,8 @@ def posterior_covariance(result: FitResult, options: FitOptions) -> FloatArray:
 
 def widening_of(unknowns: int, redundancy: float) -> float:
     """Variance of the F distribution's 95 % ellipsoid over that of a known sigma's."""
-    from scipy.special import fdtri  # takes longer to import than a fit
-
-    quantile = unknowns * fdtri(unknowns, redundancy, _COVERAGE)
-    return float(quantile / upper_quantile(unknowns, 1 - _COVERAGE))
+    quantile = unknowns * f_distribution.upper_quantile(unknowns, redundancy, 1 - _COVERAGE)
+    return quantile / upper_quantile(unknowns, 1 - _COVERAGE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,9 +34,9 @@ from support.chromium import chromium
 from support.killing import kill_at_random
 from support.panels import (
     AXE,
-    IDLE,
     MODEL,
     PHOTO,
+    SETTLED,
     WATCH_SHIFTS,
     Keyboard,
     open_page,
@@ -173,20 +173,20 @@ def _timed_clicks(
     for click in range(count + 3):
         page.evaluate("window.painted = []; annotator.select(null)")
         page.mouse.click(*photo)
-        wait(f"{IDLE} && annotator.state.pairs.length === {full} && window.painted.length === 1")
+        wait(f"{SETTLED} && annotator.state.pairs.length === {full} && window.painted.length === 1")
         page.wait_for_timeout(350)  # a person's hand; meanwhile the next keypoint is ranked
         place_on_model = page.evaluate(
             "annotator.model.toPage(annotator.state.keypoints.find((each) => !each.used).xyz)"
         )
         page.mouse.click(place_on_model["x"], place_on_model["y"])
         wait(
-            f"{IDLE} && window.painted.length === 2"
+            f"{SETTLED} && window.painted.length === 2"
             f" && annotator.state.pairs.filter((each) => each.residual).length === {full}"
         )
         if click >= 3:  # the first ones warm up
             times.append(page.evaluate("window.painted[1]"))
         page.evaluate("annotator.undo(), annotator.undo()")
-        wait(f"{IDLE} && annotator.state.pairs.length === {full - 1}")
+        wait(f"{SETTLED} && annotator.state.pairs.length === {full - 1}")
     return times
 
 
@@ -249,7 +249,7 @@ def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[s
             start = time.perf_counter()
             page.keyboard.press("PageDown")
             wait(
-                f"{IDLE} && annotator.state.image.number === {number}"
+                f"{SETTLED} && annotator.state.image.number === {number}"
                 " && annotator.photo.wanted === annotator.photo.picture"
             )
             switched.append(1000 * (time.perf_counter() - start))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import Case, place, place_all, served, wait
+from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
 from cadalign.annotate.history_file import history_path
 from cadalign.annotate.image_corners import nearest_corner
@@ -21,10 +21,6 @@ from cadalign.errors import CadalignError
 from cadalign.geometry.mesh import Mesh
 
 pytestmark = pytest.mark.long
-
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 
 
 def cube() -> Mesh:
@@ -235,16 +231,8 @@ def test_history_of_another_annotation_is_left_alone(case: Case) -> None:
 @pytest.fixture
 def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
     session = case.open()
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session) as page:
         yield page, session
-        context.close()
-    assert errors == []
 
 
 def on_page(page: Page, xyz: np.ndarray) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
-from support.annotating import Case, served, wait
+from support.annotating import IDLE, Case, served, wait
 
 import cadalign.web
 from cadalign.annotate.claims import LEASE, Claims
@@ -18,9 +18,6 @@ from cadalign.errors import CadalignError
 
 pytestmark = pytest.mark.long
 
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 SCRIPTS = Path(cadalign.web.__file__).parent / "annotate"
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
-from support.annotating import Case, make_case, place, place_all, served, wait
+from support.annotating import IDLE, Case, make_case, opened_page, place, place_all, served, wait
 from support.refusals import refusal_line
 
 from cadalign.annotate.choosing.choice import ModelChoice, starting_model
@@ -27,10 +27,6 @@ from cadalign.io.observation import Observation
 from cadalign.retrieval import Library
 
 pytestmark = pytest.mark.long
-
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 
 
 @pytest.fixture(scope="module")
@@ -203,13 +199,7 @@ def test_model_is_chosen_by_keys_alone_and_by_a_click(
         if keypoint in known:
             place(session, keypoint, uv)
     marked = len(session.photos[0].document.complete_pairs)
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session) as page:
         page.keyboard.press("q")
         cards = page.locator("dialog[open] .models button")
         expect(cards).to_have_count(6)
@@ -230,5 +220,3 @@ def test_model_is_chosen_by_keys_alone_and_by_a_click(
         page.get_by_role("button", name=re.compile("sample_chair_003")).click()
         wait(page, f"{IDLE} && annotator.model.mesh.uuid !== '{before}'")
         assert session.photos[0].files.model.samefile(other_chair(library))
-        assert errors == []
-        context.close()

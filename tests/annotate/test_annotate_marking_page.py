@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import Case, place_all, place_of_pixel, served, wait
+from support.annotating import IDLE, Case, opened_page, place_all, place_of_pixel, wait
 
 from cadalign.annotate.page_state import mask_pixels
 from cadalign.annotate.session import Session
@@ -15,9 +15,6 @@ from cadalign.io.images import write_image
 
 pytestmark = pytest.mark.long
 
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 TOOL = "What a click in the photo marks"
 
 
@@ -25,16 +22,8 @@ TOOL = "What a click in the photo marks"
 def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
     session = case.open()
     place_all(session, case, count=5)
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session) as page:
         yield page, session
-        context.close()
-    assert errors == []
 
 
 def drag(page: Page, *places: tuple[float, float]) -> None:

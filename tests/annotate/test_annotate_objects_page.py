@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import Case, place, place_of_pixel, served
+from support.annotating import IDLE, Case, opened_page, place, place_of_pixel
 from support.annotating import wait as support_wait
 
 from cadalign.annotate.session import Session
@@ -17,9 +17,6 @@ from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long
 
-READY = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 SHIFTS = """() => {
     window.moved = 0;
     new PerformanceObserver((list) => {
@@ -41,7 +38,7 @@ def click(page: Page, uv: list[float]) -> None:
 
 def press(page: Page, key: str) -> None:
     page.keyboard.press(key)
-    wait(page, READY)
+    wait(page, IDLE)
 
 
 def shown(page: Page) -> tuple[int, int]:
@@ -63,17 +60,9 @@ def session(case: Case) -> Session:
 
 @pytest.fixture
 def page(browser: Browser, session: Session) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, READY)
+    with opened_page(browser, session, width=1280, height=800) as page:
         page.evaluate(SHIFTS)
         yield page
-        context.close()
-    assert errors == []
 
 
 def test_objects_are_added_switched_renamed_and_deleted_by_mouse(
@@ -85,14 +74,14 @@ def test_objects_are_added_switched_renamed_and_deleted_by_mouse(
     dialog.get_by_label("Name of the new object").fill("left chair")
     dialog.get_by_role("button", name="Add object").click()
     expect(dialog).to_be_hidden()
-    wait(page, READY)
+    wait(page, IDLE)
     assert shown(page) == (0, 1)
     expect(page.get_by_role("alert")).to_have_text("Mark the new object's points.")
     for keypoint, (u, v) in case.clicks[:5]:
         click(page, [u + 6, v])
         session.act(0, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
     page.reload()
-    wait(page, READY)
+    wait(page, IDLE)
     assert shown(page) == (0, 1)  # as the address has it
     chips = page.get_by_role("group", name="Objects of this photo").get_by_role("button")
     expect(chips).to_have_text(["object 1 · 6", "left chair · 5"])
@@ -102,7 +91,7 @@ def test_objects_are_added_switched_renamed_and_deleted_by_mouse(
     page.evaluate("annotator.photo.zoom(1.5)")
     kept = page.evaluate("annotator.photo.scale")
     chips.nth(0).click()
-    wait(page, READY + " && annotator.state.image.object === 0")
+    wait(page, IDLE + " && annotator.state.image.object === 0")
     assert page.evaluate("annotator.photo.scale") == kept  # another object keeps the zoom
     assert page.evaluate("annotator.state.pairs.length") == 6
 
@@ -129,29 +118,29 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
     press(page, "Enter")
     assert shown(page) == (0, 1)
     press(page, "e")
-    wait(page, READY + " && annotator.state.image.object === 0")
+    wait(page, IDLE + " && annotator.state.image.object === 0")
     press(page, "e")
-    wait(page, READY + " && annotator.state.image.object === 1")
+    wait(page, IDLE + " && annotator.state.image.object === 1")
     press(page, "y")
     expect(page.get_by_role("alert")).to_have_text("This object has no other photo: T adds one.")
     press(page, "e")
-    wait(page, READY + " && annotator.state.image.object === 0")
+    wait(page, IDLE + " && annotator.state.image.object === 0")
     page.keyboard.press("t")
     dialog.get_by_label("Photo to add").focus()
     press(page, "Tab")
     press(page, "Enter")
-    wait(page, READY + " && annotator.state.image.number === 1")
+    wait(page, IDLE + " && annotator.state.image.number === 1")
     assert page.url.endswith("#2.2")
     for keypoint, uv in case.clicks[:5]:
         session.act(1, {"do": "place_uv", "uv": uv}, slot=1)
         session.act(1, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
     page.reload()
-    wait(page, READY)
+    wait(page, IDLE)
     chips = page.get_by_role("group", name="Photos of this object").get_by_role("button")
     expect(chips).to_have_text(["photo.png · 6", "right.png · 5"])
     assert page.evaluate("annotator.state.alignment.status") == "done"
     press(page, "y")
-    wait(page, READY + " && annotator.state.image.number === 0")
+    wait(page, IDLE + " && annotator.state.image.number === 0")
     assert len(Observation.load(case.observation).views) == 2
     press(page, "Control+z")
     wait(page, "annotator.api.idle && annotator.state.views[1].pairs === 4")
@@ -162,10 +151,10 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
 def test_a_photo_is_taken_from_the_object(page: Page, session: Session) -> None:
     session.act(0, {"do": "add_view", "photo": 1})
     page.evaluate("annotator.goTo(1, 1)")
-    wait(page, READY + " && annotator.state.image.number === 1")
+    wait(page, IDLE + " && annotator.state.image.number === 1")
     page.get_by_role("button", name="Objects…").click()
     page.get_by_role("button", name="Take right.png from the object").click()
-    wait(page, READY + " && annotator.state.image.number === 0")
+    wait(page, IDLE + " && annotator.state.image.number === 0")
     expect(page.get_by_role("alert")).to_have_text("right.png is no longer used.")
     assert len(session.objects[0][0].all_views) == 1
 
@@ -175,7 +164,7 @@ def test_another_model_is_shown_for_its_object(page: Page) -> None:
     dialog = page.get_by_role("dialog")
     dialog.get_by_label("Model of the new object").select_option(index=1)
     dialog.get_by_role("button", name="Add object").click()
-    wait(page, READY + " && annotator.model.number === 1 && annotator.state.image.object === 1")
+    wait(page, IDLE + " && annotator.model.number === 1 && annotator.state.image.object === 1")
     canvas = page.get_by_role("application", name="The model")
     canvas.focus()
     page.keyboard.press("Enter")
@@ -186,7 +175,7 @@ def test_another_model_is_shown_for_its_object(page: Page) -> None:
 def test_an_object_of_another_tab_that_was_deleted_is_refused(page: Page, session: Session) -> None:
     session.act(0, {"do": "add_object", "name": "lamp"})
     page.evaluate("annotator.goTo(0, 1)")
-    wait(page, READY + " && annotator.state.image.object === 1")
+    wait(page, IDLE + " && annotator.state.image.object === 1")
     session.act(0, {"do": "delete_object"}, slot=1)
     page.evaluate("annotator.act({ do: 'place_uv', uv: [10, 10], pair: null })")
     wait(page, "annotator.api.idle")

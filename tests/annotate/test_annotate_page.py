@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import Case, place_all, place_of_pixel, place_twenty, served
+from support.annotating import IDLE, Case, place_all, place_of_pixel, place_twenty, served
 from support.timing import Yardstick, reference_seconds
 
 from cadalign import ShapeModel
@@ -25,9 +25,6 @@ from cadalign.shapes.examples import Example
 
 pytestmark = pytest.mark.long
 
-READY = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 POLLS = 3000  # 20 ms apart; what fails after them does not come at all, however slow the machine
 
 # Without the thousands of numbers of the lines.
@@ -64,7 +61,7 @@ class Driver:
 
     def open(self, access: Access) -> None:
         self.page.goto(access.url)
-        self.wait(READY)
+        self.wait(IDLE)
 
     # Not `wait_for_function`, which evaluates text in the page: its policy forbids that.
     def wait(self, condition: str) -> None:
@@ -176,7 +173,7 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
 
     # Nothing is lost by a reload, nor by a crash: a new server finds it all on disk.
     page.reload()
-    driver.wait(READY)
+    driver.wait(IDLE)
     assert "token" not in page.url
     reloaded = driver.wait_for_state(lambda _: True)
     assert reloaded["pairs"] == undone["pairs"]
@@ -452,11 +449,11 @@ def test_photos_of_a_folder_come_in_turn(browser: Browser, case: Case) -> None:
         expect(page.get_by_role("button", name="Previous")).to_be_disabled()
         page.get_by_role("button", name="Next").click()
         driver.wait_for_state(lambda state: state["image"]["name"] == "second.png")
-        driver.wait(READY)
+        driver.wait(IDLE)
         page.mouse.click(*driver.pixel([100.0, 100.0]))
         driver.wait_for_state(lambda state: len(state["pairs"]) == 1)
         page.reload()
-        driver.wait(READY)
+        driver.wait(IDLE)
         expect(page.locator("h1")).to_have_text("second.png")
         page.keyboard.press("PageUp")
         state = driver.wait_for_state(lambda state: state["image"]["name"] == "photo.png")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
-from support.annotating import Case, place_all, served, wait
+from support.annotating import IDLE, Case, opened_page, place_all, wait
 
 from cadalign.annotate.model import CadModel, detail_bytes
 from cadalign.annotate.page_state import page_state
@@ -31,9 +31,6 @@ new PerformanceObserver((list) => {
 PLACES = """() => [...document.querySelectorAll(".host canvas, header button, .card > h2")].map(
     (each) => { const { x, y, width, height } = each.getBoundingClientRect();
                 return [x, y, width, height]; })"""
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 SUM = """() => {
     const { canvas, context } = annotator.photo;
     const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
@@ -50,17 +47,8 @@ DRAWN = """async () => {
 @pytest.fixture
 def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
     session = case.open()
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.add_init_script(WATCH_SHIFTS)
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session, scripts=[WATCH_SHIFTS]) as page:
         yield page, session
-        context.close()
-    assert errors == []
 
 
 def act(page: Page, action: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from playwright.sync_api import Browser
-from support.annotating import Case, place, place_of_pixel, served, wait
+from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, wait
 
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.page_state import page_state
@@ -23,10 +23,6 @@ from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import CadalignError
 
 pytestmark = pytest.mark.long
-
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
-)
 
 
 def folder_of(case: Case, *names: str) -> None:
@@ -68,13 +64,7 @@ def test_files_that_are_no_work_list_are_refused(case: Case) -> None:
 def test_list_is_filtered_and_gone_through_by_keys(browser: Browser, case: Case) -> None:
     folder_of(case, "1.png", "2.png", "3.png")
     session = case.open(image=case.folder)
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session, width=1280, height=800) as page:
         page.keyboard.press("d")
         wait(page, f"{IDLE} && annotator.state.image.number === 1")
         page.keyboard.press("k")
@@ -93,8 +83,6 @@ def test_list_is_filtered_and_gone_through_by_keys(browser: Browser, case: Case)
         wait(page, f"{IDLE} && annotator.state.image.number === 2")
         page.keyboard.press("PageUp")  # the others are done and skipped
         wait(page, "document.querySelector('[role=alert]').textContent.includes('No other photo')")
-        context.close()
-    assert errors == []
 
 
 def detections(case: Case, session: Session, names: list[str], shift: float) -> dict[str, Any]:
@@ -169,13 +157,7 @@ def test_proposals_are_taken_in_the_page(browser: Browser, case: Case) -> None:
     file = case.folder / "found.json"
     file.write_text(json.dumps(detections(case, case.open(), ["photo.png"], 0.0)))
     session = case.open(detections=file)
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    errors: list[str] = []
-    with served(session) as access:
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(access.url)
-        wait(page, IDLE)
+    with opened_page(browser, session, width=1280, height=800) as page:
         keypoint, uv = case.clicks[3]
         x, y = place_of_pixel(page, uv)
         page.mouse.click(x + 3, y)
@@ -189,5 +171,3 @@ def test_proposals_are_taken_in_the_page(browser: Browser, case: Case) -> None:
         with page.expect_download() as glb:
             page.get_by_role("link", name="Aligned model (GLB)").click()
         assert glb.value.suggested_filename == "photo.glb"
-        context.close()
-    assert errors == []

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import uvicorn
-from playwright.sync_api import Page
+from playwright.sync_api import Browser, Page
 
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
@@ -27,6 +27,11 @@ from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.evaluation.instances.instance import Instance, load_scene, make_instance
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, visible_keypoints
+
+IDLE = (
+    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle)"
+)
+"""Condition that all is loaded and nothing is under way."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,33 @@ def served(session: Session) -> Iterator[Access]:
         server.should_exit = True
         thread.join(timeout=10)
         listener.close()
+
+
+@contextmanager
+def opened_page(
+    browser: Browser,
+    session: Session,
+    *,
+    width: int = 1366,
+    height: int = 768,
+    scripts: Sequence[str] = (),
+) -> Iterator[Page]:
+    """Serve a session and open its page, in which no error may occur until it is closed.
+
+    ``scripts`` run before those of the page.
+    """
+    context = browser.new_context(viewport={"width": width, "height": height})
+    errors: list[str] = []
+    with served(session) as access:
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        for script in scripts:
+            page.add_init_script(script)
+        page.goto(access.url)
+        wait(page, IDLE)
+        yield page
+        context.close()
+    assert errors == []
 
 
 def wait(page: Page, condition: str, *, polls: int = 3000) -> None:

@@ -15,12 +15,10 @@ from playwright.sync_api import Browser, Page
 from cadalign.annotate.session import Session
 from cadalign.datasets import KeypointNet
 from cadalign.retrieval import Library
-from support.annotating import Case, wait
+from support.annotating import IDLE, Case, wait
 
-IDLE = (
-    "!!(annotator.state && annotator.model.mesh && annotator.photo.picture && annotator.api.idle"
-    " && annotator.state.alignment.status !== 'preparing')"
-)
+SETTLED = f"{IDLE} && annotator.state.alignment.status !== 'preparing'"
+"""Condition that nothing is under way and that nothing is still being prepared."""
 WATCH_SHIFTS = """
 window.shifts = [];
 new PerformanceObserver((list) => {
@@ -73,10 +71,10 @@ class Keyboard:
     seen: Callable[[str], None] = lambda name: None
     visited: list[str] = field(default_factory=list)
 
-    def wait(self, condition: str = IDLE) -> None:
+    def wait(self, condition: str = SETTLED) -> None:
         wait(self.page, condition, polls=_POLLS)
 
-    def keys(self, *keys: str, then: str = IDLE) -> None:
+    def keys(self, *keys: str, then: str = SETTLED) -> None:
         """Press keys where the focus is, and wait."""
         for key in keys:
             self.page.keyboard.press(key)
@@ -125,7 +123,7 @@ class Keyboard:
         self.page.locator(PHOTO).focus()
 
     def _pairs(self) -> None:
-        self.keys("a", then=f"{IDLE} && annotator.state.alignment.status === 'done'")
+        self.keys("a", then=f"{SETTLED} && annotator.state.alignment.status === 'done'")
         self.wait("document.querySelectorAll('.ranking:not(.stale) li').length > 0")
         self.look("aligned")
         self.disclose(".how summary")
@@ -185,7 +183,7 @@ class Keyboard:
         number = self.page.evaluate(
             "annotator.library.models.findIndex((each) => !each.current) + 1"
         )
-        self.keys(str(number), then=f"{IDLE} && annotator.model.mesh.uuid !== '{before}'")
+        self.keys(str(number), then=f"{SETTLED} && annotator.model.mesh.uuid !== '{before}'")
         self.look("other model")
         self.keys("q")
         self.wait("document.querySelectorAll('dialog[open] .models li').length > 0")
@@ -197,9 +195,9 @@ class Keyboard:
 
     def _end(self) -> None:
         self.page.locator(PHOTO).focus()
-        self.keys("f", "k", then=f"{IDLE} && annotator.state.image.number === 1")
-        self.keys("PageUp", then=f"{IDLE} && annotator.state.image.number === 0")
-        self.keys("d", then=f"{IDLE} && annotator.state.image.number === 1")
+        self.keys("f", "k", then=f"{SETTLED} && annotator.state.image.number === 1")
+        self.keys("PageUp", then=f"{SETTLED} && annotator.state.image.number === 0")
+        self.keys("d", then=f"{SETTLED} && annotator.state.image.number === 1")
         self.look("next photo")
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tyro
-from common import Benchmark, new_table, seconds_of_process, write_results
+from common import COMMAND, Benchmark, new_table, seconds_of_process, write_results
 from rich.console import Console
 
 import cadalign
@@ -28,7 +28,6 @@ from cadalign.io.observation import Observation
 from cadalign.solvers.linear import aepnp_batch
 
 LIBRARIES = [sys.executable, "-c", "import numpy, numba"]
-COMMAND = [sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())"]
 
 
 @dataclass

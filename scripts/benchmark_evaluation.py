@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from common import figure, processor_seconds, reference_seconds, write_figures
+from common import COMMAND, figure, processor_seconds, reference_seconds, write_figures
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
@@ -75,8 +74,7 @@ def used_by_run(root: Path, *options: str, views: int) -> Used:
         call = ["evaluate", "keypointnet", str(root), f"--views-per-model={views}", *options]
         call += [f"--out={folder}/run", "--json"]
         start = time.perf_counter()
-        code = "import sys; from cadalign.cli import main; sys.exit(main())"
-        process = subprocess.Popen([sys.executable, "-c", code, *call], stdout=subprocess.DEVNULL)
+        process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         wall = time.perf_counter() - start
     process.returncode = os.waitstatus_to_exitcode(status)

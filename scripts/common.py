@@ -23,6 +23,8 @@ from cadalign.evaluation.simulation.problems import Problem
 from cadalign.io.files import write_json
 from cadalign.io.images import write_image
 
+COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
+"""What runs `cadalign`, wherever it is installed."""
 LIMIT_DRAWS = 20
 STEM = Path(sys.argv[0]).stem
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from common import Picture
+from common import COMMAND, Picture
 from playwright.sync_api import Page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -39,8 +39,7 @@ def main(arguments: Arguments) -> None:
     """Serve, open the page, and take its picture."""
     observation = arguments.files / "photo.json"
     model = Observation.load(observation).model
-    command = [sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())"]
-    command += ["annotate", "--no-open", "--image", str(arguments.files / "photo.png")]
+    command = [*COMMAND, "annotate", "--no-open", "--image", str(arguments.files / "photo.png")]
     command += ["--model", str(model), "--observation", str(observation)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

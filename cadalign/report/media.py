@@ -48,7 +48,7 @@ class AssetStore:
     pictures: dict[str, str] = field(default_factory=dict)
     thumbs: dict[str, str] = field(default_factory=dict)
     meshes: dict[str, Any] = field(default_factory=dict)
-    records: dict[str, str] = field(default_factory=dict)
+    records: dict[str, Any] = field(default_factory=dict)
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
     _calls: list[list[str]] = field(default_factory=list)
     _exhibit_files: list[str] = field(default_factory=list)
@@ -78,14 +78,13 @@ class AssetStore:
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
                 record = _object(row["exhibit"], run.folder.records)
-                self._keep(place, msgspec.json.encode({**keys, **record}).decode())
+                self._keep(place, {**keys, **record})
 
     def to_dict(self) -> dict[str, Any]:
         """The page's part of it; writes the files that are beside the page."""
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
-            exhibits = {key: msgspec.json.decode(text) for key, text in self.records.items()}
-            return {**found, "exhibits": exhibits, "meshes": self.meshes}
+            return {**found, "exhibits": self.records, "meshes": self.meshes}
         for index, calls in enumerate(self._calls):
             if calls or not self._exhibit_files[index]:
                 self._write_records(index)
@@ -132,8 +131,8 @@ class AssetStore:
         write_whole(self.assets / name, lambda path: path.write_bytes(data))
         return self._address(name)
 
-    def _keep(self, place: int, record: str) -> None:
-        """Keep an instance's record as text; beside a page, a file is written once it is full."""
+    def _keep(self, place: int, record: dict[str, Any]) -> None:
+        """Keep an instance's record; beside a page as text, whose file is written once full."""
         if self.assets is None:
             self.records[str(place)] = record
             return
@@ -141,7 +140,8 @@ class AssetStore:
         while len(self._calls) <= index:
             self._calls.append([])
             self._exhibit_files.append("")
-        self._calls[index].append(f"cadalignExhibit({place}, {record})")
+        text = msgspec.json.encode(record).decode()
+        self._calls[index].append(f"cadalignExhibit({place}, {text})")
         if len(self._calls[index]) == _PER_FILE:
             self._write_records(index)
 

@@ -27,7 +27,7 @@ from cadalign.evaluation.simulation.problems import Problem, random_rotation, si
 from cadalign.fitting.noise import whitening_of
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
-from cadalign.solvers.objective import evaluate_cost, keypoint_objective
+from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.refine import refine
 
 ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))

@@ -49,6 +49,51 @@ def _compiled(function: F, fastmath: set[str], *, forceinline: bool = False) -> 
     return cast(F, KernelDispatcher(function, options))
 
 
+class KernelFamily:
+    """A kernel of one name with a member for each type of its first argument.
+
+    What calls it is compiled once for each of these types, with the member of that type in it.
+    Members stand in the module of their type, or in one that this module imports: code that was
+    compiled for a type is found by the sources of its module.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.__name__, self.__doc__ = function.__name__, function.__doc__
+        self._members: dict[type, Any] = {}
+
+    def of(self, kind: type) -> Callable[[F], F]:
+        """Decorate the kernel that is the member for a type of NamedTuple."""
+
+        def add(member: F) -> F:
+            self._members[kind] = member
+            return member
+
+        return add
+
+    is_compiling = False  # members know it of themselves
+
+    def __call__(self, first: Any, *others: Any) -> Any:
+        return self._members[type(first)](first, *others)
+
+    @property
+    def _numba_type_(self) -> types.Dispatcher:
+        return types.Dispatcher(self)
+
+    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
+        """Types of a call by a kernel."""
+        return self._member(arguments).get_call_template(arguments, keywords)
+
+    def get_overload(self, signature: Any) -> Any:
+        """Code that a kernel calls."""
+        return self._member(signature).get_overload(signature)
+
+    def _member(self, arguments: Any) -> Any:
+        kind = arguments[0].instance_class
+        if kind not in self._members:
+            raise TypeError(f"{self.__name__} has no member for {kind.__name__}")
+        return self._members[kind]
+
+
 class KernelDispatcher(CPUDispatcher):
     """A function compiled for Python and, apart from that, for the kernels that call it."""
 

@@ -7,6 +7,7 @@ going back to an older version compiles anything that was compiled before.
 from __future__ import annotations
 
 import os
+import sys
 import time
 from functools import cache, cached_property
 from itertools import count
@@ -90,7 +91,7 @@ class KernelCache(FunctionCache):
         )
 
     def _index_key(self, signature: Any, codegen: Any) -> Any:
-        return *super()._index_key(signature, codegen), self._use
+        return *super()._index_key(signature, codegen), self._use, _sources_of(signature)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for a signature, None if there is none.
@@ -101,6 +102,16 @@ class KernelCache(FunctionCache):
         """
         rtsys.initialize(target_context)
         return self._load_overload(sig, target_context)
+
+
+def _sources_of(signature: Any) -> tuple[str, ...]:
+    """Hashes of the modules of named tuples among a signature's types.
+
+    Members of kernel families, which the code calls for such a type, stand there.
+    """
+    kinds = [getattr(kind, "instance_class", None) for kind in signature]
+    modules = [sys.modules[kind.__module__].__file__ for kind in kinds if kind is not None]
+    return tuple(source_hash(Path(file)) for file in modules if file is not None)
 
 
 class KernelFiles(CodeFiles):

@@ -20,7 +20,7 @@ from cadalign.geometry.projection import perspective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import Keypoints, ScalePrior, Views
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.objective import Objective
+from cadalign.solvers.alignment import Objective
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from

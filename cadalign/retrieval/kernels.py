@@ -13,13 +13,19 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
+from cadalign.solvers.alignment import (
+    Objective,
+    accept_new,
+    evaluate_alignment,
+    evaluate_cost,
+    room_for,
+    solve_damped,
+)
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS
-from cadalign.solvers.evidence import BLOCK, Keypoints, ScalePrior
-from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.evidence import Keypoints, ScalePrior
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.objective import Objective, evaluate, evaluate_cost
-from cadalign.solvers.refine import least_information, refine
+from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
 
 LEAST_SHARED = 4
@@ -218,21 +224,11 @@ def _linearised_cost(objective: Objective, pose: FloatArray, cost: float) -> flo
 
     The decrease of the cost on its quadratic model counts `_OPTIMISM` times.
     """
-    hessian = np.empty((UNKNOWNS, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
-    step = np.empty(UNKNOWNS)
-    evaluate(objective, pose, rows, hessian, gradient)
-    floor = least_information(hessian)
-    for k in range(UNKNOWNS):
-        step[k] = gradient[k]
-        hessian[k, k] += floor
-    if not cholesky(hessian, UNKNOWNS, 0.0):
-        return 0.0
-    solve_cholesky(hessian, UNKNOWNS, step)
-    for k in range(UNKNOWNS):
-        cost -= _OPTIMISM * gradient[k] * step[k]
-    return cost
+    equations = room_for(UNKNOWNS)
+    evaluate_alignment(objective, pose, equations)
+    accept_new(equations, UNKNOWNS)
+    decrease = solve_damped(equations, UNKNOWNS, 0.0, np.empty(UNKNOWNS))
+    return cost - _OPTIMISM * decrease if decrease == decrease else 0.0
 
 
 @kernel

@@ -6,11 +6,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE
-from cadalign.solvers.evidence import BLOCK
-from cadalign.solvers.focal import focal_system
+from cadalign.solvers.alignment import Objective, evaluate_alignment, room_for, with_points
+from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, UNOBSERVABLE
+from cadalign.solvers.focal import FocalObjective, evaluate_focal
 from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
-from cadalign.solvers.objective import Objective, evaluate, with_points
 from cadalign.solvers.unknowns import uncenter
 
 
@@ -22,11 +21,36 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
     """
     center, unit = center_and_unit(objective.keypoints.points)
     local = with_points(objective, (objective.keypoints.points - center) / unit)
-    centered = pose.copy()
-    uncenter(centered, -center, 1.0)
-    for c in range(3):
-        centered[9 + c] /= unit
-    undetermined = _invert_information(local, centered, covariance)
+    equations = room_for(UNKNOWNS)
+    evaluate_alignment(local, _centered(pose, center, unit), equations)
+    undetermined = _invert(equations.new_hessian, objective.free, 0.0, covariance)
+    _uncenter_covariance(pose, center, unit, covariance)
+    return undetermined
+
+
+@kernel
+def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: FloatArray) -> int:
+    """Write the covariance of all 9 unknowns, at log_ratio 0, into (9, 9).
+
+    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
+    number of an unknown that the points do not determine; the focal length is never one, its
+    deviation is then as large as rounding errors let it be known.
+    """
+    points = system.objective.keypoints.points
+    center, unit = center_and_unit(points)
+    local = with_points(system.objective, (points - center) / unit)
+    state = np.zeros(POSE_SIZE + 1)
+    state[:POSE_SIZE] = _centered(pose, center, unit)
+    equations = room_for(UNKNOWNS + 1)
+    evaluate_focal(FocalObjective(local, system.slopes, system.prior), state, equations)
+    hessian, distance = equations.new_hessian, state[11]
+    least = UNOBSERVABLE * hessian[5, 5] * distance * distance
+    undetermined = _invert(hessian, system.objective.free, least, covariance)
+    # The distance follows the focal length, see `cadalign.solvers.focal`.
+    for k in range(UNKNOWNS + 1):
+        covariance[5, k] += distance * covariance[UNKNOWNS, k]
+    for k in range(UNKNOWNS + 1):
+        covariance[k, 5] += distance * covariance[k, UNKNOWNS]
     _uncenter_covariance(pose, center, unit, covariance)
     return undetermined
 
@@ -47,12 +71,25 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 @kernel
-def _invert_information(objective: Objective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write (J' W J)^-1 for centred points; see `covariance_of`."""
-    information = np.empty((UNKNOWNS, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
-    evaluate(objective, pose, rows, information, gradient)
+def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
+    """The pose of points (x - center) / unit, in these units."""
+    centered = pose.copy()
+    uncenter(centered, -center, 1.0)
+    for c in range(3):
+        centered[9 + c] /= unit
+    return centered
+
+
+@kernel
+def _invert(
+    information: FloatArray, free: FloatArray, least: float, covariance: FloatArray
+) -> int:
+    """Write the inverse of an information matrix (U, U), whose factor takes its place.
+
+    An unknown beyond the first 8 has at least the information ``least`` left by the others.
+    Returns -1, or the number of an undetermined unknown.
+    """
+    size = information.shape[0]
     diagonal = np.diag(information).copy()
     covariance[:] = 0.0
     if not cholesky(information, UNKNOWNS, UNOBSERVABLE):
@@ -63,13 +100,21 @@ def _invert_information(objective: Objective, pose: FloatArray, covariance: Floa
             if not total > UNOBSERVABLE * diagonal[k]:
                 return k
         return UNKNOWNS - 1
-    column = np.empty(UNKNOWNS)
-    for k in range(UNKNOWNS):
-        if objective.free[k] == 0.0:
+    for k in range(UNKNOWNS, size):
+        total = diagonal[k]
+        for m in range(UNKNOWNS):
+            for j in range(m):
+                information[k, m] -= information[m, j] * information[k, j]
+            information[k, m] /= information[m, m]
+            total -= information[k, m] ** 2
+        information[k, k] = np.sqrt(max(total, least))
+    column = np.empty(size)
+    for k in range(size):
+        if k < UNKNOWNS and free[k] == 0.0:
             continue
         column[:] = 0.0
         column[k] = 1.0
-        solve_cholesky(information, UNKNOWNS, column)
+        solve_cholesky(information, size, column)
         copy_into(covariance[:, k], column)
     return -1
 
@@ -83,7 +128,8 @@ def _uncenter_covariance(
     With t = unit t' - R S center, an infinitesimal change of the unknowns changes t by
     unit dt' + [R S center]x d(rotation) - sum_k R_k s_k center_k d(log s_k).
     """
-    jacobian = np.eye(UNKNOWNS)
+    size = covariance.shape[0]
+    jacobian = np.eye(size)
     shift = np.zeros(3)
     for c in range(3):
         for j in range(3):
@@ -94,51 +140,14 @@ def _uncenter_covariance(
     jacobian[3, 1], jacobian[3, 2] = -shift[2], shift[1]
     jacobian[4, 0], jacobian[4, 2] = shift[2], -shift[0]
     jacobian[5, 0], jacobian[5, 1] = -shift[1], shift[0]
-    product = np.zeros((UNKNOWNS, UNKNOWNS))
-    for i in range(UNKNOWNS):
-        for j in range(UNKNOWNS):
-            for k in range(UNKNOWNS):
+    product = np.zeros((size, size))
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
                 product[i, j] += jacobian[i, k] * covariance[k, j]
-    for i in range(UNKNOWNS):
-        for j in range(UNKNOWNS):
+    for i in range(size):
+        for j in range(size):
             total = 0.0
-            for k in range(UNKNOWNS):
+            for k in range(size):
                 total += product[i, k] * jacobian[j, k]
             covariance[i, j] = total
-
-
-@kernel
-def focal_covariance(
-    objective: Objective,
-    slopes: FloatArray,
-    prior_weight: float,
-    pose: FloatArray,
-    covariance: FloatArray,
-) -> int:
-    """Write the inverse information of all 9 unknowns, at log_ratio 0, into (9, 9).
-
-    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
-    number of an unknown that the points do not determine.
-    """
-    given = np.empty((UNKNOWNS, UNKNOWNS))
-    covariance[:] = 0.0
-    undetermined = covariance_of(objective, pose, given)
-    if undetermined >= 0:
-        return undetermined
-    hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    own, _ = focal_system(objective, slopes, 1.0, pose, hessian, gradient)
-    shift = np.zeros(UNKNOWNS)
-    information = own + prior_weight
-    for k in range(UNKNOWNS):
-        for m in range(UNKNOWNS):
-            shift[k] -= given[k, m] * hessian[UNKNOWNS, m]
-        information += hessian[UNKNOWNS, k] * shift[k]
-    # Where nothing is left, the deviation is as large as rounding errors let it be known.
-    variance = 1.0 / max(information, UNOBSERVABLE * (own + prior_weight))
-    covariance[UNKNOWNS, UNKNOWNS] = variance
-    for k in range(UNKNOWNS):
-        covariance[k, UNKNOWNS] = covariance[UNKNOWNS, k] = variance * shift[k]
-        for m in range(UNKNOWNS):
-            covariance[k, m] = given[k, m] + variance * shift[k] * shift[m]
-    return -1

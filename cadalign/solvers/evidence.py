@@ -2,7 +2,7 @@
 
 A block is a NamedTuple of its data with two kernels: one returns its cost at a pose, the other also
 adds J' W J to the upper triangle of a ``hessian`` (8, 8) and J' W r to a ``gradient`` (8,), in the
-order of `cadalign.solvers.unknowns`. `cadalign.solvers.objective` sums the blocks.
+order of `cadalign.solvers.unknowns`. `cadalign.solvers.alignment` sums the blocks.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def add_keypoints(
         cost += keypoint_rows(keypoints, pose, start, size, rows)
         if not cost < np.inf:
             return np.inf
-        _add_products(rows, 2 * size, hessian, gradient)
+        add_products(rows, 2 * size, hessian, gradient)
     return cost
 
 
@@ -144,7 +144,7 @@ def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]
 
 
 @fast_sums
-def _add_products(
+def add_products(
     rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray
 ) -> None:
     """Add the rows' inner products to the upper triangle of J' W J and to J' W r."""

@@ -1,40 +1,73 @@
-"""The ninth unknown: refinement and covariance where the focal length is estimated too.
+"""The system of pose, stretch and focal length: 9 unknowns, from the keypoints of one view.
 
-The focal length is written as a reference one times exp(log_ratio). The reference's objective holds
-rays and weights at log_ratio 0; at another focal length the rays shrink and the weights grow by the
-ratio. Given the focal length, the other 8 unknowns are refined as ever, so the ninth is found by
-Newton's method on what is left, the least error as a function of the focal length alone (variable
-projection).
+The focal length is a reference one times exp(log_ratio). The reference's objective holds rays and
+weights at log_ratio 0; at another focal length the rays shrink and the weights grow by the ratio. A
+longer lens and a larger distance explain much the same image, so that the two are moved together:
+a step of the log focal length carries the distance with it. What is left for it to explain is the
+perspective, and the valley of the cost is straight.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import kernel
-from cadalign.solvers.constants import OK, UNKNOWNS, UNOBSERVABLE
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.alignment import (
+    Equations,
+    Objective,
+    accept_new,
+    are_same_poses,
+    evaluate_cost,
+    room_for,
+    solve_damped,
+    with_keypoints,
+)
+from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS
 from cadalign.solvers.evidence import (
     BLOCK,
     Keypoints,
     LogFocalPrior,
+    add_products,
+    add_scale_prior,
     focal_prior_cost,
     keypoint_rows,
 )
-from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
+from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import affine_rows
-from cadalign.solvers.objective import Objective, evaluate, with_keypoints
 from cadalign.solvers.projection import project_point, scalars_of
-from cadalign.solvers.refine import least_information, refine
-from cadalign.solvers.unknowns import move_pose
+from cadalign.solvers.refine import refine
+from cadalign.solvers.system import (
+    accept,
+    are_same,
+    cost_at,
+    evaluate,
+    is_estimate,
+    move,
+    room_of,
+    score_of,
+    solve,
+)
+from cadalign.solvers.unknowns import has_collapsed, hold_fixed, move_pose
 
-_ROUNDS = 60
-_POSE_ITERATIONS = 100
 _LARGEST_STEP = 0.5
-_CONVERGED_STEP = 1e-9
-_RELATIVE_DECREASE = 1e-12
-_ABSOLUTE_DECREASE = 1e-16
-_HALVINGS = 12
+_SAME_FOCAL = 0.01
+_AT_BOUND = 1e-9
+
+
+class FocalObjective(NamedTuple):
+    """An objective at the reference focal length, and what is known of the focal length.
+
+    A state is the packed pose and log_ratio (16,). ``slopes`` (n, 2), or (0, 2) for a lens without
+    distortion, holds the change of the undistorted pixels, over the reference focal length, per
+    unit of the logarithm of the focal length.
+    """
+
+    objective: Objective
+    slopes: FloatArray
+    prior: LogFocalPrior
 
 
 @kernel
@@ -64,8 +97,7 @@ def linear_focal(points: FloatArray, rays: FloatArray) -> float:
 def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Objective:
     """The objective at exp(log_ratio) times the focal length of its rays.
 
-    ``slopes`` (n, 2), or (0, 2) for a lens without distortion, holds the change of the undistorted
-    pixels, over the reference focal length, per unit of the logarithm of the focal length.
+    ``slopes`` are those of `FocalObjective`.
     """
     ratio = np.exp(log_ratio)
     old = objective.keypoints
@@ -76,116 +108,147 @@ def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Obje
     return with_keypoints(objective, keypoints)
 
 
-@kernel
-def focal_system(
-    here: Objective,
-    slopes: FloatArray,
-    ratio: float,
-    pose: FloatArray,
-    hessian: FloatArray,
-    gradient: FloatArray,
-) -> tuple[float, float]:
-    """Build the Gauss-Newton system of all 9 unknowns at a pose, without the focal length's prior.
+@room_of.of(FocalObjective)
+@inlined
+def _room_of(system: FocalObjective) -> Equations:
+    return room_for(UNKNOWNS + 1)
 
-    ``here`` is what `at_focal` gives for the ratio. ``hessian`` (9, 8) and ``gradient`` (8,)
-    receive the system of the other 8, and in the last row the focal length's products with them;
-    its own entries of J' W J and J' W r are returned.
-    """
-    rows = np.empty((UNKNOWNS + 1, 2 * BLOCK))
-    evaluate(here, pose, rows, hessian[:UNKNOWNS], gradient)
-    hessian[UNKNOWNS] = 0.0
-    information = slope = 0.0
+
+@evaluate.of(FocalObjective)
+@kernel
+def evaluate_focal(system: FocalObjective, state: FloatArray, equations: Equations) -> float:
+    """Build the Gauss-Newton system of all 9 unknowns; see `FocalObjective`."""
+    rows, hessian, gradient = equations.rows, equations.new_hessian, equations.new_gradient
+    log_ratio = state[POSE_SIZE]
+    ratio = np.exp(log_ratio)
+    here = at_focal(system.objective, system.slopes, log_ratio)
     points, whitening = here.keypoints.points, here.keypoints.whitening
-    scalars = scalars_of(pose)
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    by_focal = np.empty(2 * BLOCK)
+    pose = scalars_of(state)
+    cost = 0.0
     for start in range(0, points.shape[0], BLOCK):
         size = min(BLOCK, points.shape[0] - start)
-        keypoint_rows(here.keypoints, pose, start, size, rows)
+        cost += keypoint_rows(here.keypoints, state, start, size, rows)
+        if not cost < np.inf:
+            return np.inf
+        add_products(rows, 2 * size, hessian, gradient)
         for b in range(size):
             i = start + b
-            _, _, depth = project_point(scalars, (points[i, 0], points[i, 1], points[i, 2]))
-            # A longer focal length moves a point's image as a smaller depth does.
-            across = -rows[5, b] * depth
-            down = -rows[5, size + b] * depth
-            if slopes.shape[0] > 0:
+            _, _, depth = project_point(pose, (points[i, 0], points[i, 1], points[i, 2]))
+            # A longer focal length moves a point's image as a smaller depth does; the distance
+            # follows it.
+            nearer = state[11] - depth
+            by_focal[b], by_focal[size + b] = rows[5, b] * nearer, rows[5, size + b] * nearer
+            if system.slopes.shape[0] > 0:
                 weighted = whitening[i if whitening.shape[0] > 1 else 0]
                 root = rows[3, b] * depth / weighted[0]  # of the loss's weight
-                dx, dy = root * slopes[i, 0] / ratio, root * slopes[i, 1] / ratio
-                across -= weighted[0] * dx + weighted[1] * dy
-                down -= weighted[2] * dy
+                dx = root * system.slopes[i, 0] / ratio
+                dy = root * system.slopes[i, 1] / ratio
+                by_focal[b] -= weighted[0] * dx + weighted[1] * dy
+                by_focal[size + b] -= weighted[2] * dy
+        for c in range(2 * size):
             for k in range(UNKNOWNS):
-                if here.free[k] != 0.0:
-                    hessian[UNKNOWNS, k] += rows[k, b] * across + rows[k, size + b] * down
-            information += across * across + down * down
-            slope += rows[UNKNOWNS, b] * across + rows[UNKNOWNS, size + b] * down
-    return information, slope
+                hessian[k, UNKNOWNS] += rows[k, c] * by_focal[c]
+            hessian[UNKNOWNS, UNKNOWNS] += by_focal[c] * by_focal[c]
+            gradient[UNKNOWNS] += rows[UNKNOWNS, c] * by_focal[c]
+    cost += add_scale_prior(system.objective.scale_prior, state, hessian, gradient)
+    cost += focal_prior_cost(system.prior, log_ratio)
+    hessian[UNKNOWNS, UNKNOWNS] += system.prior.weight
+    gradient[UNKNOWNS] += system.prior.weight * (log_ratio - system.prior.center)
+    for k in range(UNKNOWNS + 1):
+        for m in range(k):
+            hessian[k, m] = hessian[m, k]
+    hold_fixed(system.objective.free, UNKNOWNS + 1, hessian, gradient)
+    _hold_at_bounds(system.prior, log_ratio, hessian, gradient)
+    return cost
+
+
+@inlined
+def _hold_at_bounds(
+    prior: LogFocalPrior, log_ratio: float, hessian: FloatArray, gradient: FloatArray
+) -> None:
+    """Hold the focal length where it would leave its bounds."""
+    downhill = -gradient[UNKNOWNS]
+    if (log_ratio <= prior.low + _AT_BOUND and downhill < 0.0) or (
+        log_ratio >= prior.high - _AT_BOUND and downhill > 0.0
+    ):
+        gradient[UNKNOWNS] = 0.0
+        for m in range(UNKNOWNS):
+            hessian[UNKNOWNS, m] = hessian[m, UNKNOWNS] = 0.0
+
+
+@cost_at.of(FocalObjective)
+@kernel
+def _cost_at(system: FocalObjective, state: FloatArray) -> float:
+    log_ratio = state[POSE_SIZE]
+    here = at_focal(system.objective, system.slopes, log_ratio)
+    return evaluate_cost(here, state) + focal_prior_cost(system.prior, log_ratio)
+
+
+@solve.of(FocalObjective)
+@inlined
+def _solve(
+    system: FocalObjective, equations: Equations, damping: float, step: FloatArray
+) -> float:
+    return solve_damped(equations, UNKNOWNS + 1, damping, step)
+
+
+@move.of(FocalObjective)
+@inlined
+def _move(
+    system: FocalObjective,
+    state: FloatArray,
+    equations: Equations,
+    damping: float,
+    step: FloatArray,
+    moved: FloatArray,
+) -> None:
+    move_pose(state, step, moved)
+    log_step = min(max(step[UNKNOWNS], -_LARGEST_STEP), _LARGEST_STEP)
+    log_ratio = min(max(state[POSE_SIZE] + log_step, system.prior.low), system.prior.high)
+    moved[POSE_SIZE] = log_ratio
+    moved[11] *= np.exp(log_ratio - state[POSE_SIZE])
+
+
+@accept.of(FocalObjective)
+@inlined
+def _accept(system: FocalObjective, state: FloatArray, equations: Equations) -> None:
+    accept_new(equations, UNKNOWNS + 1)
+
+
+@score_of.of(FocalObjective)
+@inlined
+def _score_of(system: FocalObjective, state: FloatArray, cost: float) -> float:
+    return cost
+
+
+@are_same.of(FocalObjective)
+@inlined
+def _are_same(system: FocalObjective, first: FloatArray, second: FloatArray) -> bool:
+    zoomed = abs(first[POSE_SIZE] - second[POSE_SIZE])
+    return zoomed < _SAME_FOCAL and are_same_poses(system.objective, first, second)
+
+
+@is_estimate.of(FocalObjective)
+@inlined
+def _is_estimate(system: FocalObjective, state: FloatArray) -> bool:
+    return not has_collapsed(state)
 
 
 @kernel
 def refine_focal(
-    objective: Objective,
-    slopes: FloatArray,
-    prior: LogFocalPrior,
-    max_rounds: int,
-    pose: FloatArray,
-    log_ratio: float,
+    system: FocalObjective, max_iterations: int, pose: FloatArray
 ) -> tuple[float, float, int]:
-    """Improve ``pose`` (15,) in place, and log_ratio with it, in at most ``max_rounds`` steps.
+    """Improve ``pose`` (15,) in place, with the focal length, from log_ratio 0.
 
-    ``objective`` and ``slopes`` are as for `at_focal`. Returns the cost, infinite if a point lies
-    behind the camera at the start, log_ratio, and the iterations of the pose.
+    Returns the cost, infinite if a point lies behind the camera at the start, log_ratio, and the
+    number of iterations.
     """
-    hessian = np.empty((UNKNOWNS + 1, UNKNOWNS))
-    gradient = np.empty(UNKNOWNS)
-    shift = np.empty(UNKNOWNS)
-    trial = np.empty(pose.shape[0])
-    here = at_focal(objective, slopes, log_ratio)
-    cost, iterations, _ = refine(here, _POSE_ITERATIONS, pose)
-    cost += focal_prior_cost(prior, log_ratio)
-    if not cost < np.inf:
-        return np.inf, log_ratio, iterations
-    for _ in range(min(max_rounds, _ROUNDS)):
-        own, slope = focal_system(here, slopes, np.exp(log_ratio), pose, hessian, gradient)
-        slope += prior.weight * (log_ratio - prior.center)
-        curvature = own + prior.weight
-        whole = curvature
-        # The pose follows the focal length by shift, which lessens both slope and curvature.
-        floor = least_information(hessian)
-        for k in range(UNKNOWNS):
-            hessian[k, k] += floor
-        if not cholesky(hessian, UNKNOWNS, 0.0):
-            return cost, log_ratio, iterations
-        for k in range(shift.shape[0]):
-            shift[k] = -hessian[UNKNOWNS, k]
-        solve_cholesky(hessian, UNKNOWNS, shift)
-        for k in range(UNKNOWNS):
-            curvature += hessian[UNKNOWNS, k] * shift[k]
-            slope += gradient[k] * shift[k]
-        if curvature > UNOBSERVABLE * whole:
-            step = -slope / curvature
-        else:
-            step = -np.sign(slope) * _LARGEST_STEP
-        step = min(max(step, -_LARGEST_STEP), _LARGEST_STEP)
-        step = min(max(step, prior.low - log_ratio), prior.high - log_ratio)
-        improved = False
-        for _ in range(_HALVINGS):
-            if abs(step) < _CONVERGED_STEP:
-                break
-            move_pose(pose, step * shift, trial)
-            there = at_focal(objective, slopes, log_ratio + step)
-            moved_cost, used, _ = refine(there, _POSE_ITERATIONS, trial)
-            iterations += used
-            moved_cost += focal_prior_cost(prior, log_ratio + step)
-            if moved_cost <= cost:
-                improved = True
-                break
-            step *= 0.3
-        if not improved:
-            break
-        decrease = cost - moved_cost
-        copy_into(pose, trial)
-        here = there
-        log_ratio += step
-        cost = moved_cost
-        if decrease <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost:
-            break
-    return cost, log_ratio, iterations
+    state = np.zeros(POSE_SIZE + 1)
+    for k in range(POSE_SIZE):
+        state[k] = pose[k]
+    cost, iterations, _ = refine(system, max_iterations, state)
+    copy_into(pose, state[:POSE_SIZE])
+    return cost, state[POSE_SIZE], iterations

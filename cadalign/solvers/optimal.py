@@ -6,6 +6,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.alignment import Objective, with_keypoints, with_points
 from cadalign.solvers.constants import (
     DEGENERATE,
     NOT_FOUND,
@@ -20,10 +21,9 @@ from cadalign.solvers.evidence import Keypoints, ScalePrior, take_keypoints
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.objective import Objective, evaluate_cost, with_keypoints, with_points
-from cadalign.solvers.refine import refine
+from cadalign.solvers.search import Effort, Minima, search
 from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
-from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
+from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 MAX_MINIMA = 12
 _COARSE_POINTS = 48  # that many tell the minima apart; all points then refine them
@@ -31,7 +31,6 @@ _GRID_ROTATIONS = 96
 _GRID_REFINED = 20
 _PROBE_ITERATIONS = 6
 _MAX_ITERATIONS = 200
-_SAME_CHORD = 1e-3
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 
 
@@ -95,7 +94,10 @@ def optimal_kernel(
     if not unit > 0:
         return 0, 0, 0, 0
     local = with_points(objective, (points - center) / unit)
-    minima, iterations, hypotheses = _search(local, poses, costs)
+    counts = np.zeros(2, dtype=np.int64)
+    found = Minima(poses, costs, costs.copy(), np.zeros(MAX_MINIMA, dtype=np.int64), counts)
+    hypotheses = _search(local, found)
+    minima, iterations = int(counts[0]), int(counts[1])
     if minima == 0:
         return 0, iterations, hypotheses, -1
     for k in range(minima):
@@ -105,8 +107,8 @@ def optimal_kernel(
 
 
 @kernel
-def _search(objective: Objective, poses: FloatArray, costs: FloatArray) -> tuple[int, int, int]:
-    """Find the minima; returns how many, and the iterations and hypotheses it took.
+def _search(objective: Objective, minima: Minima) -> int:
+    """Find the minima; returns the number of starts.
 
     Where there are many points the search runs on some of them, and what it finds is refined on
     all.
@@ -115,41 +117,35 @@ def _search(objective: Objective, poses: FloatArray, costs: FloatArray) -> tuple
     keypoints = objective.keypoints
     is_solved = aepnp_kernel(keypoints.points, keypoints.rays, linear) == OK
     n = keypoints.points.shape[0]
-    few = n <= _COARSE_POINTS
-    coarse = objective
-    if not few:  # evenly spread over their order
-        chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS
-        coarse = with_keypoints(objective, take_keypoints(keypoints, chosen))
-    found, iterations, hypotheses = _search_from_all_starts(coarse, linear, is_solved, poses, costs)
-    if few:
-        return found, iterations, hypotheses
-    candidates = np.empty((found + 1, POSE_SIZE))
+    if n <= _COARSE_POINTS:
+        return _search_from_all_starts(objective, linear, is_solved, minima)
+    chosen = np.arange(_COARSE_POINTS) * n // _COARSE_POINTS  # evenly spread over their order
+    coarse = with_keypoints(objective, take_keypoints(keypoints, chosen))
+    hypotheses = _search_from_all_starts(coarse, linear, is_solved, minima)
+    found = minima.counts[0]
+    starts = np.empty((found + 1, POSE_SIZE))
     count = 0
     # A wrong sigma should not make every coarse minimum look unlikely.
-    variance = max(1.0, costs[0] / (2.0 * _COARSE_POINTS - UNKNOWNS)) if found > 0 else 1.0
-    while count < found and costs[count] - costs[0] < _UNLIKELY * variance:
-        copy_into(candidates[count], poses[count])
+    variance = max(1.0, minima.costs[0] / (2.0 * _COARSE_POINTS - UNKNOWNS)) if found else 1.0
+    while count < found and minima.costs[count] - minima.costs[0] < _UNLIKELY * variance:
+        copy_into(starts[count], minima.states[count])
         count += 1
-    copy_into(
-        candidates[count], linear
-    )  # with strong noise, some of the points may have no minimum
-    minima = 0
-    for k in range(count + 1):
-        if k < count or (minima == 0 and is_solved):
-            minima, used = _descend(objective, candidates[k], poses, costs, minima)
-            iterations += used
-    return minima, iterations, hypotheses
+    minima.counts[0] = 0
+    minima.costs[:] = np.inf
+    minima.scores[:] = np.inf
+    everything = Effort(MAX_MINIMA, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
+    search(objective, starts[:count], everything, 0, 0.0, minima)
+    if minima.counts[0] == 0 and is_solved:  # with strong noise, some may have no minimum
+        copy_into(starts[0], linear)
+        search(objective, starts[:1], everything, 0, 0.0, minima)
+    return hypotheses
 
 
 @kernel
 def _search_from_all_starts(
-    objective: Objective,
-    linear: FloatArray,
-    is_solved: bool,
-    poses: FloatArray,
-    costs: FloatArray,
-) -> tuple[int, int, int]:
-    """Refine the most promising of all starts; returns minima, iterations, hypotheses.
+    objective: Objective, linear: FloatArray, is_solved: bool, minima: Minima
+) -> int:
+    """Refine the most promising of all starts; returns their number.
 
     ``linear`` is the linear solver's pose, where it has one.
     """
@@ -166,17 +162,19 @@ def _search_from_all_starts(
         count += 1
     # Other starts serve coplanar points, and where the unstretched model is a better guess.
     needs_grid = free[6] == 0.0 or free[7] == 0.0 or objective.scale_prior.weight > 0.0
-    minima = 0
-    iterations = 0
     for attempt in range(2):
-        if minima > 0 or (attempt == 0 and needs_grid):
+        if minima.counts[0] > 0 or (attempt == 0 and needs_grid):
             continue
         if attempt == 1:
             count += rotation_starts(points, rays, starts[count : count + _GRID_ROTATIONS])
             refined = _GRID_REFINED
-        minima, used = _descend_best(objective, starts[:count], refined, poses, costs)
-        iterations += used
-    return minima, iterations, count
+        for k in range(count):
+            for j in range(2):
+                if free[6 + j] == 0.0:
+                    starts[k, 13 + j] = 1.0
+        effort = Effort(refined, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
+        search(objective, starts[:count], effort, 0, 0.0, minima)
+    return count
 
 
 @kernel
@@ -194,81 +192,3 @@ def _effort(points: int) -> tuple[int, int]:
     if points < 17:
         return 5, 6
     return 3, 3
-
-
-@kernel
-def _descend_best(
-    objective: Objective, starts: FloatArray, refined: int, poses: FloatArray, costs: FloatArray
-) -> tuple[int, int]:
-    """Refine the starts of the lowest cost; returns the number of minima and of iterations."""
-    count = starts.shape[0]
-    scores = np.empty(count)
-    for k in range(count):
-        for j in range(2):
-            if objective.free[6 + j] == 0.0:
-                starts[k, 13 + j] = 1.0
-        scores[k] = evaluate_cost(objective, starts[k])
-    minima = 0
-    iterations = 0
-    for _ in range(min(refined, count)):
-        best = 0
-        for k in range(1, count):
-            if scores[k] < scores[best]:
-                best = k
-        if not scores[best] < np.inf:
-            break
-        scores[best] = np.inf
-        minima, used = _descend(objective, starts[best].copy(), poses, costs, minima)
-        iterations += used
-    return minima, iterations
-
-
-@kernel
-def _descend(
-    objective: Objective, pose: FloatArray, poses: FloatArray, costs: FloatArray, minima: int
-) -> tuple[int, int]:
-    """Refine one start and insert its minimum, if it is new, by cost.
-
-    Returns the new number of minima and the iterations used.
-    """
-    iterations = 0
-    cost = np.inf
-    for stage in range(2):  # a few steps tell whether it goes where another start went
-        cost, used, converged = refine(
-            objective, _PROBE_ITERATIONS if stage == 0 else _MAX_ITERATIONS, pose
-        )
-        iterations += used
-        if not cost < np.inf or has_collapsed(pose):
-            return minima, iterations
-        if converged or _find(pose, poses, minima) >= 0:
-            break
-    found = _find(pose, poses, minima)
-    if found >= 0:
-        if cost < costs[found]:
-            costs[found] = cost
-            copy_into(poses[found], pose)
-        return minima, iterations
-    if minima == MAX_MINIMA and cost >= costs[minima - 1]:
-        return minima, iterations
-    row = minima if minima < MAX_MINIMA else minima - 1
-    while row > 0 and costs[row - 1] > cost:
-        costs[row] = costs[row - 1]
-        copy_into(poses[row], poses[row - 1])
-        row -= 1
-    costs[row] = cost
-    copy_into(poses[row], pose)
-    return min(minima + 1, MAX_MINIMA), iterations
-
-
-@kernel
-def _find(pose: FloatArray, poses: FloatArray, minima: int) -> int:
-    """The row of the minimum that a pose coincides with, or -1."""
-    for k in range(minima):
-        square = 0.0
-        for i in range(9):
-            square += (poses[k, i] - pose[i]) ** 2
-        for i in range(13, 15):
-            square += (np.log(poses[k, i] / pose[i])) ** 2
-        if square < _SAME_CHORD * _SAME_CHORD:
-            return k
-    return -1

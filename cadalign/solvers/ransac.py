@@ -15,6 +15,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
+from cadalign.solvers.alignment import Objective, with_keypoints
 from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
 from cadalign.solvers.evidence import (
     Keypoints,
@@ -24,7 +25,7 @@ from cadalign.solvers.evidence import (
     squared_error,
     take_keypoints,
 )
-from cadalign.solvers.focal import at_focal, refine_focal
+from cadalign.solvers.focal import FocalObjective, at_focal, refine_focal
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import (
@@ -32,7 +33,6 @@ from cadalign.solvers.minimal import (
     minimal_memory,
     solve_subset,
 )
-from cadalign.solvers.objective import Objective, with_keypoints
 from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.refine import refine
 from cadalign.solvers.sampling import (
@@ -49,7 +49,7 @@ _LEAST_SUPPORT = 0.03  # share of the points that a hypothesis is expected to fi
 _REJECTION = 200.0  # likelihood ratio at which a hypothesis is rejected
 _LOCAL_POINTS = 120
 _LOCAL_ITERATIONS = 6
-_LOCAL_FOCAL_STEPS = 8
+_LOCAL_FOCAL_ITERATIONS = 40
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
 
@@ -266,14 +266,9 @@ def _optimize_locally(
         if some.keypoints.points.shape[0] < least_points:
             break
         if settings.estimate_focal:
-            _, moved, _ = refine_focal(
-                some,
-                without_lens,
-                relative_to(focal_prior, log_ratio),
-                _LOCAL_FOCAL_STEPS,
-                pose,
-                0.0,
-            )
+            prior = relative_to(focal_prior, log_ratio)
+            system = FocalObjective(some, without_lens, prior)
+            _, moved, _ = refine_focal(system, _LOCAL_FOCAL_ITERATIONS, pose)
             log_ratio += moved
             here = at_focal(view, without_lens, log_ratio)
         else:

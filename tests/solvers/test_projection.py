@@ -13,7 +13,7 @@ from cadalign.fitting.prediction import projection_jacobian
 from cadalign.geometry.projection import perspective
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import BLOCK, Keypoints, ScalePrior
-from cadalign.solvers.objective import Objective, evaluate, evaluate_cost
+from cadalign.solvers.alignment import Objective, evaluate, evaluate_cost
 from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
 from cadalign.solvers.unknowns import move_pose
 

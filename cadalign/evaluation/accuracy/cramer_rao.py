@@ -16,7 +16,7 @@ from cadalign.geometry.projection import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.covariance import covariance_of, focal_covariance
-from cadalign.solvers.objective import keypoint_objective
+from cadalign.solvers.alignment import keypoint_objective
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0

@@ -27,8 +27,8 @@ from cadalign.solvers.constants import (
 )
 from cadalign.solvers.covariance import focal_covariance
 from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views, relative_to
-from cadalign.solvers.focal import linear_focal, refine_focal
-from cadalign.solvers.objective import Objective
+from cadalign.solvers.focal import FocalObjective, linear_focal, refine_focal
+from cadalign.solvers.alignment import Objective
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
 
@@ -42,7 +42,7 @@ _SAME_FOCAL = 0.01
 _LENS_ROUNDS = 12
 _LENS_TOLERANCE = 1e-10
 _STEPS = 1000
-_STEPS_OF_ALL_POINTS = 20  # from a minimum for some of them
+_STEPS_OF_ALL_POINTS = 100  # from a minimum for some of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,8 @@ def _descend(task: _Task, start: _Minimum, steps: int) -> tuple[_Minimum, int]:
             task.points_2d, task.camera.with_focal(focal), objective.keypoints.rays
         )
         here = relative_to(prior, math.log(focal))
-        cost, moved, used = refine_focal(objective, slopes, here, steps, pose, 0.0)
+        system = FocalObjective(objective, slopes, here)
+        cost, moved, used = refine_focal(system, steps, pose)
         iterations += used
         focal *= float(np.exp(moved))
         if abs(moved) < _LENS_TOLERANCE:  # slopes are valid near the focal length of their rays
@@ -283,6 +284,7 @@ def _covariance(task: _Task, minimum: _Minimum) -> tuple[int, FloatArray]:
     camera = task.camera.with_focal(minimum.focal)
     slopes = focal_slopes(task.points_2d, camera, objective.keypoints.rays)
     covariance = np.zeros((UNKNOWNS + 1, UNKNOWNS + 1))
-    weight = task.prior.weight
-    undetermined = focal_covariance(objective, slopes, weight, minimum.pose, covariance)
+    here = relative_to(task.prior, math.log(minimum.focal))
+    system = FocalObjective(objective, slopes, here)
+    undetermined = focal_covariance(system, minimum.pose, covariance)
     return int(undetermined), covariance

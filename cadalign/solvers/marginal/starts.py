@@ -12,7 +12,7 @@ from cadalign.solvers.evidence import Keypoints, ScalePrior
 from cadalign.solvers.joint.factor import factorize, solve_factor
 from cadalign.solvers.linalg import eigenvectors_4
 from cadalign.solvers.marginal.problem import Seen, Target
-from cadalign.solvers.objective import Objective, evaluate_cost
+from cadalign.solvers.alignment import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import rotation_starts
 from cadalign.solvers.unknowns import orthonormalize, uncenter

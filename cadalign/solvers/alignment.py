@@ -1,0 +1,217 @@
+"""The system of pose and stretch: 8 unknowns, from the keypoints of one view.
+
+To add evidence, write a block as in `cadalign.solvers.evidence`, give `Objective` a field for it,
+and add its terms in `add_evidence` and `evaluate_cost`; everything else sums them through these.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.constants import LINEAR, UNKNOWNS
+from cadalign.solvers.evidence import (
+    BLOCK,
+    Keypoints,
+    ScalePrior,
+    add_keypoints,
+    add_scale_prior,
+    keypoint_cost,
+    scale_prior_cost,
+)
+from cadalign.solvers.linalg import cholesky, solve_cholesky
+from cadalign.solvers.system import (
+    accept,
+    are_same,
+    cost_at,
+    evaluate,
+    is_estimate,
+    move,
+    room_of,
+    score_of,
+    solve,
+)
+from cadalign.solvers.unknowns import has_collapsed, hold_fixed, move_pose
+
+_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
+_SAME_CHORD = 1e-3
+
+
+class Objective(NamedTuple):
+    """Evidence of one problem; ``free`` (8,) is 0 for an unknown that keeps its value, else 1."""
+
+    free: FloatArray
+    keypoints: Keypoints
+    scale_prior: ScalePrior
+
+
+class Equations(NamedTuple):
+    """Normal equations of U unknowns: ``hessian`` (U, U), ``gradient`` (U,), and scratch space.
+
+    Those that were evaluated last are ``new_hessian`` and ``new_gradient``.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    new_hessian: FloatArray
+    new_gradient: FloatArray
+    rows: FloatArray
+    factor: FloatArray
+
+
+@inlined
+def room_for(unknowns: int) -> Equations:
+    """Room for the equations of so many unknowns."""
+    return Equations(
+        np.empty((unknowns, unknowns)),
+        np.empty(unknowns),
+        np.empty((unknowns, unknowns)),
+        np.empty(unknowns),
+        np.empty((UNKNOWNS + 1, 2 * BLOCK)),
+        np.empty((unknowns, unknowns)),
+    )
+
+
+def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> Objective:
+    """The plain objective: keypoints with squared errors, all unknowns free, no prior."""
+    points = np.require(points, np.float64, ["C", "W"])
+    keypoints = Keypoints(points, rays, whitening, LINEAR, 1.0)
+    return Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0))
+
+
+@room_of.of(Objective)
+@inlined
+def _room_of(objective: Objective) -> Equations:
+    return room_for(UNKNOWNS)
+
+
+@evaluate.of(Objective)
+@kernel
+def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
+    """Build the Gauss-Newton system at a pose (15,); unit rows for unknowns that are not free."""
+    hessian, gradient = equations.new_hessian, equations.new_gradient
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    cost = add_keypoints(objective.keypoints, pose, equations.rows, hessian, gradient)
+    if not cost < np.inf:
+        return np.inf
+    cost += add_scale_prior(objective.scale_prior, pose, hessian, gradient)
+    for k in range(UNKNOWNS):
+        for m in range(k):
+            hessian[k, m] = hessian[m, k]
+    hold_fixed(objective.free, UNKNOWNS, hessian, gradient)
+    return cost
+
+
+@cost_at.of(Objective)
+@kernel
+def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
+    """The cost of a pose, without derivatives."""
+    cost = keypoint_cost(objective.keypoints, pose)
+    return cost + scale_prior_cost(objective.scale_prior, pose)
+
+
+@solve.of(Objective)
+@inlined
+def _solve(
+    objective: Objective, equations: Equations, damping: float, step: FloatArray
+) -> float:
+    return solve_damped(equations, UNKNOWNS, damping, step)
+
+
+@inlined
+def solve_damped(equations: Equations, unknowns: int, damping: float, step: FloatArray) -> float:
+    """Write the damped step; returns the decrease that it predicts, NaN for no solution."""
+    hessian, gradient, factor = equations.hessian, equations.gradient, equations.factor
+    least = least_information(hessian, unknowns)
+    for k in range(unknowns):
+        step[k] = -gradient[k]
+        for m in range(k + 1):
+            factor[k, m] = hessian[k, m]
+        factor[k, k] += damping * hessian[k, k] + least
+    if not cholesky(factor, unknowns, 0.0):
+        return np.nan
+    solve_cholesky(factor, unknowns, step)
+    expected = 0.0
+    for k in range(unknowns):
+        expected -= gradient[k] * step[k]
+    return expected
+
+
+@inlined
+def least_information(hessian: FloatArray, unknowns: int) -> float:
+    """Addition to the diagonal that holds unknowns without evidence where they are."""
+    least = 1e-300
+    for k in range(unknowns):
+        least = max(least, _LEAST_INFORMATION * hessian[k, k])
+    return least
+
+
+@move.of(Objective)
+@inlined
+def _move(
+    objective: Objective,
+    pose: FloatArray,
+    equations: Equations,
+    damping: float,
+    step: FloatArray,
+    moved: FloatArray,
+) -> None:
+    move_pose(pose, step, moved)
+
+
+@accept.of(Objective)
+@inlined
+def _accept(objective: Objective, pose: FloatArray, equations: Equations) -> None:
+    accept_new(equations, UNKNOWNS)
+
+
+@inlined
+def accept_new(equations: Equations, unknowns: int) -> None:
+    """Make the new equations the current ones."""
+    for k in range(unknowns):
+        equations.gradient[k] = equations.new_gradient[k]
+        for m in range(unknowns):
+            equations.hessian[k, m] = equations.new_hessian[k, m]
+
+
+@score_of.of(Objective)
+@inlined
+def _score_of(objective: Objective, pose: FloatArray, cost: float) -> float:
+    return cost
+
+
+@are_same.of(Objective)
+@kernel
+def are_same_poses(objective: Objective, first: FloatArray, second: FloatArray) -> bool:
+    """True if rotations and scales of two poses coincide."""
+    square = 0.0
+    for i in range(9):
+        square += (first[i] - second[i]) ** 2
+    for i in range(13, 15):
+        square += (np.log(first[i] / second[i])) ** 2
+    return square < _SAME_CHORD * _SAME_CHORD
+
+
+@is_estimate.of(Objective)
+@inlined
+def _is_estimate(objective: Objective, pose: FloatArray) -> bool:
+    return not has_collapsed(pose)
+
+
+@kernel
+def with_keypoints(objective: Objective, keypoints: Keypoints) -> Objective:
+    """The same objective for other keypoints."""
+    return Objective(objective.free, keypoints, objective.scale_prior)
+
+
+@kernel
+def with_points(objective: Objective, points: FloatArray) -> Objective:
+    """The same objective for other model points."""
+    old = objective.keypoints
+    return with_keypoints(
+        objective, Keypoints(points, old.rays, old.whitening, old.loss, old.loss_scale)
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import fast_sums, inlined, kernel
 
 
 @kernel
@@ -43,6 +43,58 @@ def solve_cholesky(factor: FloatArray, size: int, right: FloatArray) -> None:
         for k in range(i + 1, size):
             total -= factor[k, i] * right[k]
         right[i] = total / factor[i, i]
+
+
+@fast_sums
+def factorize(matrix: FloatArray) -> bool:
+    """Replace the lower triangle of a large symmetric matrix by its Cholesky factor.
+
+    Sums run on vector units. Returns False where it is not positive definite.
+    """
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            total = 0.0
+            for k in range(j):
+                total += matrix[i, k] * matrix[j, k]
+            matrix[i, j] = (matrix[i, j] - total) / matrix[j, j]
+        total = 0.0
+        for k in range(i):
+            total += matrix[i, k] * matrix[i, k]
+        square = matrix[i, i] - total
+        if not square > 0.0:
+            return False
+        matrix[i, i] = np.sqrt(square)
+    return True
+
+
+@fast_sums
+def solve_factor(factor: FloatArray, right: FloatArray) -> None:
+    """Solve in place, with the factor that `factorize` left."""
+    size = factor.shape[0]
+    for i in range(size):
+        total = 0.0
+        for k in range(i):
+            total += factor[i, k] * right[k]
+        right[i] = (right[i] - total) / factor[i, i]
+    for i in range(size - 1, -1, -1):
+        right[i] /= factor[i, i]
+        for k in range(i):
+            right[k] -= factor[i, k] * right[i]
+
+
+@fast_sums
+def invert_factor(factor: FloatArray) -> FloatArray:
+    """The inverse of the lower triangle that `factorize` left."""
+    size = factor.shape[0]
+    inverse = np.zeros((size, size))
+    for i in range(size):
+        scale = 1.0 / factor[i, i]
+        for k in range(i):
+            product = factor[i, k] * scale
+            for m in range(k + 1):
+                inverse[i, m] -= product * inverse[k, m]
+        inverse[i, i] = scale
+    return inverse
 
 
 @inlined

@@ -31,9 +31,9 @@ def pack_pose(
         pose[12 + i] = scale[i]
 
 
-@kernel
-def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
-    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
+@inlined
+def move_rigid(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
+    """Write the rotation and translation that a step of their 6 unknowns leads to."""
     angle2 = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
     angle = np.sqrt(angle2)
     if angle > 1e-4:
@@ -52,6 +52,12 @@ def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
         moved[6 + c] = r + a * (x * q - y * p) + b * (z * dot - r * angle2)
     for c in range(3):
         moved[9 + c] = pose[9 + c] + step[3 + c]
+
+
+@kernel
+def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
+    """Write the pose that a step of the 8 unknowns leads to into ``moved``."""
+    move_rigid(pose, step, moved)
     moved[12] = pose[12]
     for k in range(2):
         log_step = min(max(step[6 + k], -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)

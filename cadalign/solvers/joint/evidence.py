@@ -1,13 +1,14 @@
-"""Joint estimation of poses, log scales and shape from everything that is known about an object.
+"""Joint estimation of poses, log scales, focal lengths and shape from everything that is known.
 
-A point of the object is ``x_i = diag(exp(log_scales)) @ (mean_i + sum_k c_k modes_ki) + d_i``, in
-the model's frame. The coefficients c have a standard normal prior; a displacement d_i has the
-standard deviation ``spread_i`` and is eliminated from the normal equations. A sighting of a point
-is its ray in one view, its depth there, or both; a contour point is one whose ray counts along the
-contour's normal only. Views share one pose through known ``cam_from_rig``, or have one each.
+A point of the object is ``x_i = diag(exp(log_scales)) @ (mean_i + sum_k c_k modes_ki + d_i)``, in
+the model's frame. The coefficients c have a standard normal prior, a displacement d_i has the
+standard deviation ``spread_i``. A sighting of a point is its ray in one view, its depth there, or
+both; a contour point is one whose ray counts along the contour's normal only. Views share one pose
+through known ``cam_from_rig``, or have one each; views of one camera share its focal length.
 
 The unknowns stand in this order: six for every pose (a rotation vector applied in the rig's frame,
-the translation), three log scales, the coefficients.
+the translation), then the border that all views share: log focal lengths, three log scales, the
+coefficients. Displacements are eliminated.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import inlined, kernel
 
 
 class Shape(NamedTuple):
@@ -34,7 +35,8 @@ class Sightings(NamedTuple):
     ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
     ``whitening`` (N, 3) as in `cadalign.solvers.evidence.Keypoints`; ``depths`` (N, 2) holds depths
     and their inverse standard deviations, 0 where there is none. ``loss`` (N,) and ``loss_scale``
-    (N,) say how the length of each residual counts. They are sorted by point.
+    (N,) say how the length of each residual counts. ``slopes`` (N, 2) are the changes of undistorted
+    pixels, over the focal length, by its logarithm.
     """
 
     point: IntArray
@@ -44,6 +46,7 @@ class Sightings(NamedTuple):
     depths: FloatArray
     loss: IntArray
     loss_scale: FloatArray
+    slopes: FloatArray
 
 
 class Rig(NamedTuple):
@@ -51,6 +54,21 @@ class Rig(NamedTuple):
 
     cam_from_rig: FloatArray
     pose: IntArray
+
+
+class Focals(NamedTuple):
+    """Focal lengths to estimate, F of them, relative to those of the rays.
+
+    ``group`` (V,) numbers the one of each view, -1 where it is known. The logarithms are bounded by
+    ``low`` and ``high`` (F,) and have a Gaussian prior of mean ``center`` (F,) and inverse variance
+    ``weight`` (F,), 0 for none.
+    """
+
+    group: IntArray
+    low: FloatArray
+    high: FloatArray
+    center: FloatArray
+    weight: FloatArray
 
 
 class Directions(NamedTuple):
@@ -117,6 +135,7 @@ class Evidence(NamedTuple):
     shape: Shape
     sightings: Sightings
     rig: Rig
+    focals: Focals
     directions: Directions
     lengths: Lengths
     heights: Heights
@@ -125,12 +144,49 @@ class Evidence(NamedTuple):
 
 
 class State(NamedTuple):
-    """Poses (P, 12), log scales (3,), coefficients (K,) and displacements (m, 3)."""
+    """Poses (P, 12), log focals (F,), log scales (3,), coefficients (K,), displacements (m, 3)."""
 
     poses: FloatArray
+    log_focals: FloatArray
     log_scales: FloatArray
     coefficients: FloatArray
     displacements: FloatArray
+
+
+@kernel
+def state_size(evidence: Evidence) -> int:
+    """Numbers of a state as a row."""
+    modes, points = evidence.shape.modes.shape[0], evidence.shape.mean.shape[0]
+    poses = count_poses(evidence)
+    return 12 * poses + evidence.focals.low.shape[0] + 3 + modes + 3 * points
+
+
+@inlined
+def unpacked(evidence: Evidence, row: FloatArray) -> State:
+    """The parts of a state that is a row of numbers; they share its memory."""
+    modes, points = evidence.shape.modes.shape[0], evidence.shape.mean.shape[0]
+    focals = evidence.focals.low.shape[0]
+    a = row.shape[0] - 3 * points
+    b = a - modes
+    c = b - 3
+    d = c - focals
+    return State(
+        row[:d].reshape((d // 12, 12)), row[d:c], row[c:b], row[b:a], row[a:].reshape((points, 3))
+    )
+
+
+@kernel
+def packed(state: State) -> FloatArray:
+    """The state as a row of numbers."""
+    return np.concatenate(
+        (
+            state.poses.ravel(),
+            state.log_focals,
+            state.log_scales,
+            state.coefficients,
+            state.displacements.ravel(),
+        )
+    )
 
 
 @kernel
@@ -139,11 +195,17 @@ def points_of(shape: Shape, state: State) -> FloatArray:
     points = np.empty_like(shape.mean)
     for i in range(points.shape[0]):
         for a in range(3):
-            value = shape.mean[i, a]
-            for k in range(shape.modes.shape[0]):
-                value += state.coefficients[k] * shape.modes[k, i, a]
-            points[i, a] = np.exp(state.log_scales[a]) * value + state.displacements[i, a]
+            points[i, a] = np.exp(state.log_scales[a]) * unstretched(shape, state, i, a)
     return points
+
+
+@inlined
+def unstretched(shape: Shape, state: State, i: int, a: int) -> float:
+    """Coordinate a of point i before the stretch."""
+    value = shape.mean[i, a] + state.displacements[i, a]
+    for k in range(shape.modes.shape[0]):
+        value += state.coefficients[k] * shape.modes[k, i, a]
+    return value
 
 
 @kernel
@@ -151,6 +213,7 @@ def copy_state(state: State) -> State:
     """A copy that shares nothing."""
     return State(
         state.poses.copy(),
+        state.log_focals.copy(),
         state.log_scales.copy(),
         state.coefficients.copy(),
         state.displacements.copy(),
@@ -158,9 +221,25 @@ def copy_state(state: State) -> State:
 
 
 @kernel
-def count_unknowns(evidence: Evidence, modes: int) -> int:
-    """Number of unknowns, without the displacements."""
+def count_poses(evidence: Evidence) -> int:
+    """Number of poses."""
     poses = 0
     for v in range(evidence.rig.pose.shape[0]):
         poses = max(poses, evidence.rig.pose[v] + 1)
-    return 6 * poses + 3 + modes
+    return poses
+
+
+@kernel
+def with_shape(evidence: Evidence, shape: Shape) -> Evidence:
+    """The same evidence about another shape."""
+    return Evidence(
+        shape,
+        evidence.sightings,
+        evidence.rig,
+        evidence.focals,
+        evidence.directions,
+        evidence.lengths,
+        evidence.heights,
+        evidence.planes,
+        evidence.scales,
+    )

@@ -3,63 +3,136 @@
 Modes move the s points that the evidence names in at most 3 s directions. In an orthonormal basis
 of these, coefficients ``c = basis @ reduced`` plus a rest that moves no such point: the rest keeps
 its standard normal prior, and the reduced coefficients have one, too. Estimates, costs and
-determinants are those of all modes.
+determinants are those of all modes. Of several poses, the displacements of sighted points are modes
+as well, three for each, before the basis is chosen.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
-from cadalign.solvers.joint.evidence import Evidence, Shape
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, count_poses, with_shape
 
 _LEAST_SQUARE = 1e-14  # of a direction's rest, over the largest
 _LOST = 0.01  # of a direction's square: less asks for a second pass
 
 
+class Reduction(NamedTuple):
+    """Evidence with reduced modes, and their ``basis`` (K + 3 u, r) in the evidence's own.
+
+    Rows K + 3 j + a belong to the displacement along axis a of point ``displaced[j]`` (u,).
+    """
+
+    evidence: Evidence
+    basis: FloatArray
+    displaced: IntArray
+
+
 @kernel
-def reduce_modes(evidence: Evidence) -> tuple[Evidence, FloatArray]:
-    """The evidence with modes in the directions that it tells apart, and their basis (K, r)."""
+def reduce_modes(evidence: Evidence) -> Reduction:
+    """The evidence with modes in the directions that it tells apart."""
     shape = evidence.shape
     modes, points = shape.modes.shape[0], shape.modes.shape[1]
     used = used_points(evidence)
-    if 3 * used.sum() >= modes:
-        return evidence, np.eye(modes)
-    directions = np.empty((3 * used.sum(), modes))
+    displaced = np.empty(0, dtype=np.int64)
+    if count_poses(evidence) > 1:
+        displaced = np.flatnonzero(_sighted_points(evidence) & (shape.spread > 0.0))
+    extra = 3 * displaced.shape[0]
+    if 3 * used.sum() >= modes + extra and not extra:
+        return Reduction(evidence, np.eye(modes), displaced)
+    whole = np.zeros((modes + extra, points, 3))
+    whole[:modes] = shape.modes
+    spread = shape.spread.copy()
+    for j in range(displaced.shape[0]):
+        for a in range(3):
+            whole[modes + 3 * j + a, displaced[j], a] = shape.spread[displaced[j]]
+        spread[displaced[j]] = 0.0
+    if 3 * used.sum() >= modes + extra:
+        return Reduction(
+            with_shape(evidence, Shape(shape.mean, whole, spread)), np.eye(modes + extra), displaced
+        )
+    directions = np.empty((3 * used.sum(), modes + extra))
     row = 0
     for i in range(points):
         if used[i]:
             for a in range(3):
-                for k in range(modes):
-                    directions[row, k] = shape.modes[k, i, a]
+                for k in range(modes + extra):
+                    directions[row, k] = whole[k, i, a]
                 row += 1
     basis = directions[: _orthonormalize(directions)]
-    flat = np.ascontiguousarray(shape.modes).reshape((modes, 3 * points))
+    flat = whole.reshape((modes + extra, 3 * points))
     reduced = (basis @ flat).reshape((basis.shape[0], points, 3))
-    return Evidence(
-        Shape(shape.mean, reduced, shape.spread),
-        evidence.sightings,
-        evidence.rig,
-        evidence.directions,
-        evidence.lengths,
-        evidence.heights,
-        evidence.planes,
-        evidence.scales,
-    ), np.ascontiguousarray(basis.T)
+    return Reduction(
+        with_shape(evidence, Shape(shape.mean, reduced, spread)),
+        np.ascontiguousarray(basis.T),
+        displaced,
+    )
+
+
+@kernel
+def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:
+    """A state in reduced coefficients; ``whole`` is the shape that was reduced."""
+    modes = state.coefficients.shape[0]
+    given = np.zeros(reduction.basis.shape[0])
+    given[:modes] = state.coefficients
+    displacements = state.displacements.copy()
+    for j in range(reduction.displaced.shape[0]):
+        i = reduction.displaced[j]
+        for a in range(3):
+            given[modes + 3 * j + a] = state.displacements[i, a] / whole.spread[i]
+            displacements[i, a] = 0.0
+    return State(
+        state.poses.copy(),
+        state.log_focals.copy(),
+        state.log_scales.copy(),
+        given @ reduction.basis,
+        displacements,
+    )
+
+
+@kernel
+def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
+    """The state in the coefficients and displacements of the shape that was reduced."""
+    modes = whole.modes.shape[0]
+    given = reduction.basis @ state.coefficients
+    displacements = state.displacements.copy()
+    for j in range(reduction.displaced.shape[0]):
+        i = reduction.displaced[j]
+        for a in range(3):
+            displacements[i, a] = given[modes + 3 * j + a] * whole.spread[i]
+    return State(
+        state.poses.copy(),
+        state.log_focals.copy(),
+        state.log_scales.copy(),
+        given[:modes].copy(),
+        displacements,
+    )
 
 
 @kernel
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
-    used = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
+    used = _sighted_points(evidence)
     lengths = evidence.lengths.points
-    for named in (evidence.sightings.point, evidence.heights.point, evidence.planes.point):
+    for named in (evidence.heights.point, evidence.planes.point):
         for i in named:
             used[i] = True
     for j in range(lengths.shape[0]):
         used[lengths[j, 0]] = used[lengths[j, 1]] = True
     return used
+
+
+@kernel
+def _sighted_points(evidence: Evidence) -> BoolArray:
+    """True for the points (m,) that are sighted."""
+    sighted = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
+    for i in evidence.sightings.point:
+        sighted[i] = True
+    return sighted
 
 
 @fast_sums

@@ -1,0 +1,217 @@
+"""Blocks of evidence beside sightings: priors, directions, lengths, heights and planes.
+
+Each adds equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by the
+pose, the log focals, the log scales and the coefficients, and a residual. Displacements don't count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.evidence import loss_and_root
+from cadalign.solvers.joint.arrow import Arrow, add_row
+from cadalign.solvers.joint.evidence import Evidence, State
+
+
+@kernel
+def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add all evidence but sightings; returns its cost."""
+    cost = _add_priors(evidence, state, arrow)
+    cost += _add_directions(evidence, state, arrow)
+    cost += _add_lengths(evidence, state, arrow)
+    cost += _add_heights(evidence, state, arrow)
+    cost += _add_planes(evidence, state, arrow)
+    return cost
+
+
+@inlined
+def first_scale(evidence: Evidence) -> int:
+    """Place of the log scales in the border."""
+    return evidence.focals.low.shape[0]
+
+
+@kernel
+def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add the priors on focal lengths, log scales and coefficients."""
+    border, gradient = arrow.border, arrow.gradient[6 * arrow.blocks.shape[0] :]
+    focals = evidence.focals
+    first = first_scale(evidence)
+    cost = 0.0
+    for f in range(first):
+        value = state.log_focals[f] - focals.center[f]
+        cost += focals.weight[f] * value * value
+        gradient[f] += focals.weight[f] * value
+        border[f, f] += focals.weight[f]
+    for a in range(3):
+        for b in range(3):
+            weight = evidence.scales.precision[a, b]
+            cost += weight * state.log_scales[a] * state.log_scales[b]
+            gradient[first + a] += weight * state.log_scales[b]
+            border[first + a, first + b] += weight
+    for k in range(state.coefficients.shape[0]):
+        value = state.coefficients[k]
+        cost += value * value
+        gradient[first + 3 + k] += value
+        border[first + 3 + k, first + 3 + k] += 1.0
+    return cost
+
+
+@kernel
+def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add directions known in a camera, such as gravity.
+
+    The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
+    """
+    directions, rig = evidence.directions, evidence.rig
+    cost = 0.0
+    row, seen, by_rig = np.zeros(6 + arrow.border.shape[0]), np.empty(3), np.empty(3)
+    for d in range(directions.image.shape[0]):
+        v = directions.image[d]
+        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        rotated = np.zeros(3)
+        for r in range(3):
+            for a in range(3):
+                rotated[r] += pose[3 * r + a] * directions.model[d, a]
+        for c in range(3):
+            seen[c] = -directions.camera[d, c]
+            for r in range(3):
+                seen[c] += camera[3 * c + r] * rotated[r]
+        for w in range(3):
+            whitening = directions.whitening[d, w]
+            value = whitening[0] * seen[0] + whitening[1] * seen[1] + whitening[2] * seen[2]
+            cost += value * value
+            for r in range(3):
+                by_rig[r] = (
+                    whitening[0] * camera[r]
+                    + whitening[1] * camera[3 + r]
+                    + whitening[2] * camera[6 + r]
+                )
+            _write_turn(rotated, by_rig, row)
+            add_row(arrow, rig.pose[v], row, value)
+    return cost
+
+
+@kernel
+def _add_lengths(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add known lengths along the model's axes."""
+    lengths, shape = evidence.lengths, evidence.shape
+    row = np.empty(6 + arrow.border.shape[0])
+    cost = 0.0
+    for j in range(lengths.axis.shape[0]):
+        low, high, a = lengths.points[j, 0], lengths.points[j, 1], lengths.axis[j]
+        extent = np.exp(state.log_scales[a]) * (
+            _undisplaced(evidence, state, high, a) - _undisplaced(evidence, state, low, a)
+        )
+        weight = lengths.weight[j]
+        value = (extent - lengths.value[j]) * weight
+        cost += value * value
+        row[:] = 0.0
+        _add_shape(evidence, state, high, a, weight, row)
+        _add_shape(evidence, state, low, a, -weight, row)
+        add_row(arrow, 0, row, value)
+    return cost
+
+
+@kernel
+def _add_heights(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add heights of cameras above the plane through a point, across a direction of the model.
+
+    The height is ``-direction . (x + R' q)`` with the stretched point x and the camera's place
+    ``-q`` in the rig's frame, which the pose (R, t) leads to.
+    """
+    heights, rig = evidence.heights, evidence.rig
+    row = np.empty(6 + arrow.border.shape[0])
+    up, q = np.empty(3), np.empty(3)
+    cost = 0.0
+    for j in range(heights.point.shape[0]):
+        v, i = heights.image[j], heights.point[j]
+        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        weight = heights.weight[j]
+        value = heights.value[j]
+        row[:] = 0.0
+        for r in range(3):
+            up[r] = 0.0
+            q[r] = pose[9 + r]
+            for a in range(3):
+                up[r] += pose[3 * r + a] * heights.direction[j, a]
+                q[r] += camera[3 * a + r] * camera[9 + a]
+            stretched = np.exp(state.log_scales[r]) * _undisplaced(evidence, state, i, r)
+            value += up[r] * q[r] + heights.direction[j, r] * stretched
+            row[3 + r] = weight * up[r]
+            _add_shape(evidence, state, i, r, weight * heights.direction[j, r], row)
+        value *= weight
+        cost += value * value
+        row[0] = weight * (up[1] * q[2] - up[2] * q[1])
+        row[1] = weight * (up[2] * q[0] - up[0] * q[2])
+        row[2] = weight * (up[0] * q[1] - up[1] * q[0])
+        add_row(arrow, rig.pose[v], row, value)
+    return cost
+
+
+@kernel
+def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add points that lie in planes known in a camera.
+
+    The residual is ``normal . X - offset`` of the point X in the camera's frame.
+    """
+    planes, rig = evidence.planes, evidence.rig
+    row = np.empty(6 + arrow.border.shape[0])
+    rotated, normal, stretched = np.empty(3), np.empty(3), np.empty(3)
+    cost = 0.0
+    for j in range(planes.point.shape[0]):
+        v, i = planes.image[j], planes.point[j]
+        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        for a in range(3):
+            stretched[a] = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+        value = -planes.offset[j]
+        for r in range(3):
+            normal[r] = rotated[r] = 0.0
+            for c in range(3):
+                normal[r] += planes.normal[j, c] * camera[3 * c + r]
+                rotated[r] += pose[3 * r + c] * stretched[c]
+            value += planes.normal[j, r] * camera[9 + r] + normal[r] * (rotated[r] + pose[9 + r])
+        value *= planes.weight[j]
+        part, root = loss_and_root(planes.loss[j], planes.loss_scale[j], value * value)
+        cost += part
+        weight = root * planes.weight[j]
+        for r in range(3):
+            normal[r] *= weight
+        row[:] = 0.0
+        _write_turn(rotated, normal, row)
+        for a in range(3):
+            row[3 + a] = normal[a]
+            slope = normal[0] * pose[a] + normal[1] * pose[3 + a] + normal[2] * pose[6 + a]
+            _add_shape(evidence, state, i, a, slope, row)
+        add_row(arrow, rig.pose[v], row, root * value)
+    return cost
+
+
+@inlined
+def _write_turn(rotated: FloatArray, slope: FloatArray, row: FloatArray) -> None:
+    """Write the derivatives by the rotation of ``slope . rotated``."""
+    row[0] = rotated[1] * slope[2] - rotated[2] * slope[1]
+    row[1] = rotated[2] * slope[0] - rotated[0] * slope[2]
+    row[2] = rotated[0] * slope[1] - rotated[1] * slope[0]
+
+
+@inlined
+def _undisplaced(evidence: Evidence, state: State, i: int, a: int) -> float:
+    """Coordinate a of point i, neither stretched nor displaced."""
+    value = evidence.shape.mean[i, a]
+    for k in range(evidence.shape.modes.shape[0]):
+        value += state.coefficients[k] * evidence.shape.modes[k, i, a]
+    return value
+
+
+@inlined
+def _add_shape(
+    evidence: Evidence, state: State, i: int, a: int, slope: float, row: FloatArray
+) -> None:
+    """Add the derivatives by scale and modes of ``slope`` times coordinate a of point i."""
+    first = 6 + first_scale(evidence)
+    scale = slope * np.exp(state.log_scales[a])
+    row[first + a] += scale * _undisplaced(evidence, state, i, a)
+    for k in range(evidence.shape.modes.shape[0]):
+        row[first + 3 + k] += scale * evidence.shape.modes[k, i, a]

@@ -35,7 +35,7 @@ fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with ra
 
 bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored
 	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
-	$(BIN)/python -m pytest tests/fitting/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
+	$(BIN)/python -m pytest tests/estimation/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
 	$(BIN)/python scripts/benchmark_cold.py --json bench/cold.ratios.json
 	$(BIN)/python scripts/benchmark_calls.py --json bench/calls.ratios.json
 	$(BIN)/python scripts/benchmark_focal.py

@@ -7,20 +7,19 @@ from cadalign.lazy import lazy_names
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
     from cadalign.errors import CadalignError
+    from cadalign.estimation.align import align, align_batch
+    from cadalign.estimation.align_result import AlignResult
+    from cadalign.estimation.batch import BatchResult
+    from cadalign.estimation.fit import fit, fit_batch
+    from cadalign.estimation.focal import FocalPrior
+    from cadalign.estimation.frames import to_dataframe
+    from cadalign.estimation.model import Model, Size
+    from cadalign.estimation.observed import views_from
+    from cadalign.estimation.options import RansacOptions
+    from cadalign.estimation.result import FitResult
+    from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
+    from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
-    from cadalign.fitting.batch import BatchResult
-    from cadalign.fitting.fit import fit, fit_batch
-    from cadalign.fitting.focal.prior import FocalPrior
-    from cadalign.fitting.frames import to_dataframe
-    from cadalign.fitting.joint.align import align, align_batch
-    from cadalign.fitting.joint.model import Model
-    from cadalign.fitting.joint.reconstruction import views_from
-    from cadalign.fitting.joint.result import AlignResult
-    from cadalign.fitting.joint.size import Size
-    from cadalign.fitting.joint.summary import Contribution, EvidenceSummary
-    from cadalign.fitting.joint.view import View
-    from cadalign.fitting.options import RansacOptions
-    from cadalign.fitting.result import FitResult
     from cadalign.geometry.alignment import Alignment
     from cadalign.geometry.box import Box
     from cadalign.geometry.camera import Camera

@@ -18,7 +18,7 @@ from common import Picture, write_row
 from cadalign.annotate.model import CadModel
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
-from cadalign.fitting.fit import fit
+from cadalign.estimation.fit import fit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

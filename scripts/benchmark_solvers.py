@@ -21,10 +21,10 @@ from rich.console import Console
 import cadalign
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
+from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.outcome import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
-from cadalign.fitting.noise import whitening_of
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective

@@ -18,8 +18,8 @@ from rich.console import Console
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError
+from cadalign.estimation.fit import fit
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.fitting.fit import fit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou, rotation_error

@@ -11,14 +11,14 @@ WIDTH, ROW, TOP = 1080, 34, 56
 # Layers by kind, and the kind's colour.
 KINDS = {
     "#e8e8ec": "errors lazy arrays notebook seeding compile",
-    "#d9e8f7": "geometry metrics io solvers shapes export fitting",
+    "#d9e8f7": "geometry metrics io solvers shapes export estimation fitting",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation report annotate health cli scripts",
 }
 # The layers that a journey passes, in order, and what happens there.
-FIT = "cli options, io observation, fitting checks, solvers search, render overlay"
+FIT = "cli options, io observation, estimation checks, solvers search, render overlay"
 INSTANCE = (
-    "cli options, evaluation task, datasets model, render visible keypoints, fitting fit, "
+    "cli options, evaluation task, datasets model, render visible keypoints, estimation fit, "
     "solvers search, geometry errors, report page"
 )
 

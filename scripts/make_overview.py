@@ -11,8 +11,8 @@ import tyro
 from common import Picture, write_row
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.estimation.fit import fit
 from cadalign.evaluation.instances.instance import load_scene, make_instance
-from cadalign.fitting.fit import fit
 from cadalign.geometry.box import Box
 from cadalign.render import RaycastRenderer, draw_overlay
 

@@ -34,7 +34,7 @@ def test_examples_are_looked_for_in_every_package() -> None:
     assert {
         "cadalign.geometry.alignment",
         "cadalign.geometry.camera",
-        "cadalign.fitting.fit",
+        "cadalign.estimation.fit",
     } <= set(MODULES)
 
 

@@ -10,11 +10,11 @@ from cadalign.annotate.model import CadModel
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
+from cadalign.estimation.model import Model
+from cadalign.estimation.result import FitResult
+from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import Problem
-from cadalign.fitting.joint.advice import Advice, rank_evidence
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.view import View
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.render.raycast.renderer import cast_geometry

@@ -13,10 +13,10 @@ from cadalign.annotate.document import FocalChoice, Priors
 from cadalign.annotate.photos import Intrinsics
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.fitting.fit import fit
-from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.outliers import Rows, find_outliers
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.fit import fit
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.result import FitResult
+from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
 from cadalign.geometry.camera import Camera
 
 LEAST_PAIRS = 4
@@ -238,7 +238,7 @@ class _Fitter:
         return self._fit(np.arange(len(self.points_3d)), sigma, "linear")
 
     def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
-        """Fit some pairs; see `cadalign.fitting.outliers.FitRows`."""
+        """Fit some pairs; see `cadalign.estimation.uncertainty.misfit.FitRows`."""
         result = self._fit(rows, LEAST_SIGMA, "linear")
         if robust:
             # sigma=None iterates until nothing changes, which takes ten times as long.

@@ -13,7 +13,7 @@ from typing import Any
 
 from cadalign.annotate.evidence import Evidence
 from cadalign.errors import InputError
-from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.estimation.focal import FocalPrior
 
 Pixel = tuple[float, float]
 _LONGEST = 1000  # of a history

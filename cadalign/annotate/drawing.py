@@ -12,7 +12,7 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.arrays import FloatArray
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.result import FitResult
 from cadalign.geometry.projection import projected_covariances
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 

@@ -16,11 +16,11 @@ from cadalign.annotate.objects.models import AnnotatedModel
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.errors import InputError
+from cadalign.estimation.exporting import object_of_align, object_of_fit
+from cadalign.estimation.observed import own_ids, shape_ids
+from cadalign.estimation.view import View
 from cadalign.export import AlignedObject, export_object
 from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
-from cadalign.fitting.exporting import object_of_align, object_of_fit
-from cadalign.fitting.joint.observed import own_ids, shape_ids
-from cadalign.fitting.joint.view import View
 from cadalign.io.files import write_text
 from cadalign.io.observation import Observation
 

@@ -36,9 +36,9 @@ from cadalign.annotate.objects.unfinished import (
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError
-from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.result import FitResult
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
     in_file,

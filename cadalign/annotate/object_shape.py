@@ -12,7 +12,7 @@ from cadalign.annotate.options import SessionOptions
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.fitting.joint.model import Model
+from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId

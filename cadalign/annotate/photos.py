@@ -15,7 +15,7 @@ from PIL import ImageOps
 from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.worklist import natural_key
 from cadalign.errors import DataError, InputError
-from cadalign.fitting.focal.prior import FocalPrior
+from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.files import reading

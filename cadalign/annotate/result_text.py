@@ -9,8 +9,8 @@ import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.suggestion import NextBest, Unmarked
-from cadalign.fitting.joint.advice import LENGTH_SIGMA, TURN_DEG, Advice
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.result import FitResult
+from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice
 
 UNKNOWNS = (
     *["the rotation"] * 3,

@@ -15,13 +15,12 @@ from cadalign.annotate.wireframe import Wireframe
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.observed import model_of, size_of, views_of
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.size import Size
-from cadalign.fitting.joint.view import View
-from cadalign.fitting.options import FitOptions, RansacOptions
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.model import Model, Size
+from cadalign.estimation.observed import model_of, size_of, views_of
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh

@@ -16,7 +16,7 @@ from cadalign.annotate.result_text import (
     short,
 )
 from cadalign.annotate.shape_alignment import LiveShape
-from cadalign.fitting.joint.result import AlignResult
+from cadalign.estimation.align_result import AlignResult
 
 
 def facts_of_shape(live: LiveShape, shape: ObjectShape | None) -> tuple[Fact, ...]:

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
 
-from cadalign.fitting.options import METHODS
+from cadalign.estimation.options import METHODS
 from cadalign.geometry.camera import Camera
 
 _CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
@@ -39,8 +39,8 @@ def _points() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fits() -> None:
-    from cadalign.fitting.fit import fit
-    from cadalign.fitting.options import RansacOptions
+    from cadalign.estimation.fit import fit
+    from cadalign.estimation.options import RansacOptions
 
     points, pixels = _points()
     for method in METHODS:
@@ -58,8 +58,8 @@ def _shapes_in_several_views() -> None:
 
 
 def _align_shape(*, views: int) -> None:
-    from cadalign.fitting.joint.align import align
-    from cadalign.fitting.joint.view import View
+    from cadalign.estimation.align import align
+    from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
 
     points, pixels = _points()

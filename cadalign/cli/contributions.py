@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from cadalign.fitting.joint.result import AlignResult
-    from cadalign.fitting.joint.summary import Contribution
-    from cadalign.fitting.uncertainty import Uncertainty
+    from cadalign.estimation.align_result import AlignResult
+    from cadalign.estimation.uncertainty.summary import Contribution
+    from cadalign.estimation.uncertainty.weakness import Uncertainty
 
 _HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
 

@@ -12,13 +12,13 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.exporting import object_of_align, object_of_fit
+from cadalign.estimation.observed import model_of, own_ids, shape_ids
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result import FitResult
+from cadalign.estimation.view import View
 from cadalign.export import AlignedObject
-from cadalign.fitting.exporting import object_of_align, object_of_fit
-from cadalign.fitting.joint.observed import model_of, own_ids, shape_ids
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
-from cadalign.fitting.options import FitOptions
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation

@@ -16,12 +16,12 @@ from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.options import ObservationCommand, OptionError, UsageError, named_as_flags
 from cadalign.cli.output import make_folder, say, waiting
 from cadalign.errors import InputError
-from cadalign.fitting.focal.prior import FocalPrior
-from cadalign.fitting.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
-    from cadalign.fitting.joint.result import AlignResult
-    from cadalign.fitting.result import FitResult
+    from cadalign.estimation.align_result import AlignResult
+    from cadalign.estimation.result import FitResult
     from cadalign.io.observation import Observation
     from cadalign.render.drawing.color import ByteImage
 
@@ -254,7 +254,7 @@ class Fit(ObservationCommand, CameraOptions, EvidenceOptions):
 
     def _fit(self, observation: Observation) -> FitResult:
         """Fit the stretched model."""
-        from cadalign.fitting.fit import fit
+        from cadalign.estimation.fit import fit
 
         options = self.options_for(observation)
         prior = options.focal_prior

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import InputError
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.observed import model_of, size_of, views_of
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.options import FitOptions
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.model import Model
+from cadalign.estimation.observed import model_of, size_of, views_of
+from cadalign.estimation.options import FitOptions
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation

@@ -14,7 +14,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-    from cadalign.fitting.options import Sigma
+    from cadalign.estimation.options import Sigma
     from cadalign.io.observation import Observation
 
 

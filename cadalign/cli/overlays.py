@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.result import FitResult
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model

@@ -13,7 +13,7 @@ from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
-from cadalign.fitting.options import Sigma
+from cadalign.estimation.options import Sigma
 from cadalign.retrieval.options import RetrievalOptions
 
 if TYPE_CHECKING:

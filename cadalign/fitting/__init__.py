@@ -1,1 +1,1 @@
-"""Fit models to keypoints: checked input, estimation, and results with their uncertainty."""
+"""Former name of `cadalign.estimation`."""

@@ -31,8 +31,8 @@ from functools import lru_cache
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.fitting.likelihood import bent
-from cadalign.fitting.noise import whitening_of
+from cadalign.estimation.problems import whitening_of
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions

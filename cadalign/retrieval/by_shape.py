@@ -29,10 +29,14 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.shape_posterior import ShapePosterior, gaussians_of, shape_posterior
-from cadalign.fitting.joint.view import View
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.uncertainty.shape_posterior import (
+    ShapePosterior,
+    gaussians_of,
+    shape_posterior,
+)
+from cadalign.estimation.view import View
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.errors import DegenerateError, InputError
-from cadalign.fitting.likelihood import bent
-from cadalign.fitting.noise import rays_of, whitening_of
-from cadalign.fitting.options import LOSSES, Sigma
+from cadalign.estimation.options import LOSSES, Sigma
+from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids

@@ -32,7 +32,7 @@ import math
 from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.fitting.options import AlignmentOptions, FitOptions
+from cadalign.estimation.options import AlignmentOptions, FitOptions
 
 METHODS = ("optimal", "epnp")
 

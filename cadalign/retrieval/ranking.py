@@ -22,7 +22,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, worker_count
 from cadalign.errors import DegenerateError
-from cadalign.fitting.fit import fit_batch
+from cadalign.estimation.fit import fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.projection import perspective

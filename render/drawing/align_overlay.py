@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.view import View
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.projection import projected_covariances

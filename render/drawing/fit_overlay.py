@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.fitting.result import FitResult
+from cadalign.estimation.result import FitResult
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image

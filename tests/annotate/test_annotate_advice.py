@@ -19,7 +19,7 @@ from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.result_text import evidence_text, left_text
 from cadalign.annotate.session import Session
-from cadalign.fitting.joint.advice import Advice, rank_evidence
+from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long

@@ -16,6 +16,9 @@ import pytest
 from cadalign.cli import main
 from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_correspondences
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.fit import fit
+from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.result import FitResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
@@ -33,9 +36,6 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.summary import Quartiles
-from cadalign.fitting.fit import fit
-from cadalign.fitting.options import RansacOptions
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

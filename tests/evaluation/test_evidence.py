@@ -10,6 +10,7 @@ from support.refusals import refusal_text
 
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
 from cadalign.evaluation.evidence.experiment import BOUNDS, EvidenceExperiment
 from cadalign.evaluation.evidence.methods import bound_of, evidence_for, truth_in
@@ -18,7 +19,6 @@ from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
 from cadalign.evaluation.evidence.summary import summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.opened import Run
-from cadalign.fitting.joint.align import align
 
 QUICK = ("keypoints", "gravity", "length", "depth", "views-2", "views-2-free", "gravity+length")
 

@@ -16,6 +16,7 @@ from cadalign import Alignment, Box
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.estimation import single
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -28,7 +29,6 @@ from cadalign.evaluation.unseen.options import METHODS, UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview
 from cadalign.evaluation.unseen.spec import SPEC
 from cadalign.evaluation.unseen.tasks import UnseenTask, UnseenTasks, observe_object
-from cadalign.fitting.joint import single
 from cadalign.geometry.metrics import box_iou
 from cadalign.report import headline_text, write_report
 

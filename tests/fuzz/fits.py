@@ -11,7 +11,7 @@ from fuzz.fit_cases import Case
 from fuzz.hostile import Call, made
 
 from cadalign import Alignment, CadalignError, Camera, FitResult, fit, fit_batch
-from cadalign.fitting.batch import BatchResult
+from cadalign.estimation.batch import BatchResult
 from cadalign.metrics import rotation_error
 
 ROTATION_TOLERANCE = 1e-9

@@ -16,10 +16,10 @@ from scipy.linalg import eigh
 from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
-from cadalign.fitting.likelihood import bent
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.bounds import error_bound
 from cadalign.retrieval.candidates import gather_candidates, observe

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera
-from cadalign.fitting.prediction import projection_jacobian
+from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.projection import perspective
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import BLOCK, Keypoints, ScalePrior

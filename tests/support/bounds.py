@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign import Alignment
-from cadalign.fitting.joint.deviations import pose_and_lengths
-from cadalign.fitting.joint.result import AlignResult
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import State

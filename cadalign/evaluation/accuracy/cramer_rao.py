@@ -6,10 +6,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.fitting.focal.grid import focal_slopes
-from cadalign.fitting.noise import whitening_of
-from cadalign.fitting.options import Sigma
-from cadalign.fitting.prediction import projection_jacobian
+from cadalign.estimation.focal_search import focal_slopes
+from cadalign.estimation.options import Sigma
+from cadalign.estimation.problems import whitening_of
+from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective

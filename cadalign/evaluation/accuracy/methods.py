@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from cadalign.errors import InputError
-from cadalign.fitting.options import METHODS, RansacOptions
+from cadalign.estimation.options import METHODS, RansacOptions
 
 LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cramer_rao.limit_estimate`."""

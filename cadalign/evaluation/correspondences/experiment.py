@@ -36,6 +36,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
+from cadalign.estimation.fit import fit
+from cadalign.estimation.result import FitResult
 from cadalign.evaluation.accuracy.methods import fit_options, is_robust
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
@@ -43,8 +45,6 @@ from cadalign.evaluation.outcome import Outcome, alignment_errors, reason_of
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.fitting.fit import fit
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng

@@ -12,7 +12,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.options import ExperimentOptions
 
 if TYPE_CHECKING:
-    from cadalign.fitting.options import RansacOptions
+    from cadalign.estimation.options import RansacOptions
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class CorrespondenceOptions(ExperimentOptions):
 
     def ransac(self, seed: int) -> RansacOptions:
         """The options of a search for inliers; the minimal solver is the method's."""
-        from cadalign.fitting.options import RansacOptions
+        from cadalign.estimation.options import RansacOptions
 
         return RansacOptions(
             max_reproj_error=self.max_reproj_error, max_iterations=self.max_iterations, seed=seed

@@ -34,6 +34,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.model import Model
+from cadalign.estimation.view import View
 from cadalign.evaluation.evidence.methods import bound_of, evidence_for
 from cadalign.evaluation.evidence.options import EvidenceOptions
 from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
@@ -42,10 +46,6 @@ from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reason_of
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.seeding import instance_rng

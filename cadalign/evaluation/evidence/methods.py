@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.model import Size
+from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.evidence.options import (
     COMBINED,
@@ -22,10 +26,6 @@ from cadalign.evaluation.evidence.options import (
 )
 from cadalign.evaluation.evidence.scene import ObjectScene, Shot
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.fitting.joint.deviations import pose_and_lengths
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.size import Size
-from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance

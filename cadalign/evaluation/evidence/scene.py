@@ -9,10 +9,10 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel
+from cadalign.estimation.model import Model
 from cadalign.evaluation.accuracy.masks import damaged_mask
 from cadalign.evaluation.evidence.options import EvidenceOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, load_scene, make_instance
-from cadalign.fitting.joint.model import Model
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector

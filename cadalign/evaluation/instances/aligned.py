@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.evaluation.instances.instance import Instance
-from cadalign.fitting.uncertainty import Uncertainty
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
-    from cadalign.fitting.joint.result import AlignAlternative, AlignResult
+    from cadalign.estimation.align_result import AlignAlternative, AlignResult
     from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCALE = 1e-6
@@ -98,8 +98,8 @@ def align_instance(
         As `cadalign.align`.
     """
     # Only here: their kernels take time to import, and most experiments do without.
-    from cadalign.fitting.joint.align import align
-    from cadalign.fitting.joint.view import View
+    from cadalign.estimation.align import align
+    from cadalign.estimation.view import View
 
     known = np.isin(instance.semantic_ids, shape.ids)
     view = View(

@@ -39,11 +39,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError
+from cadalign.estimation.result import FitResult
 from cadalign.evaluation.instances.aligned import AlignedAlternative, AlignedShape
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

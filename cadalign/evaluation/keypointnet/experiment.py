@@ -45,6 +45,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.errors import CadalignError, DataError
+from cadalign.estimation.fit import fit, fit_batch
+from cadalign.estimation.result import FitResult
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, SHAPE, fit_options, has_statistics
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
@@ -66,8 +68,6 @@ from cadalign.evaluation.outcome import FAILED, Outcome, overlap_up_to_scale, re
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
-from cadalign.fitting.fit import fit, fit_batch
-from cadalign.fitting.result import FitResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 

@@ -36,6 +36,9 @@ import numpy as np
 
 from cadalign.datasets.photos.photo import Photo
 from cadalign.errors import CadalignError, DataError, DegenerateError
+from cadalign.estimation.align import align
+from cadalign.estimation.model import Model
+from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
 from cadalign.evaluation.photos.methods import PhotoEstimate, estimate_object
@@ -49,9 +52,6 @@ from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel

@@ -9,6 +9,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.fit import fit
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
+from cadalign.estimation.view import View
 from cadalign.evaluation.instances.aligned import box_alignment
 from cadalign.evaluation.photos.names import (
     DEPTH,
@@ -23,12 +29,6 @@ from cadalign.evaluation.photos.names import (
     parts_of,
 )
 from cadalign.evaluation.photos.sighting import LeftOutError, Sighting
-from cadalign.fitting.fit import fit
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
-from cadalign.fitting.options import SIMILAR_SCALE_SIGMA
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.errors import CadalignError
+from cadalign.estimation.align_result import AlignAlternative, AlignResult
 from cadalign.evaluation.instances.aligned import (
     AlignedAlternative,
     AlignedShape,
@@ -18,7 +19,6 @@ from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import PhotoEstimate
 from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.evaluation.runs.tables import Row
-from cadalign.fitting.joint.result import AlignAlternative, AlignResult
 from cadalign.geometry.alignment import Alignment
 
 

@@ -10,12 +10,12 @@ from scipy import ndimage
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.photos.photo import NamedPoints, Photo, PhotoObject
 from cadalign.errors import CadalignError
+from cadalign.estimation.fit import fit
 from cadalign.evaluation.instances.aligned import box_alignment
 from cadalign.evaluation.photos.cad import Cad
 from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import Protocol
 from cadalign.evaluation.runs.tables import Row
-from cadalign.fitting.fit import fit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

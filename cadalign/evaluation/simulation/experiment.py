@@ -14,6 +14,7 @@ from itertools import groupby
 import numpy as np
 
 from cadalign.errors import CadalignError
+from cadalign.estimation.fit import fit, fit_batch
 from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, fit_options
@@ -22,7 +23,6 @@ from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.fitting.fit import fit, fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.seeding import instance_rng
 

@@ -44,6 +44,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DegenerateError
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.model import Model
+from cadalign.estimation.view import View
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale, reason_of
@@ -56,10 +60,6 @@ from cadalign.evaluation.unseen.methods import ShapeEstimate, estimate_shape
 from cadalign.evaluation.unseen.options import UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview, sighting_record
 from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask, observe_object
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import (

@@ -8,6 +8,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DegenerateError
+from cadalign.estimation.align import align
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.unseen.learned import Learned
@@ -21,11 +26,6 @@ from cadalign.evaluation.unseen.options import (
     UnseenOptions,
 )
 from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask
-from cadalign.fitting.joint.align import align
-from cadalign.fitting.joint.model import Model
-from cadalign.fitting.joint.result import AlignResult
-from cadalign.fitting.joint.view import View
-from cadalign.fitting.options import RansacOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.retrieval.models import LibraryModel
 from cadalign.seeding import instance_rng

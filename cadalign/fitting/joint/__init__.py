@@ -1,1 +1,1 @@
-"""Alignment of exact, stretched and learned models to all that is known about an object."""
+"""Former name of parts of `cadalign.estimation`."""

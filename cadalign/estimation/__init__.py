@@ -1,0 +1,1 @@
+"""Estimate alignments: from keypoints or all evidence to results with their uncertainty."""

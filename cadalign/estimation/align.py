@@ -1,0 +1,303 @@
+"""`align`: the object's pose, stretch and shape from all that is known about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TypeVar, cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, worker_count
+from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.assemble import Minimum, assemble
+from cadalign.estimation.joint_robust import Consensus, find_consensus, state_of
+from cadalign.estimation.model import Model, Size
+from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import prior_of
+from cadalign.estimation.result import FitStats
+from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
+from cadalign.estimation.starts import Start, starts_of
+from cadalign.estimation.view import View
+from cadalign.estimation.weak_views import (
+    check_first,
+    numbered_without,
+    views_without_pose,
+    with_views_left_out,
+)
+from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.search import search_joint
+
+T = TypeVar("T")
+
+
+@np.errstate(all="ignore")  # what is not finite is refused
+def align(
+    model: Model | ShapeModel,
+    views: View | Sequence[View],
+    *,
+    size: Size | None = None,
+    init: Alignment | None = None,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    ransac: RansacOptions | None = None,
+) -> AlignResult:
+    """Estimate an object's pose, stretch and shape from one or more views.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+        One CAD model, exact, stretched, or only similar (``shape_sigma``); or the learned shape of
+        a category.
+    views : View or sequence of View
+        What the images tell. Views with ``cam_from_rig`` share one pose and determine the object's
+        size; views without it have a pose each and share the stretch and the shape.
+    size : Size, optional
+        Known lengths of the object.
+    init : Alignment, optional
+        A start beside those that the keypoints suggest, needed where these are too few: the
+        alignment in the rig's frame or, where the views have no ``cam_from_rig``, in the first
+        camera's.
+    loss, loss_scale
+        As for `cadalign.fit`.
+    ransac : RansacOptions, optional
+        Search for the keypoints that agree, for views with outliers; of its options,
+        ``max_reproj_error`` and ``seed`` count where the shape is not exact.
+
+    Returns
+    -------
+    AlignResult
+
+    Raises
+    ------
+    InputError
+        If an argument is invalid, or a view names a keypoint that the model lacks.
+    DegenerateError
+        If the keypoints are too few, or no estimate has them all in front of the cameras.
+
+    Examples
+    --------
+    A box of which the model's proportions are known to some 5 % of its size:
+
+    >>> from cadalign import Alignment, Camera
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> photo = camera.project(truth.apply(corners * [1.0, 1.1, 0.95]))
+    >>> result = align(Model(points_3d=corners, shape_sigma=0.05), View(camera, photo))
+    >>> result.points_3d.shape, result.warnings
+    ((8, 3), ('the length along z is known only to +-18 %',))
+    """
+    start = time.perf_counter()
+    given = [views] if isinstance(views, View) else list(views)
+    _check_views(given)
+    _check_start(size, init)
+    options = FitOptions(loss=loss, loss_scale=loss_scale)
+    if size is None and init is None and is_plain(model, given):
+        exact = cast(Model, model)
+        return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
+    if size is None and ransac is None and is_single(model, given):
+        return align_single(cast(ShapeModel, model), given[0], options=options, init=init)
+    prior = prior_of(model)
+    left_out = views_without_pose(prior, given, is_started=init is not None)
+    if left_out:
+        check_first(left_out)
+        others = [view for number, view in enumerate(given) if number not in left_out]
+        with numbered_without(left_out, len(given)):
+            found_by_used = align(
+                model,
+                others,
+                size=size,
+                init=init,
+                loss=loss,
+                loss_scale=loss_scale,
+                ransac=ransac,
+            )
+        return with_views_left_out(found_by_used, prior, given, left_out)
+    minima: list[Minimum] = []
+    iterations = hypotheses = 0
+    everything = evidence_of(
+        prior, given, size, loss=LOSSES[options.loss], loss_scale=options.loss_scale
+    )
+    first = None if init is None else _start(init, everything)
+    for number, shape in enumerate(prior.components):
+        evidence = everything._replace(shape=shape)
+        if ransac is None:
+            found, used, tried = _search(evidence, first)
+        else:
+            threshold = _thresholds(evidence, given, ransac.max_reproj_error)
+            found, used, tried = find_consensus(evidence, threshold, int(ransac.seed), first)
+        iterations, hypotheses = iterations + used, hypotheses + tried
+        prior_score = -2 * float(np.log(prior.weights[number]))
+        minima.extend(
+            Minimum(number, *each._replace(score=each.score + prior_score)) for each in found
+        )
+    if not minima:
+        raise DegenerateError(
+            "no pose has the keypoints in front of the camera",
+            where="views",
+            fix="give at least 3 keypoints in one view, or `init`, and check which is which",
+        )
+    minima.sort(key=lambda minimum: minimum.score)
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    if all(view.mask is None for view in given):
+        return assemble(model, prior, given, minima, stats)
+    from cadalign.estimation.contours.depth import fit_depths
+    from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
+
+    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
+    stats = replace(stats, seconds=time.perf_counter() - start)
+    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
+
+
+def align_batch(
+    model: Model | ShapeModel,
+    objects: Sequence[View | Sequence[View]],
+    *,
+    size: Size | Sequence[Size | None] | None = None,
+    init: Alignment | Sequence[Alignment | None] | None = None,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    ransac: RansacOptions | None = None,
+    workers: int = 1,
+) -> list[AlignResult | CadalignError]:
+    """Align many objects of one kind; each as `align` does, bit for bit.
+
+    Parameters
+    ----------
+    model, loss, loss_scale, ransac
+        As for `align`.
+    objects : sequence of View or of sequences of View
+        The views of every object.
+    size, init
+        As for `align`: one for all objects, or a sequence of one or None for each.
+    workers : int
+        Number of threads that share the objects; -1 for all cores.
+
+    Returns
+    -------
+    list of AlignResult or CadalignError
+        The error takes the place of the result where an object has none. `cadalign.to_dataframe`
+        makes a table of them.
+
+    Raises
+    ------
+    InputError
+        If workers is invalid, or there are more or fewer sizes or starts than objects.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> view = View(camera, camera.project(truth.apply(corners)))
+    >>> boxes = align_batch(Model(points_3d=corners), [view, view], size=[None, Size(width=2.0)])
+    >>> [round(float(box.alignment.scale[0]), 3) for box in boxes]
+    [1.0, 2.0]
+    """
+    threads = worker_count(workers)
+    sizes = _one_each(size, len(objects), "size", Size)
+    starts = _one_each(init, len(objects), "init", Alignment)
+
+    def one(
+        views: View | Sequence[View], size: Size | None, init: Alignment | None
+    ) -> AlignResult | CadalignError:
+        try:
+            return align(
+                model,
+                views,
+                size=size,
+                init=init,
+                loss=loss,
+                loss_scale=loss_scale,
+                ransac=ransac,
+            )
+        except CadalignError as error:
+            return error
+
+    if threads == 1:
+        return [one(*each) for each in zip(objects, sizes, starts, strict=True)]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, objects, sizes, starts))
+
+
+def _one_each(
+    given: T | Sequence[T | None] | None, count: int, where: str, kind: type[T]
+) -> Sequence[T | None]:
+    """An argument given for each of so many objects, or for all."""
+    if given is None or isinstance(given, kind):
+        return [given] * count
+    if not isinstance(given, Sequence):
+        what = f"expected a cadalign.{kind.__name__} or a sequence of them"
+        raise InputError(f"{what}, got {type(given).__name__}", where=where)
+    if len(given) != count:
+        fix = "give one for all, or one or None for each"
+        raise InputError(f"{len(given)} for {count} objects", where=where, fix=fix)
+    for number, each in enumerate(given):
+        if each is not None and not isinstance(each, kind):
+            what = f"expected a cadalign.{kind.__name__} or None, got {type(each).__name__}"
+            raise InputError(what, where=f"{where}[{number}]")
+    return given
+
+
+def _search(evidence: Evidence, init: Start | None) -> tuple[list[Consensus], int, int]:
+    """Minima of all sightings together, and the effort they took."""
+    poses, log_scales = starts_of(evidence, init)
+    if not len(poses):
+        return [], 0, 0
+    minima, count, iterations = search_joint(evidence, poses, log_scales)
+    all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
+    found = [
+        Consensus(
+            all_of_them,
+            evidence,
+            state_of(minima, k),
+            float(minima.costs[k]),
+            float(minima.scores[k]),
+        )
+        for k in range(count)
+    ]
+    return found, iterations, len(poses)
+
+
+def _thresholds(evidence: Evidence, views: Sequence[View], max_reproj_error: float) -> FloatArray:
+    """Largest whitened residuals (N,) of inliers."""
+    sightings = evidence.sightings
+    focal = np.array([np.sqrt(view.camera.fx * view.camera.fy) for view in views])
+    root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
+    return max_reproj_error / focal[sightings.image] * root
+
+
+def _check_views(views: Sequence[object]) -> None:
+    if not views:
+        raise InputError("none is given", where="views")
+    for number, view in enumerate(views):
+        if not isinstance(view, View):
+            what = f"expected a cadalign.View, got {type(view).__name__}"
+            raise InputError(what, where=f"views[{number}]")
+
+
+def _start(init: Alignment, evidence: Evidence) -> Start:
+    """A given alignment as a start; where the size is held, it shrinks about the origin."""
+    rotation, translation, scale = init.rotation, init.translation, np.array(init.scale)
+    held = evidence.scales.free == 0
+    if held.any():
+        size = scale[held].mean()
+        scale, translation = np.where(held, 1.0, scale / size), translation / size
+    return Start(np.concatenate([rotation.ravel(), translation]), np.log(scale))
+
+
+def _check_start(size: object, init: object) -> None:
+    if size is not None and not isinstance(size, Size):
+        what = f"expected a cadalign.Size, got {type(size).__name__}"
+        raise InputError(what, where="size")
+    if init is not None and not isinstance(init, Alignment):
+        what = f"expected a cadalign.Alignment, got {type(init).__name__}"
+        raise InputError(what, where="init")

@@ -1,0 +1,211 @@
+"""Depth images over the visible surface of the object: pixels inside its mask.
+
+A pixel's ray meets the surface at a depth that depends on the pose: the surface's tangent plane at
+the point that the ray meets moves along the ray, the point's sliding in the plane does not count to
+first order. Each round casts the rays at the present estimate and refines everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.estimation.assemble import Minimum
+from cadalign.estimation.contours.contour import robust_deviation
+from cadalign.estimation.contours.loop import (
+    poses_of,
+    state_with_points,
+    state_without_points,
+    with_points,
+)
+from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
+from cadalign.estimation.model import Model
+from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.uncertainty.evidence import kept_rows
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.projection import model_rays
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.evidence import Evidence, Planes, points_of
+from cadalign.solvers.joint.refine import refine_joint
+from cadalign.solvers.joint.search import score_of
+from cadalign.solvers.joint.system import empty_system
+
+_MARGIN = 3  # [px], to the mask's border
+_LEAST_SPACING = 8  # [px], of samples that count as independent
+_MOST_SAMPLES = 100  # of a view
+_LOSS_SCALE = 3.0
+_GRAZING = 0.2  # cosine between ray and normal below which the depth is not to be trusted
+_INDEPENDENT_PARTS = 10.0  # of a surface that is only similar
+_ROUNDS = 6
+_ITERATIONS = 12
+_SETTLED = 0.01  # change of the cost
+_MOST_STARTS = 4
+_UNLIKELY = 60.0  # excess score of a minimum that is still tried
+
+
+class _Samples(NamedTuple):
+    """Depths (n,) of a view, their rays (n, 3), and their relative deviation."""
+
+    image: int
+    rays: FloatArray
+    depths: FloatArray
+    sigma: float
+
+
+class _Rows(NamedTuple):
+    """Points of the surface, their modes, and the planes that they lie in."""
+
+    mean: FloatArray
+    modes: FloatArray
+    image: int
+    normal: FloatArray
+    offset: FloatArray
+    weight: FloatArray
+
+
+def fit_depths(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    minima: Sequence[Minimum],
+) -> list[Minimum]:
+    """Refine the likely minima with the depths of the object's surface, the likeliest first."""
+    samples = [
+        _samples(number, view)
+        for number, view in enumerate(views)
+        if view.mask_image is not None and view.depth_image is not None
+    ]
+    samples = [each for each in samples if len(each.depths)]
+    if not samples:
+        return list(minima)
+    keypoints, first = len(prior.ids), minima[0]
+    points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
+    where = f"views[{samples[0].image}].depth"
+    surface = surfaces_of(model, points[:keypoints], where).surfaces[0]
+    likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
+    found = [_settled(each, keypoints, samples, surface) for each in likely[:_MOST_STARTS]]
+    found.sort(key=lambda minimum: minimum.score)
+    return found
+
+
+def _samples(number: int, view: View) -> _Samples:
+    """Pixels of a grid inside the mask whose depth is known."""
+    import cv2  # takes longer to import than all the rest
+
+    mask = np.asarray(view.mask_image) > 0.5
+    padded = np.pad(mask.astype(np.uint8), 1)  # nothing is known of what leaves the image
+    size = 2 * _MARGIN + 1
+    inside = cv2.erode(padded, np.ones((size, size), np.uint8))[1:-1, 1:-1] > 0
+    depth = cast(FloatArray, view.depth_image)
+    usable = inside & np.isfinite(depth)
+    spacing = max(_LEAST_SPACING, int(np.ceil(np.sqrt(usable.sum() / _MOST_SAMPLES))))
+    grid = np.zeros_like(usable)
+    grid[spacing // 2 :: spacing, spacing // 2 :: spacing] = True
+    rows, columns = np.nonzero(usable & grid)
+    rays, valid = view.camera.normalize_where_valid(np.stack([columns, rows], 1).astype(float))
+    rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    sigma = float(cast(float, view.depth_sigma))
+    return _Samples(number, rays[valid], depth[rows, columns][valid], sigma)
+
+
+def _settled(
+    start: Minimum, keypoints: int, samples: Sequence[_Samples], surface: Surface
+) -> Minimum:
+    """Rounds from one minimum until the cost changes little."""
+    state, last = start.state, np.inf
+    result, bare = start, _without_keypoints(start.evidence, samples)
+    own = score_of(start.evidence, start.state, empty_system(start.evidence))
+    extra = start.score - own if np.isfinite(start.score - own) else 0.0
+    for _ in range(_ROUNDS):
+        posed = surface.at(start.evidence.shape, state)
+        poses = poses_of(bare, state)
+        rows = [
+            _rows(posed, poses[each.image], each, is_exact=surface.is_exact) for each in samples
+        ]
+        full = _with_rows(bare, keypoints, rows)
+        total = sum(len(each.mean) for each in rows)
+        room = state_with_points(state, keypoints, total)
+        cost, _, _ = refine_joint(full, _ITERATIONS, room)
+        if not cost < np.inf:
+            return start
+        score = score_of(full, room, empty_system(full))
+        result = start._replace(evidence=full, state=room, cost=cost, score=score + extra)
+        state, _ = state_without_points(room, keypoints, total)
+        if abs(last - cost) < _SETTLED:
+            break
+        last = cost
+    return result
+
+
+def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:
+    """The evidence without depths at keypoints, which may be hidden, where the surface has them."""
+    kept = ~np.isin(evidence.planes.image, [each.image for each in samples])
+    return evidence._replace(planes=kept_rows(evidence.planes, kept))
+
+
+def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples, *, is_exact: bool) -> _Rows:
+    """Points where the rays of samples meet the surface, and planes at their measured depths."""
+    origin, model_from_ray = model_rays(pose)
+    directions = samples.rays @ model_from_ray.T
+    face, depth = surface.caster.first_hits(origin, directions)
+    hit = np.flatnonzero(face >= 0)
+    normals = (surface.caster.normals(face[hit]) / pose.scale) @ pose.rotation.T
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    rays = samples.rays[hit]
+    along = (normals * rays).sum(axis=1)
+    steep = np.abs(along) > _GRAZING * np.linalg.norm(rays, axis=1)
+    hit, normals, along = hit[steep], normals[steep], along[steep]
+    points = origin + depth[hit, None] * directions[hit]
+    mean, modes = surface.rows(points, face[hit])
+    measured = samples.depths[hit]
+    sigma = samples.sigma
+    if not is_exact:
+        sigma = _sigma_of_similar(depth[hit] / measured - 1, sigma)
+    return _Rows(
+        mean,
+        modes,
+        samples.image,
+        normals / along[:, None],
+        measured,
+        1.0 / (sigma * measured),
+    )
+
+
+def _sigma_of_similar(relative: FloatArray, sigma: float) -> float:
+    """Deviation of depths over a surface that is only similar to the object's.
+
+    Its own error, which shows in the residuals (n,), is alike over large parts of the surface, of
+    which only a few are independent.
+    """
+    own = robust_deviation(relative - np.median(relative)) if len(relative) else 0.0
+    alike = max(len(relative) / _INDEPENDENT_PARTS, 1.0)
+    return float(np.hypot(sigma, own * np.sqrt(alike)))
+
+
+def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evidence:
+    """The evidence with points of the surface, which stand behind the keypoints."""
+    total = sum(len(each.mean) for each in rows)
+    modes = np.zeros((len(evidence.shape.modes), total, 3))
+    start = 0
+    for each in rows:
+        modes[: len(each.modes), start : start + len(each.mean)] = each.modes
+        start += len(each.mean)
+    extended = with_points(evidence, keypoints, np.concatenate([each.mean for each in rows]), modes)
+    planes = extended.planes
+    images = [np.full(len(each.mean), each.image) for each in rows]
+    return extended._replace(
+        planes=Planes(
+            np.concatenate([planes.point, keypoints + np.arange(total)]),
+            np.concatenate([planes.image, *images]),
+            np.concatenate([planes.normal, *(each.normal for each in rows)]),
+            np.concatenate([planes.offset, *(each.offset for each in rows)]),
+            np.concatenate([planes.weight, *(each.weight for each in rows)]),
+            np.concatenate([planes.loss, np.full(total, CAUCHY)]),
+            np.concatenate([planes.loss_scale, np.full(total, _LOSS_SCALE)]),
+        ),
+    )

@@ -1,0 +1,429 @@
+"""Minima of the other evidence, refined with masks; masks that contradict it are left out.
+
+With them, for a known true alignment, the Cramer-Rao bound of keypoints and masks together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.assemble import Minimum
+from cadalign.estimation.contours.loop import (
+    ContourFit,
+    Noise,
+    RimRows,
+    Settled,
+    ViewContour,
+    contour_view,
+    count_of,
+    noise_of,
+    poses_of,
+    rim_rows,
+    settle,
+    state_with_points,
+    with_displacement_modes,
+    with_rims,
+)
+from cadalign.estimation.contours.rims import extraction_bias, find_rims
+from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
+from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.model import Model
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.search import score_of
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+_MOST_STARTS = 4
+_MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
+_LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
+_UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried with them
+_LEAST_SUPPORT = 0.5  # share of the contour that must agree
+_LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
+_RELATIVE_TOLERANCE = 0.02
+_WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
+_LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
+_LARGEST = 24.0  # [px]
+_HULL_GAIN = 0.5  # misfit of hulls, relative, below which these take the place of the outlines
+_INLIER = 3.5  # in deviations
+_OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
+_LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
+_BOUND_REACH = 8.0  # [px]
+_LEAST_COMMON_OFFSET = 0.1  # [px], that the whole contour may have in common
+
+
+class MaskFit(NamedTuple):
+    """Minima with the masks, the residuals of every view's mask, and what contradicts."""
+
+    minima: list[Minimum]
+    residuals: tuple[MaskResiduals | None, ...]
+    warnings: tuple[str, ...]
+
+    def noted_in(self, result: AlignResult) -> AlignResult:
+        """The result with what is known of the masks."""
+        if not self.residuals:
+            return result
+        summaries = [
+            EvidenceSummary(
+                "mask", number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
+            )
+            for number, each in enumerate(self.residuals)
+            if each is not None
+        ]
+        return replace(
+            result,
+            mask_residuals=self.residuals,
+            evidence=(*result.evidence, *summaries),
+            warnings=(*result.warnings, *self.warnings),
+        )
+
+
+class _Candidate(NamedTuple):
+    """A start, a surface, and where the rounds led.
+
+    ``evidence`` and ``state`` are those of the start, with displacements as modes where the surface
+    follows them; ``prior_score`` is that of the component.
+    """
+
+    start: Minimum
+    evidence: Evidence
+    state: State
+    prior_score: float
+    surface: Surface
+    settled: Settled
+
+
+def fit_masks(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    minima: Sequence[Minimum],
+) -> MaskFit:
+    """Refine the likely minima of the other evidence with the views' masks.
+
+    Parameters
+    ----------
+    model, prior, views
+        Those of `cadalign.align`; without a mask the minima stay as they are.
+    minima : sequence of Minimum
+        Estimates without masks, the likeliest first; starts where these leave something open.
+
+    Raises
+    ------
+    InputError
+        If a mask has no contour, or the model has no mesh.
+    DegenerateError
+        If there is no estimate without the masks and no rim near them.
+    """
+    contours = [
+        contour_view(number, view, f"views[{number}].mask")
+        for number, view in enumerate(views)
+        if view.mask_image is not None
+    ]
+    if not contours:
+        return MaskFit(list(minima), (), ())
+    keypoints = len(prior.ids)
+    first = minima[0]
+    points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
+    choice = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
+    is_open = not _is_determined(first)
+    likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
+    most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
+    used, left_out, warnings = list(contours), [], []
+    settle_all = partial(
+        _settled,
+        likely[:most],
+        keypoints,
+        follows_displacements=isinstance(model, Model),
+        is_wide=is_open,
+    )
+    best: list[_Candidate] = []
+    while used:
+        best = settle_all(used, choice.surfaces)
+        hulls = [hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
+        known = [each for each in hulls if each is not None]
+        if known and len(known) == len(used):
+            by_hulls = settle_all(known, choice.hulls)
+            if by_hulls and (not best or _is_better(by_hulls[0], best[0])):
+                best, used = by_hulls, known
+        wrong = _contradicting(best, used)
+        if wrong is None:
+            break
+        contour, reason = wrong
+        if len(used) == 1 and is_open:
+            if not best:
+                raise _no_rim(contour)
+            warnings.append(f"views[{contour.image}].mask: {reason}")
+            break
+        warnings.append(
+            f"views[{contour.image}].mask contradicts the rest and is left out: {reason}"
+        )
+        left_out.append(contour)
+        used.remove(contour)
+    residuals: list[MaskResiduals | None] = [None] * len(views)
+    if not used:
+        for contour in left_out:
+            residuals[contour.image] = _unused(contour)
+        return MaskFit(list(minima), tuple(residuals), tuple(warnings))
+    for contour, fit in zip(used, best[0].settled.fits, strict=True):
+        residuals[contour.image] = _residuals(contour, fit)
+    for contour in left_out:
+        residuals[contour.image] = _unused(contour)
+    return MaskFit([_minimum(each) for each in best], tuple(residuals), tuple(warnings))
+
+
+def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
+    """True if hulls agree so much better that the rest of the outline is another object's."""
+    return _misfit(by_hulls.settled) < _HULL_GAIN * _misfit(other.settled)
+
+
+def _is_determined(minimum: Minimum) -> bool:
+    """True if the evidence without masks determines all unknowns."""
+    system = empty_system(minimum.evidence)
+    evaluate_joint(minimum.evidence, minimum.state, system)
+    sizes = np.sqrt(system.hessian.diagonal())
+    if not np.isfinite(sizes).all() or not (sizes > 0).all():
+        return False
+    values = np.linalg.eigvalsh(system.hessian / np.outer(sizes, sizes))
+    return bool(values[0] > _LEAST_INFORMATION)
+
+
+def _settled(
+    starts: Sequence[Minimum],
+    keypoints: int,
+    contours: list[ViewContour],
+    surfaces: list[Surface],
+    *,
+    follows_displacements: bool,
+    is_wide: bool,
+) -> list[_Candidate]:
+    """Every start with the surface that fits best.
+
+    The scores of several starts are made comparable by the noise of the best one.
+    """
+    found = []
+    for start in starts:
+        own = score_of(start.evidence, start.state, empty_system(start.evidence))
+        extra = start.score - own if np.isfinite(start.score - own) else 0.0
+        evidence, state = start.evidence, start.state
+        if follows_displacements:
+            evidence, state = with_displacement_modes(evidence, state)
+        tried = []
+        for surface in surfaces:
+            settled = settle(evidence, keypoints, state, contours, surface, is_wide=is_wide)
+            if settled is not None:
+                tried.append(_Candidate(start, evidence, state, extra, surface, settled))
+        if tried:
+            found.append(min(tried, key=lambda each: _misfit(each.settled)))
+    if len(found) > 1:
+        reference = min(found, key=lambda each: _misfit(each.settled))
+        noises = [fit.noise for fit in reference.settled.fits]
+        again = []
+        for each in found:
+            settled = settle(
+                each.evidence, keypoints, each.settled.bare, contours, each.surface, noises
+            )
+            if settled is not None:
+                again.append(each._replace(settled=settled))
+        found = again
+    found.sort(key=lambda each: each.settled.score + each.prior_score)
+    return found
+
+
+def _misfit(settled: Settled) -> float:
+    """Mean residual [px] of all samples, each at most `_LARGEST`, as of those without a rim."""
+    every = [np.nan_to_num(np.abs(fit.residuals), nan=_LARGEST) for fit in settled.fits]
+    return float(np.minimum(np.concatenate(every), _LARGEST).mean())
+
+
+def _contradicting(
+    candidates: list[_Candidate], contours: list[ViewContour]
+) -> tuple[ViewContour, str] | None:
+    """The mask that contradicts the rest, and how; None where all agree."""
+    if not candidates:
+        return contours[0], "no part of the model's outline comes near its contour"
+    best = candidates[0]
+    relative = _RELATIVE_TOLERANCE if best.surface.is_exact else _WARPED_TOLERANCE
+    supports = []
+    for contour, fit in zip(contours, best.settled.fits, strict=True):
+        tolerance = max(_LEAST_TOLERANCE, relative * contour.contour.size)
+        supports.append(
+            float((np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < tolerance).mean())
+        )
+    worst = int(np.argmin(supports))
+    if supports[worst] < _LEAST_SUPPORT:
+        share = f"{100 * supports[worst]:.0f} % of its contour"
+        return contours[worst], f"only {share} can be the model's outline"
+    tension = _tension(best)
+    if tension is not None:
+        return contours[worst], tension
+    return None
+
+
+def _tension(candidate: _Candidate) -> str | None:
+    """Report other residuals that rise more than the masks' information explains."""
+    from scipy.special import chdtri  # takes longer to import than all that is compiled
+
+    evidence, state = candidate.evidence, candidate.state
+    alone, joint = _cost(evidence, state), _cost(evidence, candidate.settled.bare)
+    equations = 2 * len(evidence.sightings.point)
+    free = 6 * len(state.poses) + int(evidence.scales.free.sum())
+    if not equations:
+        return None
+    redundancy = equations - free
+    scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
+    unknowns = min(free + len(state.coefficients), equations)
+    if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
+        return None
+    times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))
+    return f"with it the other residuals are {times:.2g} times as large"
+
+
+def _cost(evidence: Evidence, state: State) -> float:
+    return float(evaluate_joint(evidence, state, empty_system(evidence)))
+
+
+def _minimum(candidate: _Candidate) -> Minimum:
+    settled = candidate.settled
+    return candidate.start._replace(
+        evidence=settled.evidence,
+        state=settled.state,
+        cost=settled.cost,
+        score=settled.score + candidate.prior_score,
+    )
+
+
+def _residuals(contour: ViewContour, fit: ContourFit) -> MaskResiduals:
+    near = np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < _INLIER * fit.noise.sigma
+    return MaskResiduals(
+        contour.contour.points,
+        contour.contour.normals,
+        fit.residuals,
+        near,
+        fit.noise.sigma,
+        fit.noise.correlation,
+        fit.offset,
+    )
+
+
+def _unused(contour: ViewContour) -> MaskResiduals:
+    count = len(contour.contour.points)
+    return MaskResiduals(
+        contour.contour.points,
+        contour.contour.normals,
+        np.full(count, np.nan),
+        np.zeros(count, dtype=bool),
+        float("nan"),
+        1.0,
+        0.0,
+        is_used=False,
+    )
+
+
+def _no_rim(contour: ViewContour) -> DegenerateError:
+    return DegenerateError(
+        "no part of the model's outline comes near its contour",
+        where=f"views[{contour.image}].mask",
+        fix="give an init that shows the model near the mask, or keypoints",
+    )
+
+
+def hull_contour(contour: ViewContour, view: View) -> ViewContour | None:
+    """The contour of the convex hull of a view's mask; None where the mask leaves the image."""
+    inside = np.asarray(view.mask_image) >= 0.5
+    if inside.sum() > inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER].sum():
+        return None
+    hull = replace(view, mask=_hull_of(inside))
+    return contour_view(contour.image, hull, f"views[{contour.image}].mask")
+
+
+def _hull_of(inside: BoolArray) -> BoolArray:
+    pieces, _ = cv2.findContours(
+        inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+    )
+    largest = max(cv2.contourArea(piece) for piece in pieces)
+    kept = [piece for piece in pieces if cv2.contourArea(piece) >= _LEAST_PIECE * largest]
+    filled = np.zeros(inside.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
+    return filled > 0
+
+
+def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
+    """The least covariance of an estimate from one view's keypoints and mask.
+
+    The contour has the deviation and the correlation that its residuals show at the true alignment,
+    which has the scale 1 along the model's known axis.
+
+    Returns
+    -------
+    (9, 9) float
+        As `AlignResult.covariance`.
+
+    Raises
+    ------
+    InputError
+        If the view has no mask, or the model is not exact.
+    """
+    if view.mask_image is None or model.shape_sigma is not None:
+        raise InputError("expected a view with a mask, and an exact model", where="view")
+    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
+    pose = np.concatenate([gt.rotation.ravel(), gt.translation])[None]
+    still = np.zeros_like(evidence.shape.mean)
+    state = State(pose, np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
+    full, stacked = with_contours(model, [view], evidence, state)
+    return pose_and_lengths(full, stacked, joint_covariance(full, stacked).unknowns)
+
+
+def with_contours(
+    model: Model, views: Sequence[View], evidence: Evidence, state: State
+) -> tuple[Evidence, State]:
+    """The evidence of an exact model's views with the contours of their masks.
+
+    Their deviation and correlation are those that their residuals show at the state.
+
+    Raises
+    ------
+    InputError
+        If a mask has no contour, or the model has no mesh.
+    """
+    masked = [number for number, view in enumerate(views) if view.mask_image is not None]
+    if not masked:
+        return evidence, state
+    keypoints = len(evidence.shape.mean) - 2
+    where = f"views[{masked[0]}].mask"
+    (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
+    posed = surface.at(evidence.shape, state)
+    poses = poses_of(evidence, state)
+    rows = [
+        _contour_rows(contour_view(n, views[n], f"views[{n}].mask"), posed, poses[n])
+        for n in masked
+    ]
+    full = with_rims(evidence, keypoints, rows)
+    return full, state_with_points(state, keypoints, count_of(rows), np.zeros(len(rows)))
+
+
+def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> RimRows:
+    rims = find_rims(posed.caster, seen.camera, gt, seen.contour, _BOUND_REACH)
+    offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
+    centred = np.where(rims.found, rims.offset - offset, np.nan)
+    known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
+    bias = extraction_bias(posed.caster, seen.camera, gt, seen.mask, seen.contour, rims)
+    noise = noise_of(seen, rims, centred - bias, known, correlated=True)
+    agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
+    rows = rim_rows(seen, rims._replace(found=agreeing), noise, posed, gt, bias)
+    return rows._replace(loss=np.full(len(rows.loss), LINEAR))

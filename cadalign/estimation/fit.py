@@ -1,0 +1,404 @@
+"""`fit` and `fit_batch`: from keypoints on models and in images to the models' alignments."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
+from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.batch import BatchResult
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
+from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
+from cadalign.estimation.result import FitResult, FitStats
+from cadalign.estimation.solve import alternatives_of, camera_of, solve
+from cadalign.estimation.symmetry import canonical_batch, canonical_fit, checked_symmetry
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
+
+_INLIER_ROUNDS = 5
+
+
+@np.errstate(all="ignore")  # what is not finite is refused
+def fit(
+    points_3d: npt.ArrayLike,
+    points_2d: npt.ArrayLike,
+    camera: Camera,
+    *,
+    method: str = "optimal",
+    sigma: Sigma | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
+    ransac: RansacOptions | None = None,
+    confidences: npt.ArrayLike | None = None,
+    symmetry: Symmetry | None = None,
+) -> FitResult:
+    """Estimate rotation, translation and stretch of a model from its keypoints in one image.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Keypoints on the model, in the model's own coordinates.
+    points_2d : (n, 2) float
+        The same keypoints in the image [px]; integers are pixel centres.
+    camera : Camera
+        The calibrated camera. Lens distortion is honoured. Where the focal length is estimated,
+        that of the camera counts for nothing: `Camera.without_focal` has none.
+    method : {"optimal", "aepnp", "aepnp-paper", "epnp"}
+        - ``optimal``: the maximum-likelihood alignment, searched for globally. From 5 points up;
+          4 points give every alignment that reprojects exactly, that with the least stretch
+          first.
+        - ``aepnp``: the linear solver, see `cadalign.solvers.aepnp`; at least 6 points.
+        - ``aepnp-paper``: the solver of the AEPnP paper, as published; at least 6 points.
+        - ``epnp``: OpenCV's EPnP, which does not stretch the model; at least 4 points.
+    sigma : float, (n,) float, (n, 2, 2) float or None
+        Standard deviation of the keypoints, of each keypoint, or covariance of each [px]. None
+        estimates it from the residuals: the choice for a model that is only similar to the object,
+        where shapes differ by more than the pixels' noise.
+    loss : {"linear", "huber", "cauchy"}
+        Loss on the length of a residual: its square, or less once it exceeds ``loss_scale``.
+    loss_scale : float
+        Length at which a robust loss begins to bend [sigma].
+    stretch : str, optional
+        The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
+        or ``"none"``. The others keep the scale 1.
+    scale_prior_sigma : float, optional
+        Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
+        It keeps keypoints in one plane, or seen end-on, solvable.
+    known_axis : {"x", "y", "z"}
+        The model's axis whose length is right. One image alone does not tell size from distance.
+    focal : {"known", "estimate"}
+        Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
+        5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
+        pixels are the camera's.
+    focal_prior : FocalPrior, optional
+        Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`.
+    ransac : RansacOptions, optional
+        Search for the alignment with the most inliers, and fit to these: for keypoints with
+        outliers. ``result.inliers`` marks the inliers.
+    confidences : (n,) float, optional
+        Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
+    symmetry : Symmetry, optional
+        Motions that take the model to itself. Of the alignments that are equal under it, the result
+        is the one nearest to upright, y up, with the model's z axis towards the camera, and no
+        other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
+        that differs across an axis leaves half turns of its rotations; ``stretch="y"`` keeps round
+        what is round about y. See `cadalign.geometry.symmetry_group`.
+
+    Returns
+    -------
+    FitResult
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, a value is NaN or infinite, or an option is invalid.
+    DegenerateError
+        If the points are too few or don't determine the alignment (the message says which part of
+        it), or no solution has them all in front of the camera.
+    NoConsensusError
+        With ``ransac``: if no alignment has more support than chance gives.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> problem = simulate_problem(np.random.default_rng(1), points=10, noise_px=0.0)
+    >>> result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    >>> bool(np.allclose(result.alignment.scale, problem.alignment.scale))
+    True
+
+    The same photo without its focal length, which is 150 px:
+
+    >>> camera = Camera.without_focal(640, 480)
+    >>> result = fit(problem.points_3d, problem.points_2d, camera, focal="estimate")
+    >>> round(result.camera.fx, 3)
+    150.0
+    """
+    start = time.perf_counter()
+    shape = (stretch, scale_prior_sigma, known_axis)
+    chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
+    try:
+        options = _checked_options(*chosen)
+    except InputError:
+        raise
+    except (TypeError, ValueError):  # an array as sigma has no hash
+        options = FitOptions(method, _copied(sigma), *chosen[2:])
+    problems = pack_one(points_3d, points_2d, camera)
+    _check_ransac(ransac, confidences)
+    if symmetry is not None:
+        checked_symmetry(symmetry)
+    if ransac is None:
+        result = _fit_all(problems, options, start)
+    else:
+        result = _fit_robustly(problems, options, ransac, confidences, start)
+    return result if symmetry is None else canonical_fit(result, symmetry).result
+
+
+@np.errstate(all="ignore")
+def fit_batch(
+    points_3d: Sequence[npt.ArrayLike] | FloatArray,
+    points_2d: Sequence[npt.ArrayLike] | FloatArray,
+    camera: Camera | Sequence[Camera],
+    *,
+    method: str = "optimal",
+    sigma: Sigma | Sequence[Sigma] | None = 1.0,
+    loss: str = "linear",
+    loss_scale: float = 2.0,
+    stretch: str | None = None,
+    scale_prior_sigma: float | None = None,
+    known_axis: str = "x",
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
+    ransac: RansacOptions | None = None,
+    confidences: Sequence[npt.ArrayLike] | None = None,
+    symmetry: Symmetry | None = None,
+    workers: int = 1,
+) -> BatchResult:
+    """Solve many independent problems in one call; each as `fit` does, bit for bit.
+
+    Parameters
+    ----------
+    points_3d : (B, n, 3) float or sequence of B (n_b, 3) float
+        Model points of every problem.
+    points_2d : (B, n, 2) float or sequence of B (n_b, 2) float
+        Image points of every problem [px].
+    camera : Camera or sequence of B Camera
+        One for all problems, or one each.
+    sigma : float, None, or sequence of B
+        As for `fit`, for all problems; a sequence gives each problem its own.
+    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior, ransac
+        As for `fit`; every problem has a focal length of its own.
+    confidences : sequence of B (n_b,) float, optional
+        As for `fit`, for each problem.
+    symmetry : Symmetry, optional
+        As for `fit`, of all models.
+    workers : int
+        Number of threads that share the problems; -1 for all cores.
+
+    Returns
+    -------
+    BatchResult
+        Arrays over the problems; a problem without solution has its error there, and does not stop
+        the others.
+
+    Raises
+    ------
+    InputError
+        If the arguments of any problem, or an option, are invalid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> rng = np.random.default_rng(1)
+    >>> problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (8, 20)]
+    >>> batch = fit_batch(
+    ...     [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
+    ... )
+    >>> batch.scale.shape
+    (2, 3)
+    """
+    per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
+    options = FitOptions(
+        method=method,
+        sigma=1.0 if per_problem else sigma,  # type: ignore[arg-type]
+        loss=loss,
+        loss_scale=loss_scale,
+        stretch=stretch,
+        scale_prior_sigma=scale_prior_sigma,
+        known_axis=known_axis,
+        focal=focal,
+        focal_prior=focal_prior,
+    )
+    problems = pack_many(points_3d, points_2d, camera)
+    sigmas: Sequence[Sigma] | None = None
+    if per_problem:
+        sigmas = list(each_of(sigma, "sigma", len(problems), "values"))
+    _check_ransac(ransac, confidences)
+    if confidences is not None:
+        confidences = each_of(confidences, "confidences", len(problems), "sets")
+    checked_symmetry(symmetry)
+    bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
+    parts = [(a, b) for a, b in pairwise(bounds) if a < b]
+
+    @np.errstate(all="ignore")  # holds for one thread only
+    def run(part: tuple[int, int]) -> BatchResult:
+        some = problems.part(*part)
+        own = None if sigmas is None else sigmas[part[0] : part[1]]
+        if ransac is None and not options.estimates_in_rounds:
+            return BatchResult.of_solutions(some, solve(some, options, own))
+        trusted = None if confidences is None else confidences[part[0] : part[1]]
+        fits = _fits(some, options, ransac, own, trusted)
+        return BatchResult.of_fits(some, fits, focal=options.focal)
+
+    if len(parts) < 2:
+        batch = run((0, len(problems)))
+    else:
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(len(parts)) as pool:
+            batch = BatchResult.joined(list(pool.map(run, parts)))
+    return batch if symmetry is None else canonical_batch(batch, symmetry, options)
+
+
+def _copied(sigma: Any) -> Any:
+    """A copy that the caller does not go on to change."""
+    try:
+        return deepcopy(sigma)
+    except TypeError:  # a memoryview
+        return np.array(sigma)
+
+
+def _check_ransac(ransac: object, confidences: object) -> None:
+    if ransac is not None and not isinstance(ransac, RansacOptions):
+        what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
+        raise InputError(what, where="ransac")
+    if ransac is None and confidences is not None:
+        raise InputError(
+            "given without ransac",
+            where="confidences",
+            fix="give ransac=RansacOptions(...), or the keypoints' sigma instead",
+        )
+
+
+def _fits(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    sigmas: Sequence[Sigma] | None,
+    confidences: Sequence[npt.ArrayLike] | None,
+) -> list[FitResult | CadalignError]:
+    """Fits of all problems, one by one; an error takes the place of a result."""
+    fits: list[FitResult | CadalignError] = []
+    for b in range(len(problems)):
+        own = options if sigmas is None else replace(options, sigma=sigmas[b])
+        trusted = None if confidences is None else confidences[b]
+        start = time.perf_counter()
+        one = problems.part(b, b + 1)
+        try:
+            if ransac is None:
+                fits.append(_fit_all(one, own, start))
+            else:
+                fits.append(_fit_robustly(one, own, ransac, trusted, start))
+        except CadalignError as error:
+            fits.append(error)
+    return fits
+
+
+def _fit_robustly(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions,
+    confidences: npt.ArrayLike | None,
+    start: float,
+) -> FitResult:
+    """Fit the only problem to the keypoints that support its best alignment."""
+    # Only here: most programs never search for outliers, and its kernels take time to import.
+    from cadalign.estimation.robust import find_consensus, residuals_of
+
+    if options.method != "optimal":
+        raise InputError(
+            f"the method {options.method!r} does not go with ransac",
+            where="method",
+            fix="leave it at 'optimal'; RansacOptions(minimal=...) names the minimal solver",
+        )
+    check_sigmas([options.sigma], problems.counts)
+    consensus = find_consensus(problems, options, ransac, confidences)
+    if not ransac.refine:
+        return replace(
+            consensus,
+            points_3d=problems.points_3d.copy(),
+            stats=replace(consensus.stats, seconds=time.perf_counter() - start),
+        )
+    inliers = consensus.inliers
+    result = _fit_inliers(problems, options, inliers, start)
+    for _ in range(_INLIER_ROUNDS):
+        residuals = residuals_of(problems, result.alignment, result.camera)
+        kept = np.linalg.norm(residuals, axis=1) < ransac.max_reproj_error
+        if (kept == inliers).all() or kept.sum() < inliers.sum():
+            break
+        inliers = kept
+        result = _fit_inliers(problems, options, inliers, start)
+    return replace(
+        result,
+        points_3d=problems.points_3d.copy(),
+        residuals=residuals_of(problems, result.alignment, result.camera),
+        inliers=inliers,
+        options=options,
+        method="ransac-optimal",
+        stats=replace(
+            consensus.stats,
+            seconds=time.perf_counter() - start,
+            inlier_ratio=float(inliers.mean()),
+        ),
+    )
+
+
+def _fit_inliers(
+    problems: Problems, options: FitOptions, inliers: BoolArray, start: float
+) -> FitResult:
+    """The optimum for some of the only problem's keypoints."""
+    sigma = options.sigma
+    if sigma is not None and np.ndim(sigma) > 0:
+        shape = (len(inliers),) if np.ndim(sigma) == 1 else (len(inliers), 2, 2)
+        sigma = as_floats(sigma, name="sigma", shape=shape)[inliers]
+    some = Problems(
+        problems.points_3d[inliers],
+        problems.points_2d[inliers],
+        np.array([0, int(inliers.sum())]),
+        problems.cameras,
+    )
+    return _fit_all(some, replace(options, sigma=sigma), start)
+
+
+# Checking options takes as long as solving a small problem linearly, and calls repeat them.
+_checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
+
+
+def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult:
+    """Fit the only problem to all its keypoints."""
+    solutions = solve(problems, options)
+    if solutions.errors:
+        raise solutions.errors[0]
+    alignment = Alignment.from_packed(solutions.poses[0, 0])
+    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
+    sigma = None
+    if solutions.sigmas is not None:
+        sigma = float(solutions.sigmas[0])
+    elif options.method == "optimal" and isinstance(options.sigma, int | float):
+        sigma = float(options.sigma)
+    inliers = np.empty(len(problems.points_3d), dtype=bool)
+    inliers.fill(True)
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
+        residuals=solutions.residuals,
+        inliers=inliers,
+        method=options.method,
+        camera=camera_of(problems, solutions, 0),
+        sigma=sigma,
+        covariance=None if solutions.covariances is None else solutions.covariances[0],
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+        focal=options.focal,
+        focal_prior=options.focal_prior,
+        alternatives=alternatives_of(problems, solutions, minima, options) if minima > 1 else (),
+        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
+        options=options,
+    )

@@ -1,0 +1,171 @@
+"""Inliers of a joint estimate: keypoints that one pose and one shape explain together."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.starts import Start, in_rig, starts_of
+from cadalign.solvers.constants import CAUCHY, LINEAR, UNKNOWNS
+from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
+from cadalign.solvers.joint.search import Minima, search_joint
+from cadalign.solvers.joint.starts import ViewRays, rays_in
+from cadalign.solvers.optimal import optimal_batch
+
+_SAMPLE = 4
+_MOST_SAMPLES = 100
+_REFINED = 8
+_ROUNDS = 5
+_KEPT = 4  # minima of the robust search that are settled on their inliers
+_LEAST_INLIERS = 3
+_OUTLIER_COST = 5.0  # beyond the square of its threshold
+
+
+class Consensus(NamedTuple):
+    """Sightings (N,) that agree, the estimate from them, and its score."""
+
+    inliers: BoolArray
+    evidence: Evidence
+    state: State
+    cost: float
+    score: float
+
+
+def find_consensus(
+    evidence: Evidence, threshold: FloatArray, seed: int, init: Start | None = None
+) -> tuple[list[Consensus], int, int]:
+    """Estimates that most keypoints support, the best first, with the effort they took.
+
+    Starts are the poses under a robust loss and those of small samples. Each is refined under the
+    robust loss, then on its inliers alone until these don't change. A keypoint that is left out
+    costs as much as one at its threshold, and the logarithm that one more keypoint would add.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    threshold : (N,) float
+        Largest whitened residual of an inlier.
+    seed : int
+        Seed of the samples.
+    init : Start, optional
+        One more start.
+    """
+    robust = with_loss(evidence, CAUCHY)
+    poses, log_scales = starts_of(robust, init)
+    if evidence.rig.pose.max() == 0:
+        samples = np.array(
+            [
+                in_rig(pose, camera)
+                for view, camera in enumerate(evidence.rig.cam_from_rig)
+                for pose in _hypotheses(evidence, view, seed)
+            ]
+        ).reshape(-1, 12)
+        poses = np.concatenate([poses, samples[:, None]])
+        log_scales = np.concatenate([log_scales, np.zeros((len(samples), 3))])
+    if not len(poses):
+        return [], 0, 0
+    minima, count, iterations = search_joint(robust, poses, log_scales)
+    found = []
+    for k in range(min(count, _KEPT)):
+        refined = _settle(evidence, state_of(minima, k), threshold)
+        if refined is not None:
+            found.append(refined)
+    found.sort(key=lambda consensus: consensus.score)
+    return found, iterations, len(poses)
+
+
+def _settle(evidence: Evidence, state: State, threshold: FloatArray) -> Consensus | None:
+    """Refine on the inliers until these don't change."""
+    best: Consensus | None = None
+    inliers = _lengths(evidence, state) < threshold
+    for _ in range(_ROUNDS):
+        if inliers.sum() < _LEAST_INLIERS:
+            break
+        some = with_sightings(evidence, inliers)
+        minima, count, _ = search_joint(some, state.poses[None], state.log_scales[None])
+        if not count:
+            break
+        state = state_of(minima, 0)
+        left_out = threshold[~inliers] ** 2 + _OUTLIER_COST
+        score = float(minima.scores[0]) + float(left_out.sum())
+        if best is None or score < best.score:
+            best = Consensus(inliers, some, state, float(minima.costs[0]), score)
+        again = _lengths(evidence, state) < threshold
+        if (again == inliers).all():
+            break
+        inliers = again
+    return best
+
+
+def _lengths(evidence: Evidence, state: State) -> FloatArray:
+    """Whitened lengths (N,) of all residuals in the image; infinite behind a camera."""
+    points, sightings, rig = points_of(evidence.shape, state), evidence.sightings, evidence.rig
+    poses = state.poses[rig.pose[sightings.image]]
+    cameras = rig.cam_from_rig[sightings.image]
+    seen = points[sightings.point]
+    for motion in (poses, cameras):
+        rotation = motion[:, :9].reshape(-1, 3, 3)
+        seen = (rotation @ seen[:, :, None])[:, :, 0] + motion[:, 9:]
+    error = seen[:, :2] / seen[:, 2:] - sightings.rays
+    a, b, c = sightings.whitening.T
+    lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
+    return np.where(seen[:, 2] > 0, lengths, np.inf)
+
+
+def with_loss(evidence: Evidence, loss: int) -> Evidence:
+    """The same evidence under another loss."""
+    old = evidence.sightings
+    return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), loss)))
+
+
+def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
+    """The evidence of some sightings."""
+    columns: list[Any] = [np.ascontiguousarray(each[kept]) for each in evidence.sightings]
+    some = Sightings(*columns)
+    return evidence._replace(sightings=some)
+
+
+def state_of(minima: Minima, k: int) -> State:
+    """The state at minimum k."""
+    return State(
+        minima.poses[k], minima.log_scales[k], minima.coefficients[k], minima.displacements[k]
+    )
+
+
+def _hypotheses(evidence: Evidence, view: int, seed: int) -> FloatArray:
+    """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
+    given = rays_in(evidence, view)
+    count = len(given.points)
+    if count < _SAMPLE:
+        return np.empty((0, 12))
+    rng = np.random.default_rng(seed)
+    draws = np.array([rng.permutation(count)[:_SAMPLE] for _ in range(_MOST_SAMPLES)])
+    draws = np.unique(np.sort(draws, axis=1), axis=0)
+    free = np.ones(UNKNOWNS)
+    free[6:] = 0.0
+    chosen = draws.ravel()
+    found, costs, *_ = optimal_batch(
+        given.points[chosen],
+        given.rays[chosen],
+        given.whitening[chosen],
+        np.arange(len(draws) + 1) * _SAMPLE,
+        LINEAR,
+        np.ones(len(draws)),
+        np.zeros(len(draws)),
+        free,
+        _SAMPLE,
+    )
+    poses = found[np.isfinite(costs)]
+    scores = np.array([_truncated(given, pose) for pose in poses])
+    return poses[np.argsort(scores)][:_REFINED, :12]
+
+
+def _truncated(given: ViewRays, pose: FloatArray) -> float:
+    """Sum of squared whitened residuals, each at most 9."""
+    seen = given.points @ pose[:9].reshape(3, 3).T + pose[9:12]
+    du = seen[:, :2] / seen[:, 2:] - given.rays
+    a, b, c = given.whitening.T
+    squares = (a * du[:, 0] + b * du[:, 1]) ** 2 + (c * du[:, 1]) ** 2
+    return float(np.where(seen[:, 2] > 0, np.minimum(squares, 9.0), 9.0).sum())

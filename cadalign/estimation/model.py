@@ -1,0 +1,181 @@
+"""A CAD model with known keypoints, for `align` where no category was learned; known lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
+from cadalign.errors import InputError, quote
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
+from cadalign.estimation.symmetry import checked_symmetry
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.symmetry import Symmetry
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Model:
+    """One CAD model: its keypoints, and how far the object may differ from it.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        Keypoints, in the model's own coordinates; a model with a mesh needs none for masks.
+    ids : sequence of n int or str, optional
+        Their semantic ids or names; by default their numbers 0 to n - 1.
+    bounds : (2, 3) float, optional
+        Least and greatest coordinates of the model; by default the mesh's, else the keypoints'.
+    mesh : Mesh, optional
+        The model's surface, for `AlignResult.mesh`.
+    shape_sigma : float, optional
+        Standard deviation of the keypoints' positions on the object about those on the stretched
+        model, along each axis [model units]: for an object that is only similar. None for the
+        exact, stretched model.
+    stretch, known_axis
+        As for `cadalign.fit`.
+    scale_prior_sigma : float, optional
+        As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
+        similar has similar proportions, and its keypoints alone would say otherwise.
+    symmetry : Symmetry, optional
+        As for `cadalign.fit`: motions that take the model to itself. Where the object's size is
+        estimated, a quarter turn that exchanges two stretches is an equal alignment, too.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, ids repeat, a value is NaN or infinite, or an option is invalid.
+
+    Examples
+    --------
+    >>> corners = [[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    >>> Model(points_3d=corners, shape_sigma=0.02).bounds.tolist()
+    [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+    """
+
+    points_3d: npt.ArrayLike = ()
+    ids: Sequence[Hashable] | None = None
+    bounds: npt.ArrayLike | None = None
+    mesh: Mesh | None = None
+    shape_sigma: float | None = None
+    stretch: str | None = None
+    scale_prior_sigma: float | None = None
+    known_axis: str = "x"
+    symmetry: Symmetry | None = None
+
+    def __repr__(self) -> str:
+        mesh = "" if self.mesh is None else f", {self.mesh!r}"
+        sigma = "" if self.shape_sigma is None else f", shape_sigma={self.shape_sigma:g}"
+        return f"Model({np.shape(self.points_3d)[0]} keypoints{mesh}{sigma})"
+
+    def __post_init__(self) -> None:
+        given_points = np.empty((0, 3)) if np.size(self.points_3d) == 0 else self.points_3d
+        points = as_points(given_points, name="points_3d", dimension=3)
+        if not len(points) and self.mesh is None:
+            raise InputError("a model needs keypoints", where="points_3d", fix="or give a mesh")
+        object.__setattr__(self, "points_3d", read_only(points))
+        object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        given = self.bounds
+        if given is None:
+            given = self.mesh.bounds if self.mesh is not None else _extent(points)
+        bounds = as_floats(given, name="bounds", shape=(2, 3))
+        if (bounds[1] < bounds[0]).any():
+            raise InputError("the first row must hold the least coordinates", where="bounds")
+        object.__setattr__(self, "bounds", read_only(bounds))
+        if self.shape_sigma is not None:
+            sigma = as_positive(self.shape_sigma, name="shape_sigma")
+            object.__setattr__(self, "shape_sigma", sigma)
+        checked_symmetry(self.symmetry)
+        self.fit_options(1.0)
+
+    def fit_options(self, sigma: float) -> FitOptions:
+        """The options of the plain fit to this model."""
+        prior = self.scale_prior_sigma
+        if prior is None and self.shape_sigma is not None:
+            prior = SIMILAR_SCALE_SIGMA
+        return FitOptions(
+            sigma=sigma,
+            stretch=self.stretch,
+            scale_prior_sigma=prior,
+            known_axis=self.known_axis,
+        )
+
+
+def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
+    """Ids of ``count`` keypoints, each once; their numbers where none are given.
+
+    Raises
+    ------
+    InputError
+        If there are more or fewer, or one occurs twice.
+    """
+    if ids is None:
+        return tuple(range(count))
+    listed = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+    if len(listed) != count:
+        raise InputError(f"{len(listed)} ids for {count} keypoints", where="ids")
+    seen: set[Hashable] = set()
+    for name in listed:
+        if not isinstance(name, str | int | np.integer) or isinstance(name, bool):
+            raise InputError(f"{quote(name)} is neither a number nor a name", where="ids")
+        if name in seen:
+            raise InputError(f"{quote(name)} occurs twice", where="ids", fix="give each once")
+        seen.add(name)
+    return listed
+
+
+def _extent(points: FloatArray) -> FloatArray:
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Size:
+    """Known lengths of an object's box along the model's axes.
+
+    Parameters
+    ----------
+    width, height, length : float, optional
+        Along x, y, z [the unit in which pose and size are wanted].
+    sigma : float or (3,) float
+        Standard deviation of the lengths, relative (0.01 is 1 %).
+
+    Raises
+    ------
+    InputError
+        If no length is given, or a value is not positive.
+
+    Examples
+    --------
+    >>> Size(height=0.81, sigma=0.005).lengths.tolist()
+    [nan, 0.81, nan]
+    """
+
+    width: float | None = None
+    height: float | None = None
+    length: float | None = None
+    sigma: npt.ArrayLike = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "length"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_positive(getattr(self, name), name=name))
+        if np.isnan(self.lengths).all():
+            fix = "give a width, a height or a length"
+            raise InputError("no length is given", where="size", fix=fix)
+        relative = np.asarray(self.sigma, dtype=np.float64)
+        if relative.shape not in ((), (3,)) or not (relative > 0).all():
+            raise InputError("must be positive, one or one per axis", where="sigma")
+
+    @property
+    def lengths(self) -> FloatArray:
+        """Lengths (3,) along x, y, z; NaN where unknown."""
+        given = (self.width, self.height, self.length)
+        return np.array([np.nan if each is None else each for each in given])
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Standard deviations (3,) of the lengths; NaN where unknown."""
+        return np.asarray(self.lengths * np.asarray(self.sigma, dtype=np.float64))

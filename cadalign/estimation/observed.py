@@ -1,0 +1,253 @@
+"""Models, views and known lengths for `align`, of observation files and reconstructed photos."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.errors import CadalignError, InputError, quote
+from cadalign.estimation.model import Model, Size
+from cadalign.estimation.options import FitOptions, Sigma
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.documents import within
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import KeypointId
+
+
+def model_of(
+    observation: Observation,
+    *,
+    options: FitOptions,
+    shape_sigma: float | None = None,
+    mesh: Mesh | None = None,
+) -> Model:
+    """The model of an observation's own keypoints, those of all its views.
+
+    Parameters
+    ----------
+    observation : Observation
+    options : FitOptions
+        Of these the known axis, the stretch and the prior on it count.
+    shape_sigma : float, optional
+        See `cadalign.Model`.
+    mesh : Mesh, optional
+        That of the model.
+
+    Raises
+    ------
+    InputError
+        If views place the same keypoint at different points of the model.
+    """
+    points: dict[Hashable, tuple[float, ...]] = {}
+    labels = own_ids(observation.views)
+    for number, (view, names) in enumerate(zip(observation.views, labels, strict=True)):
+        for row, (name, xyz) in enumerate(zip(names, view.points_3d.tolist(), strict=True)):
+            if points.setdefault(name, tuple(xyz)) != tuple(xyz):
+                raise InputError(
+                    f"differs from that of keypoint {name!r} in a view before",
+                    where=f"views[{number}].keypoints[{row}].xyz",
+                    fix="give the same point of the model",
+                )
+    return Model(
+        points_3d=list(points.values()),
+        ids=list(points),
+        mesh=mesh,
+        shape_sigma=shape_sigma,
+        stretch=options.stretch,
+        scale_prior_sigma=options.scale_prior_sigma,
+        known_axis=options.known_axis,
+        symmetry=observation.symmetry,
+    )
+
+
+def views_of(
+    observation: Observation, model: Model | ShapeModel, *, sigma: Sigma | None = None
+) -> tuple[View, ...]:
+    """Evidence of an observation's images about a model.
+
+    A learned shape's keypoints are found by semantic id or by name, as the shape has them.
+
+    Parameters
+    ----------
+    observation : Observation
+    model : Model or ShapeModel
+    sigma : float or array, optional
+        Standard deviation of the keypoints [px] in place of the observation's, which is 1 where it
+        has none.
+
+    Raises
+    ------
+    InputError
+        If the shape has no such keypoints, the observation has no ids or names, one of them occurs
+        twice, or what the observation says of an image is invalid.
+    DataError
+        If a mask or a depth image cannot be read.
+    """
+    own = own_ids(observation.views)
+    views = []
+    for number, image in enumerate(observation.views):
+        with within(f"views[{number}]") if observation.others else nullcontext():
+            ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
+            views.append(_view(image, ids, sigma))
+    return tuple(views)
+
+
+def size_of(observation: Observation) -> Size | None:
+    """The known lengths of an observation's object, if there are any."""
+    return None if observation.size is None else Size(**observation.size.given)
+
+
+def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
+    """The ids, or names, by which a learned shape knows an image's keypoints.
+
+    Raises
+    ------
+    InputError
+        As `views_of`.
+    """
+    if not len(image.points_2d):
+        return ()
+    named = isinstance(shape.ids[0], str)
+    field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
+    given = image.names if named else image.semantic_ids
+    if given is None:
+        raise InputError(
+            f"the keypoints have no {field}",
+            where="keypoints",
+            fix=f"the shape of {shape.category} knows its keypoints by their {kind}",
+        )
+    ids = tuple(each if named else int(each) for each in given)
+    shape.rows(ids, where=f"keypoints.{field}")
+    twice = next((each for row, each in enumerate(ids) if each in ids[:row]), None)
+    if twice is not None:
+        raise InputError(
+            f"{twice!r} occurs twice", where=f"keypoints.{field}", fix="give each once"
+        )
+    return ids
+
+
+def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]:
+    """Labels of the images' keypoints by which they are the same in several.
+
+    Their semantic ids or names, where these tell all keypoints of an image apart; otherwise their
+    numbers, in several images those of equal ``xyz``.
+    """
+    shown = [image for image in images if len(image.points_2d)]
+    for field in ("semantic_ids", "names"):
+        columns = [getattr(image, field) for image in shown]
+        if all(column is not None and len(set(column)) == len(column) for column in columns):
+            of_all = [getattr(image, field) if len(image.points_2d) else () for image in images]
+            return tuple(
+                tuple(each if isinstance(each, str) else int(each) for each in column)
+                for column in of_all
+            )
+    if len(shown) < 2:
+        return tuple(tuple(range(len(image.points_2d))) for image in images)
+    numbers: dict[tuple[float, ...], int] = {}
+    return tuple(
+        tuple(numbers.setdefault(tuple(xyz), len(numbers)) for xyz in image.points_3d.tolist())
+        for image in images
+    )
+
+
+def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) -> View:
+    evidence = image.evidence.given
+    if image.depths is not None:
+        evidence["depth"] = image.depths
+    if sigma is None:
+        sigma = 1.0 if image.sigma is None else image.sigma
+    return View(
+        image.camera,
+        image.points_2d,
+        ids=ids,
+        sigma=sigma,
+        confidences=image.confidences,
+        **evidence,
+    )
+
+
+class Photo(Protocol):
+    """A photo of a reconstruction, such as `cadalign.datasets.Correspondences`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The calibrated camera."""
+
+    @property
+    def cam_from_world(self) -> Alignment:
+        """Its pose."""
+
+
+class Reconstruction(Protocol):
+    """Photos by their names, such as `cadalign.datasets.Colmap`."""
+
+    def __getitem__(self, name: str, /) -> Photo:
+        """One photo."""
+
+
+Keypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
+
+
+def views_from(
+    images: Reconstruction, keypoints: Mapping[str, Keypoints], **options: Any
+) -> list[View]:
+    """Views with the cameras and the known poses of a reconstruction's photos.
+
+    The reconstruction's frame and unit are those of the result: `AlignResult.rig_from_model` is the
+    alignment in its world.
+
+    Parameters
+    ----------
+    images : Colmap, Bundler or another mapping
+        The reconstruction's photos, of `cadalign.datasets`.
+    keypoints : mapping of str to ((n, 2) float, sequence of n ids or None)
+        For each photo used, by its name: pixels of the object's keypoints, integers being pixel
+        centres, and their ids. One keypoint in a photo counts.
+    **options
+        Further arguments of every `View`, such as ``sigma``.
+
+    Returns
+    -------
+    list of View
+        In the order of ``keypoints``.
+
+    Raises
+    ------
+    InputError
+        If there is no such photo, or its keypoints are invalid.
+    DataError
+        If the reconstruction describes a photo wrongly.
+
+    Examples
+    --------
+    >>> from cadalign.datasets import Colmap
+    >>> images = Colmap("reconstruction")  # doctest: +SKIP
+    >>> views = views_from(images, {"00.jpg": (clicks, ["seat", "leg"])})  # doctest: +SKIP
+    >>> cadalign.align(chair, views).rig_from_model  # doctest: +SKIP
+    """
+    views = []
+    for name, pair in keypoints.items():
+        given: Any = pair
+        image = images[name]
+        pose = np.eye(4)
+        pose[:3, :3] = image.cam_from_world.rotation
+        pose[:3, 3] = image.cam_from_world.translation
+        if not isinstance(given, tuple) or len(given) != 2:
+            what = f"expected (points_2d, ids), got {quote(given)}"
+            raise InputError(what, where=f"keypoints[{quote(name)}]")
+        points_2d, ids = given
+        try:
+            views.append(View(image.camera, points_2d, ids=ids, cam_from_rig=pose, **options))
+        except CadalignError as error:
+            where = f"keypoints[{quote(name)}]{'.' + error.where if error.where else ''}"
+            raise InputError(error.what, where=where, fix=error.fix) from None
+    return views

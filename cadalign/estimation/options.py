@@ -1,0 +1,242 @@
+"""Options of `fit` and `fit_batch`: names, defaults, units and meaning, in this one place.
+
+The command line nests these dataclasses, and shows the text below each field as its help.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray, as_positive, is_number, is_whole
+from cadalign.errors import InputError, quote
+from cadalign.estimation.focal import FocalPrior
+from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
+
+METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
+FOCALS = ("known", "estimate")
+AXES = ("x", "y", "z")
+SIMILAR_SCALE_SIGMA = 0.2
+"""Default deviation of the log scales of an object that is only similar to its model."""
+LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
+MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
+
+Sigma = float | npt.ArrayLike
+
+
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """Options of every estimate of an alignment, of a fit and of a retrieval."""
+
+    method: str = "optimal"
+    """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without stretch);
+    a fit also knows aepnp (linear) and aepnp-paper (linear, as published)."""
+    sigma: Sigma | None = 1.0
+    """Standard deviation of the keypoints [px], one per keypoint, or a 2 x 2 covariance per
+    keypoint; None, for a fit, estimates it from the residuals: the choice for a model that is only
+    similar to the object."""
+    loss: str = "linear"
+    """Loss on the length of a whitened residual: linear (squared), huber or cauchy; the robust ones
+    tolerate outliers."""
+    loss_scale: float = 2.0
+    """Length at which a robust loss begins to bend [sigma]."""
+    stretch: str | None = None
+    """Axes whose scale is estimated: by default both unknown ones; one of them, such as "y"; or
+    "none"."""
+
+
+@dataclass(frozen=True)
+class FitOptions(AlignmentOptions):
+    """Options of a fit.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or unknown, or options exclude each other.
+    """
+
+    scale_prior_sigma: float | None = None
+    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1."""
+    known_axis: str = "x"
+    """Axis of the model whose length is right: x, y or z."""
+    focal: str = "known"
+    """Focal length: known (the camera's) or estimate."""
+    focal_prior: FocalPrior | None = None
+    """Prior on a focal length to be estimated, from EXIF data for example."""
+
+    def __post_init__(self) -> None:
+        _check_known("method", self.method, METHODS)
+        _check_known("loss", self.loss, LOSSES)
+        _check_known("known_axis", self.known_axis, AXES)
+        _check_known("focal", self.focal, FOCALS)
+        object.__setattr__(self, "loss_scale", as_positive(self.loss_scale, name="loss_scale"))
+        if self.scale_prior_sigma is not None:
+            scale_prior_sigma = as_positive(self.scale_prior_sigma, name="scale_prior_sigma")
+            object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
+        if self.sigma is not None and not is_number(self.sigma):
+            try:
+                np.ndim(self.sigma)
+            except ValueError:
+                raise InputError("its entries are not of one shape", where="sigma") from None
+        if self.stretch is not None:
+            self._check_stretch(self.stretch)
+        if self.focal == "estimate" or self.focal_prior is not None:
+            self._check_focal()
+        if self.method != "optimal" and (
+            self.loss != "linear"
+            or self.scale_prior_sigma is not None
+            or (self.stretch is not None and len(self.stretched_axes) < 2)
+        ):
+            raise InputError(
+                f"the method {self.method!r} supports neither loss, stretch nor scale prior",
+                where="method",
+                fix="use the method 'optimal', or leave these options at their defaults",
+            )
+
+    def _check_stretch(self, stretch: object) -> None:
+        axes = [axis for axis in "xyz" if axis != self.known_axis]
+        allowed = ("".join(axes), axes[0], axes[1], "none")
+        if not isinstance(stretch, str) or stretch not in allowed:
+            raise InputError(
+                f"{quote(stretch)} are not axes that can stretch where {self.known_axis} is known",
+                where="stretch",
+                fix=f"give one of {', '.join(allowed)}",
+            )
+
+    def _check_focal(self) -> None:
+        if self.focal == "estimate" and self.method != "optimal":
+            raise InputError(
+                f"the method {self.method!r} needs a known focal length",
+                where="focal",
+                fix="use the method 'optimal'",
+            )
+        if self.focal_prior is None:
+            return
+        if not isinstance(self.focal_prior, FocalPrior):
+            raise InputError(
+                f"expected a cadalign.FocalPrior, got {type(self.focal_prior).__name__}",
+                where="focal_prior",
+            )
+        if self.focal != "estimate":
+            raise InputError(
+                "given for a known focal length",
+                where="focal_prior",
+                fix='give focal="estimate" with it',
+            )
+
+    @property
+    def stretched_axes(self) -> str:
+        """The axes whose scale is estimated."""
+        if self.stretch == "none":
+            return ""
+        return self.stretch or "xyz".replace(self.known_axis, "")
+
+    @property
+    def axis_order(self) -> list[int]:
+        """The model's axes in the solvers' order: the known one first, no reflection."""
+        first = "xyz".index(self.known_axis)
+        return [first, (first + 1) % 3, (first + 2) % 3]
+
+    def in_model_axes(self, poses: FloatArray) -> FloatArray:
+        """Packed poses (..., 15) of the reordered axes as poses of the model's own axes."""
+        place = np.argsort(self.axis_order)
+        return poses[..., np.concatenate([place, 3 + place, 6 + place, [9, 10, 11], 12 + place])]
+
+    @property
+    def free(self) -> FloatArray:
+        """1 for each of the solvers' 8 unknowns that is estimated, 0 for the others."""
+        free = np.ones(UNKNOWNS)
+        for place, axis in enumerate(self.axis_order[1:]):
+            free[6 + place] = float("xyz"[axis] in self.stretched_axes)
+        return free
+
+    @property
+    def prior_weight(self) -> float:
+        """Inverse variance of the prior on the log scales; 0 for none."""
+        return 0.0 if self.scale_prior_sigma is None else float(self.scale_prior_sigma) ** -2
+
+    @property
+    def estimates_in_rounds(self) -> bool:
+        """True if sigma is estimated and the optimum depends on it."""
+        return (
+            self.method == "optimal"
+            and self.sigma is None
+            and (self.loss != "linear" or self.prior_weight > 0 or self.focal_prior is not None)
+        )
+
+    @property
+    def unknowns(self) -> int:
+        """The number of unknowns that are estimated."""
+        return 6 + len(self.stretched_axes) + (self.focal == "estimate")
+
+    @property
+    def estimated_unknowns(self) -> IntArray:
+        """Rows of a result's covariance that belong to unknowns that are estimated.
+
+        Scales come in cyclic order from the known axis, so that names of axes change no result.
+        """
+        scales = "xyz".replace(self.known_axis, "")
+        cyclic = ["xyz"[axis] for axis in self.axis_order[1:]]
+        stretched = [6 + scales.index(axis) for axis in cyclic if axis in self.stretched_axes]
+        return np.array([*range(6), *stretched, *[8][: self.focal == "estimate"]])
+
+    @property
+    def min_points(self) -> int:
+        """The number of keypoints that the method needs."""
+        if self.method == "optimal":
+            prior = len(self.stretched_axes) if self.scale_prior_sigma is not None else 0
+            prior += self.focal_prior is not None
+            return (self.unknowns - prior + 1) // 2
+        return 4 if self.method == "epnp" else 6
+
+
+@dataclass(frozen=True)
+class RansacOptions:
+    """Options of the robust search (LO-RANSAC) for keypoints with outliers.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range or unknown.
+    """
+
+    max_reproj_error: float = 4.0
+    """Largest reprojection error of an inlier [px]."""
+    max_iterations: int = 10_000
+    """Largest number of samples. With few points all subsets are tried once instead."""
+    min_iterations: int = 100
+    """Least number of samples."""
+    success_prob: float = 0.9999
+    """Probability of drawing a sample without outliers before the search ends."""
+    seed: int = 0
+    """Seed of the samples; the same seed gives the same result, bit for bit."""
+    minimal: str = "ap4p"
+    """Minimal solver: ap4p on 4 points, or the linear aepnp on 6 as in the AEPnP paper, which needs
+    a known focal length. Neither finds anything where all keypoints lie in one plane."""
+    refine: bool = True
+    """Optimise new best hypotheses locally, and the last one on all its inliers; otherwise return
+    the best hypothesis as the minimal solver left it."""
+
+    def __post_init__(self) -> None:
+        error = as_positive(self.max_reproj_error, name="max_reproj_error")
+        object.__setattr__(self, "max_reproj_error", error)
+        for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
+            value = getattr(self, name)
+            if not is_whole(value) or not least <= value < 2**63:
+                raise InputError(f"{quote(value)} is not a number of at least {least}", where=name)
+            object.__setattr__(self, name, int(value))
+        if not isinstance(self.refine, bool | np.bool_):
+            raise InputError(f"{quote(self.refine)} is neither True nor False", where="refine")
+        if not is_number(self.success_prob) or not 0 < self.success_prob < 1:
+            what = f"{quote(self.success_prob)} is not between 0 and 1"
+            raise InputError(what, where="success_prob")
+        _check_known("minimal", self.minimal, MINIMAL_SOLVERS)
+
+
+def _check_known(name: str, value: object, known: Collection[str]) -> None:
+    if not isinstance(value, str) or value not in known:
+        fix = f"known are {', '.join(known)}"
+        raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)

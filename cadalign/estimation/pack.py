@@ -1,0 +1,302 @@
+"""From views to the evidence that the kernels take, with depth images sampled at keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+from cadalign.estimation.model import Size
+from cadalign.estimation.options import LOSSES, FitOptions
+from cadalign.estimation.prior import ShapePrior, prior_of, rows_among, scale_priors
+from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.view import View
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.evidence import (
+    Directions,
+    Evidence,
+    Heights,
+    Lengths,
+    Planes,
+    Rig,
+    Shape,
+    Sightings,
+    State,
+)
+
+_NONE = np.empty(0, dtype=np.int64)
+_NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+_RADIUS = 2  # of the window about a keypoint [px]
+_GAP = 4.0  # between surfaces in a window [sigma]
+_LEAST_PIXELS = 3  # of a surface in a window
+_LOSS_SCALE = 3.0  # a keypoint that something hides has the depth of what hides it
+
+
+def evidence_of(
+    prior: ShapePrior,
+    views: Sequence[View],
+    size: Size | None,
+    *,
+    loss: int,
+    loss_scale: float,
+) -> Evidence:
+    """All that the views, the size and the first component of the prior tell.
+
+    Raises
+    ------
+    InputError
+        If a view names a keypoint that the model lacks, tells nothing, or tells of an up axis that
+        the model lacks, or if only some views have a known pose.
+    """
+    rows = [
+        prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+        for number, view in enumerate(views)
+    ]
+    for number, view in enumerate(views):
+        _check_view(prior, view, number)
+    return Evidence(
+        prior.components[0],
+        _sightings(rows, views, loss, loss_scale),
+        _rig(views),
+        _directions(prior, views),
+        _lengths(prior, size),
+        _heights(prior, views),
+        sampled_planes(prior.components[0], rows, views),
+        scale_priors(prior, is_metric(views, size)),
+    )
+
+
+def is_metric(views: Sequence[View], size: Size | None) -> bool:
+    """True if the object's size is told: by depths, lengths, heights, or known camera poses."""
+    if size is not None or any(view.camera_height is not None for view in views):
+        return True
+    depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
+    if any(np.isfinite(depth).any() for depth in depths):
+        return True
+    return len(views) > 1 and views[0].cam_from_rig is not None
+
+
+def _check_view(prior: ShapePrior, view: View, number: int) -> None:
+    has_samples = view.depth is not None and view.mask is not None
+    told = (view.mask, view.up, view.camera_height)
+    if not len(view.keypoint_ids) and all(each is None for each in told) and not has_samples:
+        fix = "give keypoints, a mask or a direction, or leave the view away"
+        raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
+    for name in ("up", "camera_height"):
+        if getattr(view, name) is not None and prior.up is None:
+            fix = f"learn it with an up axis, or leave `{name}` away"
+            raise InputError("the model has no up axis", where=f"views[{number}].{name}", fix=fix)
+
+
+def _sightings(
+    names: Sequence[list[int]], views: Sequence[View], loss: int, loss_scale: float
+) -> Sightings:
+    points, images, rays, whitenings, depths = [], [], [], [], []
+    for number, (rows, view) in enumerate(zip(names, views, strict=True)):
+        pixels = cast(FloatArray, view.points_2d)
+        points.append(np.array(rows, dtype=np.int64))
+        images.append(np.full(len(rows), number))
+        seen = rays_of(np.require(pixels, requirements="W"), view.camera)
+        rays.append(seen)
+        whitenings.append(
+            np.broadcast_to(whitening_of(view.sigma, seen, view.camera), (len(rows), 3))
+        )
+        depths.append(_depths(view, len(rows)))
+    point = np.concatenate(points)
+    order = np.argsort(point, kind="stable")
+    return Sightings(
+        point[order],
+        np.concatenate(images)[order],
+        np.concatenate(rays)[order],
+        np.concatenate(whitenings)[order],
+        np.concatenate(depths)[order],
+        np.full(len(point), loss),
+        np.full(len(point), float(loss_scale)),
+    )
+
+
+def _depths(view: View, count: int) -> FloatArray:
+    """Depths (n, 2) and their inverse standard deviations, 0 where unknown."""
+    found = np.zeros((count, 2))
+    if view.depth is not None and view.depth_image is None:
+        depth = cast(FloatArray, view.depth)
+        known = np.isfinite(depth)
+        relative = np.broadcast_to(np.asarray(view.depth_sigma, dtype=np.float64), (count,))
+        found[known, 0] = depth[known]
+        found[known, 1] = 1.0 / (depth[known] * relative[known])
+    return found
+
+
+def _rig(views: Sequence[View]) -> Rig:
+    posed = [view.cam_from_rig is not None for view in views]
+    if any(posed) != all(posed):
+        raise InputError(
+            "only some views have a known pose",
+            where=f"views[{posed.index(False)}].cam_from_rig",
+            fix="give it for all views, or for none",
+        )
+    if not all(posed):
+        return Rig(np.tile(_NO_RIG, (len(views), 1)), np.arange(len(views)))
+    cameras = [cast(FloatArray, view.cam_from_rig) for view in views]
+    rows = [np.concatenate([pose[:3, :3].ravel(), pose[:3, 3]]) for pose in cameras]
+    return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64))
+
+
+def _directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
+    numbers = [number for number, view in enumerate(views) if view.up is not None]
+    model = np.tile(np.zeros(3) if prior.up is None else prior.up, (len(numbers), 1))
+    camera = [cast(FloatArray, views[number].up) for number in numbers]
+    whitening = [_whitening_of_up(views[number]) for number in numbers]
+    return Directions(
+        model,
+        np.array(camera).reshape(-1, 3),
+        np.array(numbers, dtype=np.int64),
+        np.array(whitening).reshape(-1, 3, 3),
+    )
+
+
+def _whitening_of_up(view: View) -> FloatArray:
+    """Whitening (3, 3) of the difference of directions [1/rad]; along them as weak as across."""
+    sigma = np.asarray(view.up_sigma_deg, dtype=np.float64)
+    if not sigma.ndim:
+        return np.asarray(np.eye(3) / np.radians(sigma))
+    up = cast(FloatArray, view.up)
+    across = np.eye(3) - np.outer(up, up)
+    covariance = across @ np.radians(np.radians(sigma)) @ across
+    largest = np.linalg.eigvalsh(covariance)[-1]
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance + largest * np.outer(up, up))).T)
+
+
+def _lengths(prior: ShapePrior, size: Size | None) -> Lengths:
+    if size is None:
+        return Lengths(np.empty((0, 2), dtype=np.int64), _NONE, np.empty(0), np.empty(0))
+    shape = prior.components[0]
+    axes = np.flatnonzero(np.isfinite(size.lengths))
+    count = len(shape.mean)
+    values, sigmas = size.lengths[axes], size.deviations[axes]
+    for axis in axes:
+        if not prior.lengths[axis] > 0:
+            name = ("width", "height", "length")[axis]
+            what = f"the model has no extent along its {'xyz'[axis]}"
+            raise InputError(what, where=f"size.{name}", fix="leave it away")
+    own = (shape.spread[-2:] ** 2).sum()  # of the two corners, which move by themselves
+    return Lengths(
+        np.tile([count - 2, count - 1], (len(axes), 1)).astype(np.int64),
+        axes.astype(np.int64),
+        values,
+        1.0 / np.sqrt(sigmas**2 + own),
+    )
+
+
+def _heights(prior: ShapePrior, views: Sequence[View]) -> Heights:
+    numbers = [number for number, view in enumerate(views) if view.camera_height is not None]
+    shape, count = prior.components[0], len(prior.components[0].mean)
+    up = np.zeros(3) if prior.up is None else prior.up
+    lowest = count - 2 if up.sum() > 0 else count - 1  # the box's corner in its lowest face
+    values = np.array([views[number].camera_height for number in numbers], dtype=np.float64)
+    relative = np.array([views[number].camera_height_sigma for number in numbers])
+    return Heights(
+        np.full(len(numbers), lowest, dtype=np.int64),
+        np.array(numbers, dtype=np.int64),
+        np.tile(up, (len(numbers), 1)),
+        values,
+        1.0 / np.hypot(values * relative, shape.spread[lowest]),
+    )
+
+
+def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:
+    """Depths of the keypoints ``rows`` of every view that its depth image holds.
+
+    They count under Cauchy's loss: a keypoint may be hidden by something nearer.
+    """
+    points, images, depths, sigmas = [], [], [], []
+    for number, view in enumerate(views):
+        image = view.depth_image
+        if image is None:
+            continue
+        relative = float(cast(float, view.depth_sigma))
+        depth = sample_depth(image, cast(FloatArray, view.points_2d), sigma=relative)
+        known = np.isfinite(depth)
+        points.append(np.array(rows[number], dtype=np.int64)[known])
+        images.append(np.full(int(known.sum()), number))
+        depths.append(depth[known])
+        sigmas.append(relative * depth[known])
+    if not points:
+        none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
+        return Planes(none, none, np.empty((0, 3)), no_value, no_value, none, no_value)
+    point = np.concatenate(points)
+    count = len(point)
+    return Planes(
+        point,
+        np.concatenate(images),
+        np.tile([0.0, 0.0, 1.0], (count, 1)),
+        np.concatenate(depths),
+        1.0 / np.hypot(np.concatenate(sigmas), shape.spread[point]),
+        np.full(count, CAUCHY),
+        np.full(count, _LOSS_SCALE),
+    )
+
+
+def sample_depth(image: FloatArray, points_2d: FloatArray, *, sigma: float) -> FloatArray:
+    """Depths (n,) of keypoints in a depth image; NaN where it holds none.
+
+    At a silhouette, a window about the keypoint shows the object and what is behind it: the depths
+    are split at gaps of some ``sigma`` (relative), and the nearest surface's median is taken.
+
+    Examples
+    --------
+    >>> image = np.full((5, 8), 9.0)
+    >>> image[:, :4] = 2.0
+    >>> sample_depth(image, np.array([[3.4, 2.0], [7.0, 2.0], [60.0, 2.0]]), sigma=0.01).tolist()
+    [2.0, 9.0, nan]
+    """
+    height, width = image.shape
+    found = np.full(len(points_2d), np.nan)
+    for row, (x, y) in enumerate(points_2d):
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            continue
+        left, top = round(float(x)) - _RADIUS, round(float(y)) - _RADIUS
+        window = image[max(top, 0) : top + 2 * _RADIUS + 1, max(left, 0) : left + 2 * _RADIUS + 1]
+        depths = np.sort(window[np.isfinite(window)])
+        breaks = np.flatnonzero(np.diff(depths) > _GAP * sigma * depths[:-1]) + 1
+        surfaces = [part for part in np.split(depths, breaks) if len(part) >= _LEAST_PIXELS]
+        if surfaces:
+            found[row] = np.median(surfaces[0])
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class SingleBasis:
+    """The evidence of one view and the state estimated from it, as `Basis`."""
+
+    model: ShapeModel
+    view: View
+    options: FitOptions
+    component: int
+    pose: FloatArray
+    force: FloatArray
+    numbers: tuple[int, ...] | None = None
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """The evidence in the form of the kernels."""
+        prior = prior_of(self.model)
+        loss, scale = LOSSES[self.options.loss], self.options.loss_scale
+        first = evidence_of(prior, [self.view], None, loss=loss, loss_scale=scale)
+        return first._replace(shape=prior.components[self.component])
+
+    @cached_property
+    def state(self) -> State:
+        """The state that was estimated."""
+        shape = self.evidence.shape
+        rows = rows_among(self.model.ids, self.view.keypoint_ids, "views[0].ids")
+        coefficients = np.tensordot(shape.modes[:, rows], self.force, 2)
+        displacements = np.zeros_like(shape.mean)
+        displacements[rows] = shape.spread[rows, None] ** 2 * self.force
+        return State(self.pose[None], np.zeros(3), coefficients, displacements)

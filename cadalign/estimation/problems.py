@@ -1,0 +1,288 @@
+"""Problems for the solvers, and their solutions: checked and packed correspondences, and weights.
+
+Pixels become rays, and the keypoints' uncertainties the weights of the residuals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, is_number
+from cadalign.errors import CadalignError, InputError, quote
+from cadalign.estimation.options import Sigma
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.projection import all_finite, pinhole_rays
+
+_NO_RESIDUALS = np.empty((0, 2))
+_NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class Problems:
+    """The correspondences of one or many problems, one after the other.
+
+    Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]`` of ``points_3d`` (n, 3) and
+    ``points_2d`` (n, 2) [px]; there is one camera for all, or one each.
+    """
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    offsets: IntArray
+    cameras: tuple[Camera, ...]
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def camera(self, problem: int) -> Camera:
+        """The camera of a problem."""
+        return self.cameras[problem if len(self.cameras) > 1 else 0]
+
+    def rows(self, problem: int) -> slice:
+        """The rows of a problem."""
+        return slice(int(self.offsets[problem]), int(self.offsets[problem + 1]))
+
+    @property
+    def calibrations(self) -> FloatArray:
+        """Focal lengths and principal points (1 or B, 4): fx, fy, cx, cy."""
+        return np.array([[c.fx, c.fy, c.cx, c.cy] for c in self.cameras])
+
+    @property
+    def counts(self) -> IntArray:
+        """Number of points of each problem, (B,) int."""
+        return self.offsets[1:] - self.offsets[:-1]
+
+    @cached_property
+    def distinct_counts(self) -> IntArray:
+        """Number of different pairs of points of each problem, (B,) int."""
+        pairs = np.concatenate([self.points_3d, self.points_2d], axis=1)
+        return np.array([distinct_rows(pairs[self.rows(b)]) for b in range(len(self))])
+
+    def each_camera(self) -> Sequence[Camera]:
+        """The camera of every problem; none at all where no lens has distortion."""
+        if not any(camera.distortion for camera in self.cameras):
+            return ()
+        return self.cameras if len(self.cameras) > 1 else self.cameras * len(self)
+
+    def with_focals(self, focals: FloatArray) -> Problems:
+        """The same problems seen with the focal lengths (B,); NaN leaves a camera as it is."""
+        cameras = tuple(
+            self.camera(b) if math.isnan(focal) else self.camera(b).with_focal(focal)
+            for b, focal in enumerate(focals.tolist())
+        )
+        return replace(self, cameras=cameras)
+
+    def part(self, first: int, last: int) -> Problems:
+        """Problems ``first`` to ``last``, that one left out."""
+        start, end = self.offsets[first], self.offsets[last]
+        return Problems(
+            self.points_3d[start:end],
+            self.points_2d[start:end],
+            self.offsets[first : last + 1] - start,
+            self.cameras[first:last] if len(self.cameras) > 1 else self.cameras,
+        )
+
+
+def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera) -> Problems:
+    """Check one problem's arguments."""
+    model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
+    _check_camera(camera)
+    return Problems(model, image, np.array([0, len(model)]), (camera,))
+
+
+def pack_many(
+    points_3d: Sequence[npt.ArrayLike] | FloatArray,
+    points_2d: Sequence[npt.ArrayLike] | FloatArray,
+    camera: Camera | Sequence[Camera],
+) -> Problems:
+    """Check the arguments of many problems, of the same or of different sizes."""
+    points_3d = each_of(points_3d, "points_3d", None, "")
+    count = len(points_3d)
+    points_2d = each_of(points_2d, "points_2d", count, "sets of image points")
+    given = isinstance(camera, Camera)
+    cameras = (camera,) if given else tuple(each_of(camera, "camera", count, "cameras"))
+    for single in cameras:
+        _check_camera(single)
+    if not count:
+        return Problems(np.empty((0, 3)), np.empty((0, 2)), np.zeros(1, dtype=np.int64), cameras)
+    if _is_stack(points_3d, 3) and _is_stack(points_2d, 2):
+        model = np.array(points_3d, dtype=np.float64, order="C").reshape(-1, 3)
+        image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
+        if len(model) == len(image) and all_finite(model, image):
+            offsets = np.arange(count + 1) * (len(model) // count)
+            return Problems(model, image, offsets, cameras)
+    pairs = [
+        _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
+        for b in range(count)
+    ]
+    offsets = np.concatenate([[0], np.cumsum([len(model) for model, _ in pairs])])
+    return Problems(
+        np.concatenate([model for model, _ in pairs]),
+        np.concatenate([image for _, image in pairs]),
+        offsets.astype(np.int64),
+        cameras,
+    )
+
+
+def distinct_rows(rows: FloatArray) -> int:
+    """The number of different rows among (n, k), told apart by a fixed combination of columns."""
+    combined = np.zeros(len(rows))
+    for k in range(rows.shape[1]):
+        combined += math.sqrt(k + 2.0) * rows[:, k]
+    return len(np.unique(combined))
+
+
+def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
+    """A sequence of one entry for each of ``count`` problems, which messages name ``entries``."""
+    try:
+        each = value if isinstance(value, np.ndarray) and value.ndim else list(value)
+    except TypeError:
+        what = f"expected a sequence of one entry per problem, got {type(value).__name__}"
+        raise InputError(what, where=name) from None
+    if count is not None and len(each) != count:
+        raise InputError(f"{count} problems but {len(each)} {entries}", where=name)
+    return each
+
+
+def _is_stack(value: object, last: int) -> bool:
+    return (
+        type(value) is np.ndarray
+        and value.ndim == 3
+        and value.shape[2] == last
+        and value.dtype.kind == "f"
+    )
+
+
+def _check_camera(camera: object) -> None:
+    if not isinstance(camera, Camera):
+        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+
+
+def _is_plain(points: npt.ArrayLike, dimension: int) -> bool:
+    """True for a writable array of the right form: frozen ones would compile the kernels again."""
+    return (
+        type(points) is np.ndarray
+        and points.dtype == np.float64
+        and points.flags.carray
+        and points.ndim == 2
+        and points.shape[1] == dimension
+    )
+
+
+def _check_pair(
+    points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, name_3d: str, name_2d: str
+) -> tuple[FloatArray, FloatArray]:
+    """Writable arrays (n, 3) and (n, 2) of finite numbers; the given ones where they are that."""
+    model, image = cast(FloatArray, points_3d), cast(FloatArray, points_2d)
+    if not (_is_plain(model, 3) and _is_plain(image, 2) and all_finite(model, image)):
+        model = np.require(as_points(points_3d, name=name_3d, dimension=3), requirements="W")
+        image = np.require(as_points(points_2d, name=name_2d, dimension=2), requirements="W")
+    if len(model) != len(image):
+        raise InputError(
+            f"{len(model)} model points but {len(image)} image points",
+            where=name_2d,
+            fix="row i of both must be the same keypoint",
+        )
+    return model, image
+
+
+def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:
+    """Normalised image coordinates (n, 2) of checked pixels (n, 2)."""
+    if camera.distortion:
+        return camera.normalize(points_2d)
+    return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
+    """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
+
+    A row (a, b, c) is such that (a du + b dv, c dv) has unit covariance for the error (du, dv) of a
+    ray: the upper Cholesky factor of its information matrix. Lens distortion enters by its
+    derivative. A sigma of None counts as 1 px.
+    """
+    if sigma is None:
+        sigma = 1.0
+    if isinstance(sigma, int | float) and not camera.distortion:
+        if not (is_number(sigma) and sigma > 0):
+            raise InputError(f"{quote(sigma)} is not a standard deviation", where="sigma", fix=_FIX)
+        return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
+    information = pixel_information(sigma, len(rays))
+    to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
+    of_rays = np.swapaxes(to_pixels, 1, 2) @ information @ to_pixels
+    a = np.sqrt(of_rays[:, 0, 0])
+    b = of_rays[:, 0, 1] / a
+    c = np.sqrt(of_rays[:, 1, 1] - b * b)
+    return np.stack([a, b, c], axis=1)
+
+
+def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
+    """Check the standard deviations of problems of so many keypoints each, or one for all.
+
+    Raises
+    ------
+    InputError
+        If one is no standard deviation, or has another shape than its keypoints.
+    """
+    for b, sigma in enumerate(sigmas):
+        if sigma is None or (isinstance(sigma, int | float) and is_number(sigma) and sigma > 0):
+            continue
+        if np.ndim(sigma) == 0 or len(sigmas) > 1:
+            pixel_information(sigma, int(counts[b]))
+        else:
+            for count in set(counts.tolist()):
+                pixel_information(sigma, count)
+
+
+_FIX = "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
+
+
+def pixel_information(sigma: Any, count: int) -> FloatArray:
+    """Inverse covariances (n, 2, 2) of the pixels of n keypoints; checks sigma."""
+    dimensions = np.ndim(sigma)
+    if dimensions < 2:
+        shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
+        deviations = as_floats(sigma, name="sigma", shape=shape)
+        if not (deviations > 0).all():
+            raise InputError("has values that are not positive", where="sigma", fix=_FIX)
+        weights = np.broadcast_to(1.0 / deviations**2, (count,))
+        return np.asarray(weights[:, None, None] * np.eye(2))
+    covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))
+    definite = (np.linalg.eigvalsh(covariances)[:, 0] > 0) & (
+        np.abs(covariances[:, 0, 1] - covariances[:, 1, 0])
+        <= 1e-9 * np.abs(covariances).max(axis=(1, 2))
+    )
+    if not definite.all():
+        raise InputError(
+            f"the covariance of keypoint {np.flatnonzero(~definite)[0]} is not symmetric and "
+            "positive definite",
+            where="sigma",
+            fix=_FIX,
+        )
+    return np.asarray(np.linalg.inv(covariances))
+
+
+class Solutions(NamedTuple):
+    """Minima of every problem, the best first.
+
+    ``poses`` (B, k, 15) are packed, ``costs`` (B, k) their whitened squared errors, infinite where
+    there is none; ``covariances`` (B, 8, 8) or (B, 9, 9) and ``residuals`` (n, 2) [px] are those of
+    the best. ``info`` (B, 4) counts minima, iterations and hypotheses, and names an undetermined
+    unknown or -1. ``focals`` (B, k) and ``sigmas`` (B,) [px] are there where they were estimated.
+    """
+
+    poses: FloatArray
+    costs: FloatArray
+    covariances: FloatArray | None
+    statuses: IntArray
+    info: IntArray
+    focals: FloatArray | None = None
+    sigmas: FloatArray | None = None
+    residuals: FloatArray = _NO_RESIDUALS
+    errors: Mapping[int, CadalignError] = _NO_ERRORS

@@ -1,0 +1,202 @@
+"""Robust search: the alignment with the most inliers, by LO-RANSAC over the minimal solver."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, as_floats
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.estimation.focal_search import focal_views, log_focal_prior
+from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
+from cadalign.estimation.problems import Problems, rays_of, whitening_of
+from cadalign.estimation.result import FitResult, FitStats
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
+from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
+from cadalign.solvers.evidence import Keypoints, ScalePrior, Views
+from cadalign.solvers.minimal import MAX_SOLUTIONS
+from cadalign.solvers.alignment import Objective
+from cadalign.solvers.ransac import Settings, ransac_kernel
+
+_MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
+_CHANCE = 0.1  # expected number of models with as much support by chance
+_FLAT = 1e-6  # thickness over extent of what counts as a plane
+_LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
+
+
+def find_consensus(
+    problems: Problems,
+    options: FitOptions,
+    ransac: RansacOptions,
+    confidences: npt.ArrayLike | None,
+) -> FitResult:
+    """The best hypothesis of LO-RANSAC for the only problem, with its inliers.
+
+    Raises
+    ------
+    NoConsensusError
+        If no alignment has more support than chance gives; it carries the best score reached.
+    """
+    camera = problems.cameras[0]
+    points = problems.points_3d[:, options.axis_order]
+    count = len(points)
+    minimal = MINIMAL_SOLVERS[ransac.minimal]
+    size = SAMPLE_SIZES[minimal]
+    if count < size:
+        raise InputError(
+            f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
+        )
+    if options.focal == "estimate" and ransac.minimal != "ap4p":
+        raise InputError(
+            f"{ransac.minimal!r} does not estimate the focal length",
+            where="minimal",
+            fix="leave it at 'ap4p'",
+        )
+    by_confidence = _by_confidence(confidences, count)
+    order = np.random.default_rng(ransac.seed).permutation(count)
+    ranked = np.arange(count) if by_confidence is None else np.argsort(order)[by_confidence]
+    views = _views(problems.points_2d[order], camera, options)
+    exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
+    pose = np.zeros(POSE_SIZE)
+    inliers = np.zeros(count, dtype=bool)
+    score, log_focal, iterations, hypotheses = ransac_kernel(
+        Objective(
+            options.free,
+            Keypoints(
+                np.ascontiguousarray(points[order]), views.rays[0], views.whitening[0], LINEAR, 1.0
+            ),
+            ScalePrior(options.prior_weight),
+        ),
+        views,
+        np.log(views.focals),
+        log_focal_prior(camera, options),
+        ranked,
+        Settings(
+            threshold=float(ransac.max_reproj_error),
+            minimal=minimal,
+            size=size,
+            max_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations),
+            min_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations),
+            success_prob=float(ransac.success_prob),
+            seed=int(ransac.seed),
+            exhaustive=exhaustive,
+            guided=by_confidence is not None,
+            optimize=ransac.refine,
+            estimate_focal=options.focal == "estimate",
+        ),
+        pose,
+        inliers,
+    )
+    if not hypotheses and _are_in_one_plane(points):
+        raise DegenerateError(
+            "all keypoints lie in one plane, where the samples of ransac determine nothing",
+            where="points_3d",
+            fix="leave ransac away: use loss='cauchy', with stretch= or scale_prior_sigma=",
+        )
+    if options.focal == "estimate":
+        camera = camera.with_focal(math.exp(log_focal))
+    alignment = Alignment.from_packed(options.in_model_axes(pose))
+    kept = np.empty(count, dtype=bool)
+    kept[order] = inliers
+    support = int(kept.sum())
+    residuals = residuals_of(problems, alignment, camera)
+    errors = np.linalg.norm(residuals[kept], axis=1)
+    extent = np.ptp(problems.points_2d, axis=0) + 2 * ransac.max_reproj_error
+    area = min(float(np.prod(extent)), float(camera.width) * float(camera.height))
+    size += options.focal == "estimate"  # which half a keypoint determines
+    if not np.isfinite(score) or _expected_by_chance(errors, count, size, area) > _CHANCE:
+        raise NoConsensusError(
+            f"no alignment is supported: the best has {support} of {count} keypoints within "
+            f"{ransac.max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)",
+            where="points_2d",
+            fix="check the correspondences and the camera, or raise max_reproj_error or "
+            "max_iterations",
+            score=float(score),
+            inliers=support,
+        )
+    return FitResult(
+        alignment=alignment,
+        points_3d=problems.points_3d,
+        residuals=residuals,
+        inliers=kept,
+        method=f"ransac-{ransac.minimal}",
+        camera=camera,
+        sigma=None,
+        covariance=None,
+        known_axis=options.known_axis,
+        stretched_axes=options.stretched_axes,
+        focal=options.focal,
+        focal_prior=options.focal_prior,
+        stats=FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score)),
+        options=options,
+    )
+
+
+def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
+    """Rays and weights, in pixels, at the camera's focal length or at those to be tried."""
+    if options.focal == "estimate":
+        return focal_views(points_2d, camera, options.focal_prior, None)
+    camera.require_focal()
+    rays = rays_of(points_2d, camera)
+    return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
+
+
+def _are_in_one_plane(points: FloatArray) -> bool:
+    """True for points that do not all coincide and lie in a plane or on a line."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[0] > 0 and spread[2] <= _FLAT * spread[0])
+
+
+def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
+    """The order of falling confidence; None where there are none, or all are alike."""
+    if confidences is None:
+        return None
+    values = as_floats(confidences, name="confidences", shape=(count,))
+    if (values < 0).any():
+        raise InputError(
+            f"keypoint {int(np.argmax(values < 0))} has the confidence {values.min():g}",
+            where="confidences",
+            fix="give numbers that are not negative",
+        )
+    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None
+
+
+def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) -> float:
+    """The expected number of models as well supported among keypoints scattered at random.
+
+    Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
+    estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
+    ``size`` keypoints, all choices of k keypoints and of a sample among them are counted, and the
+    chance that the others lie within the largest of the k errors; the least such number over k
+    (over the smallest dozen and all of them, which is where it lies). ``errors`` (k,) are those of
+    the supporting keypoints [px], and outliers are scattered over ``area`` [px^2].
+    """
+    if len(errors) <= size:
+        return math.inf
+    radii = np.maximum(np.sort(errors), _LEAST_ERROR)
+    logarithms = [
+        math.log(MAX_SOLUTIONS * (count - size))
+        + _log_choose(count, k)
+        + _log_choose(k, size)
+        + (k - size) * min(0.0, math.log(math.pi * radii[k - 1] ** 2 / area))
+        for k in {*range(size + 1, min(size + 12, len(errors) + 1)), len(errors)}
+    ]
+    return math.exp(min(700.0, *logarithms))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> FloatArray:
+    """Projected minus observed keypoints (n, 2) of the only problem; infinite behind the camera."""
+    in_camera = alignment.apply(problems.points_3d)
+    ahead = in_camera[:, 2] > 0
+    residuals = np.full((len(in_camera), 2), np.inf)
+    projected = camera.pixels_from_normalized(perspective(in_camera[ahead]))
+    residuals[ahead] = projected - problems.points_2d[ahead]
+    return residuals

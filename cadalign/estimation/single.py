@@ -1,0 +1,256 @@
+"""One view of keypoints, the cases that need no joint search.
+
+`fit` solves an exact or stretched model; of a learned shape, the search eliminates the shape.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import DegenerateError
+from cadalign.estimation.align_result import AlignAlternative, AlignResult
+from cadalign.estimation.estimates import curvature_of_rotations, is_other, stretch_of, with_boxes
+from cadalign.estimation.fit import fit
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
+from cadalign.estimation.pack import SingleBasis
+from cadalign.estimation.prior import prior_of, rows_among
+from cadalign.estimation.problems import pixel_information, rays_of, whitening_of
+from cadalign.estimation.result import FitResult, FitStats
+from cadalign.estimation.solve import LEAST_LIKELIHOOD
+from cadalign.estimation.symmetry import canonical_fit, equal_text, held_axes, without_free_turns
+from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
+from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.warnings import another_pose, misfits, weaknesses
+from cadalign.estimation.uncertainty.weakness import unknown_axes
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.inflation import inflation_with
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.marginal.directions import find_directions
+from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
+from cadalign.solvers.marginal.moments import moments_of
+from cadalign.solvers.marginal.posterior import posteriors_of
+from cadalign.solvers.marginal.problem import Mixture, Seen
+from cadalign.solvers.marginal.search import search_view
+
+_LEAST_POINTS = 3
+
+
+def is_plain(model: object, views: Sequence[View]) -> bool:
+    """True where nothing but the keypoints of one view and an exact model is given."""
+    if not isinstance(model, Model) or model.shape_sigma is not None or len(views) != 1:
+        return False
+    view = views[0]
+    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
+    return all(each is None for each in others)
+
+
+def align_plain(
+    model: Model, view: View, *, loss: str, loss_scale: float, ransac: RansacOptions | None
+) -> AlignResult:
+    """The result of `fit`, in the form of `align`'s."""
+    prior = prior_of(model)
+    points = cast(FloatArray, model.points_3d)
+    rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
+    found = fit(
+        points[rows],
+        cast(FloatArray, view.points_2d),
+        view.camera,
+        sigma=view.sigma,
+        loss=loss,
+        loss_scale=loss_scale,
+        stretch=model.stretch,
+        scale_prior_sigma=model.scale_prior_sigma,
+        known_axis=model.known_axis,
+        ransac=ransac,
+        confidences=view.confidences if ransac is not None else None,
+    )
+    columns = [0, 1, 2, 3, 4, 5, *(6 + axis for axis in unknown_axes(model.known_axis))]
+    covariance = np.zeros((9, 9))
+    of_others = [points] * len(found.alternatives)
+    if model.symmetry is not None:
+        found, best, others = canonical_fit(found, model.symmetry)
+        points, of_others = best.relabelled(points), [each.relabelled(points) for each in others]
+    if found.covariance is not None:
+        covariance[np.ix_(columns, columns)] = found.covariance
+    if model.symmetry is not None:
+        covariance = without_free_turns(covariance, best)
+    scale = found.alignment.scale
+    of_points, of_seen = _points_covariances(points, found.alignment, covariance)
+    bounds = cast(FloatArray, model.bounds)
+    return AlignResult(
+        alignment=found.alignment,
+        ids=prior.ids,
+        points_3d=points,
+        bounds=bounds,
+        poses=(found.alignment,),
+        residuals=(found.residuals,),
+        inliers=(found.inliers,),
+        covariance=covariance,
+        points_covariance=of_points,
+        points_cam_covariance=of_seen,
+        stretch=scale,
+        component=0,
+        model=model,
+        alternatives=tuple(
+            AlignAlternative(other.alignment, of_other, bounds, other.relative_likelihood)
+            for other, of_other in zip(found.alternatives, of_others, strict=True)
+        ),
+        warnings=found.warnings,
+        stats=found.stats,
+        evidence=(_summary(found, view),),
+        equal_under_symmetry=equal_text(
+            found.alignment, model.symmetry, held=held_axes(found.stretched_axes)
+        ),
+        cameras=(view.camera,),
+        observed=(cast(FloatArray, view.points_2d),),
+    )
+
+
+def _summary(found: FitResult, view: View) -> EvidenceSummary:
+    """Agreement of the keypoints that the estimate rests on."""
+    residuals = found.residuals[found.inliers]
+    count = len(residuals)
+    sigma = found.sigma if view.sigma is None else view.sigma
+    squares = (residuals * residuals).sum()
+    if isinstance(sigma, int | float):
+        whitened = squares / sigma**2
+    else:
+        information = pixel_information(sigma, len(found.residuals))[found.inliers]
+        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
+    in_sigmas = float(np.sqrt(whitened / (2 * count)))
+    return EvidenceSummary("keypoints", 0, count, in_sigmas, float(np.sqrt(squares / count)), "px")
+
+
+def _points_covariances(
+    points: FloatArray, alignment: Alignment, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
+    stretched = points * alignment.scale
+    by_logs = stretched[:, :, None] * np.eye(3)
+    of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
+    turned = stretched @ alignment.rotation.T
+    by_turn = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)  # columns: axis x turned
+    shifts = np.broadcast_to(np.eye(3), by_turn.shape)
+    rows = np.concatenate([by_turn, shifts, alignment.rotation @ by_logs], axis=2)
+    return of_points, rows @ covariance @ rows.swapaxes(1, 2)
+
+
+def is_single(model: object, views: Sequence[View]) -> bool:
+    """True where nothing but the keypoints of one view and a learned shape is given."""
+    if not isinstance(model, ShapeModel) or len(views) != 1:
+        return False
+    view = views[0]
+    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
+    return len(view.keypoint_ids) >= _LEAST_POINTS and all(each is None for each in others)
+
+
+def align_single(
+    model: ShapeModel, view: View, *, options: FitOptions, init: Alignment | None
+) -> AlignResult:
+    """The result of `cadalign.align` where `is_single` holds.
+
+    Raises
+    ------
+    InputError
+        If the view names a keypoint that the model lacks.
+    DegenerateError
+        If no pose has all keypoints in front of the camera.
+    """
+    start = time.perf_counter()
+    rows = rows_among(model.ids, view.keypoint_ids, "views[0].ids")
+    means, covariances, weights = model.gaussians
+    mixture = Mixture(means, covariances, -2 * np.log(weights))
+    seen = _seen(view, rows, options)
+    minima, count, iterations, hypotheses = search_view(mixture, seen, _given(init))
+    if not count:
+        raise DegenerateError(
+            "no pose has the keypoints in front of the camera",
+            where="views",
+            fix="give `init`, and check which keypoint is which",
+        )
+    minima, count = find_directions(mixture, seen, minima, count)
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
+    likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
+    boxed = mixture, minima
+    if model.box_margins is not None:
+        boxed = with_boxes(mixture, seen, minima, len(likelihoods), model.box_margins)
+    inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
+    likely = posteriors_of(boxed[0], seen, boxed[1], likelihoods, inflation)
+    moments = moments_of(likely)
+    if covariances.any():
+        turns = moments.covariance[:3, :3]
+        turns += curvature_of_rotations(turns)
+    points, alignment = likely.points[0], _alignment(likely.poses[0])
+    in_camera = alignment.apply(points[rows])
+    of_mean = weights @ (means[:, -1] - means[:, -2])
+    alternatives = tuple(
+        AlignAlternative(
+            _alignment(likely.poses[k]),
+            likely.points[k, :-2],
+            likely.points[k, -2:],
+            float(likelihoods[k]),
+        )
+        for k in range(1, len(likelihoods))
+        if is_other(moments, k)
+    )
+    warnings = weaknesses(alignment, moments.covariance)
+    if seen.loss == LINEAR:
+        warnings += misfits(float(minima.costs[0]), 2 * len(rows) - POSE_UNKNOWNS)
+    errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
+    component = int(minima.component[0])
+    return AlignResult(
+        alignment=alignment,
+        ids=model.ids,
+        points_3d=points[:-2],
+        bounds=points[-2:],
+        poses=(alignment,),
+        residuals=(view.camera.project(in_camera) - cast(FloatArray, view.points_2d),),
+        inliers=(np.ones(len(rows), dtype=bool),),
+        covariance=moments.covariance,
+        points_covariance=moments.of_points[:-2],
+        points_cam_covariance=moments.of_seen[:-2],
+        stretch=stretch_of(likely.lengths[0], of_mean),
+        component=component,
+        model=model,
+        alternatives=alternatives,
+        warnings=(*warnings, *another_pose(alignment, alternatives)),
+        stats=stats,
+        evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
+        basis=SingleBasis(
+            model, view, options, component, minima.poses[0].copy(), minima.forces[0].copy()
+        ),
+        cameras=(view.camera,),
+        observed=(cast(FloatArray, view.points_2d),),
+        degrees_of_freedom=model.degrees_of_freedom,
+    )
+
+
+def _seen(view: View, rows: list[int], options: FitOptions) -> Seen:
+    pixels = cast(FloatArray, view.points_2d)
+    rays = rays_of(np.require(pixels, requirements="W"), view.camera)
+    whitening = np.empty((len(rows), 3))
+    whitening[:] = whitening_of(view.sigma, rays, view.camera)
+    loss, scale = LOSSES[options.loss], float(options.loss_scale)
+    return Seen(np.array(rows, dtype=np.int64), rays, whitening, loss, scale)
+
+
+def _given(init: Alignment | None) -> FloatArray:
+    """A given start as a pose (1, 12) of the unstretched shape; none (0, 12) without."""
+    if init is None:
+        return np.empty((0, 12))
+    translation = init.translation / init.scale.mean()
+    return np.concatenate([init.rotation.ravel(), translation])[None]
+
+
+def _alignment(pose: FloatArray) -> Alignment:
+    """A pose (12,) of the unstretched shape."""
+    return Alignment(pose[:9].reshape(3, 3), pose[9:], np.ones(3), is_valid=True)

@@ -1,0 +1,397 @@
+"""Solving of packed problems: methods, estimated noise, status codes to errors, alternatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
+from cadalign.errors import CadalignError, DegenerateError
+from cadalign.estimation.options import LOSSES, FitOptions, Sigma
+from cadalign.estimation.problems import Problems, Solutions, check_sigmas, rays_of, whitening_of
+from cadalign.estimation.result import Alternative
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
+from cadalign.solvers.linear import aepnp_batch, aepnp_error, describe_plane, out_of_range_error
+from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.projection import pinhole_rays, reproject_batch
+
+_SIGMA_ROUNDS = 20
+_SIGMA_TOLERANCE = 1e-3
+# No keypoint is known better, over the keypoints' spread in the image: keeps a perfect fit from
+# claiming to be certain of everything.
+_LEAST_SIGMA = 1e-6
+_HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
+_EXACT_COST = 1e-6
+_TINY = 1e-100
+# Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
+_ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
+_NO_COST = read_only(np.array([[np.inf]]))
+
+Errors = dict[int, CadalignError]
+_FLAT = 1e-6  # extent across a line over that along it
+LEAST_LIKELIHOOD = 1e-3
+"""Relative likelihood above which another minimum is reported as an alternative."""
+
+
+def solve(
+    problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None = None
+) -> Solutions:
+    """Solve every problem with the method of the options.
+
+    ``sigmas``, one for each problem, takes the place of the options' sigma.
+    """
+    if options.method == "aepnp" and sigmas is None:
+        short = _solve_one_linearly(problems, options)
+        if short is not None:
+            return short
+    points = problems.points_3d
+    if options.known_axis != "x":
+        points = np.ascontiguousarray(points[:, options.axis_order])
+    if options.focal == "known":
+        for camera in problems.cameras:
+            camera.require_focal()
+    if options.method != "optimal" and not _is_plain(options.sigma, sigmas):
+        # The other methods would not notice a wrong one.
+        check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
+    if options.method == "optimal":
+        found = _solve_optimal(problems, options, points, sigmas)
+    elif options.method == "aepnp":
+        rays, errors = _rays(problems)
+        found = _one_minimum(*aepnp_batch(points, rays, problems.offsets), errors)
+    else:
+        found = _solve_baseline(problems, options, points)
+    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
+    residuals, statuses = _residuals(seen, points, found)
+    found = found._replace(residuals=residuals, statuses=statuses)
+    if np.count_nonzero(statuses):
+        found = found._replace(errors=_errors(problems, options, found))
+    return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | None:
+    """The linear solution of a single plain problem; None of any other, and where it fails.
+
+    The short way of the usual call, which would otherwise take longer than its kernels.
+    """
+    camera = problems.cameras[0]
+    plain = len(problems.offsets) == 2 and options.known_axis == "x" and camera.focal_known
+    if not plain or camera.distortion or not _is_plain(options.sigma, None):
+        return None
+    points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    poses, solved = aepnp_batch(points, pinhole_rays(pixels, fx, fy, cx, cy), offsets)
+    calibration = np.array([[fx, fy, cx, cy]])
+    residuals, statuses = reproject_batch(points, pixels, offsets, poses, calibration, solved)
+    if statuses[0] != OK:
+        return None
+    return Solutions(poses, _NO_COST, None, statuses, _ONE_MINIMUM, residuals=residuals)
+
+
+def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
+    """True for one positive number, which needs no further check."""
+    return sigmas is None and type(sigma) is float and 0.0 < sigma < math.inf
+
+
+def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors:
+    """Those found on the way, and otherwise those of the statuses."""
+    errors = {
+        b: solver_error(
+            found.statuses[b], found.info[b, 3], problems.points_3d[problems.rows(b)], options
+        )
+        for b in np.flatnonzero(found.statuses).tolist()
+        if b not in found.errors
+    }
+    return {**found.errors, **errors}
+
+
+def _rays(problems: Problems) -> tuple[FloatArray, Errors]:
+    """Normalised image coordinates (n, 2) of all problems, and errors by problem."""
+    if len(problems.cameras) == 1 and (len(problems) == 1 or not problems.cameras[0].distortion):
+        return rays_of(problems.points_2d, problems.cameras[0]), {}
+    rays = np.zeros_like(problems.points_2d)
+    errors: Errors = {}
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        try:
+            rays[rows] = rays_of(problems.points_2d[rows], problems.camera(b))
+        except CadalignError as error:
+            errors[b] = error
+    return rays, errors
+
+
+def _whitening(
+    problems: Problems, options: FitOptions, rays: FloatArray, sigmas: Sequence[Sigma] | None
+) -> FloatArray:
+    """Weights (1 or n, 3) of the residuals of all problems."""
+    if sigmas is None and len(problems.cameras) == 1:
+        return whitening_of(options.sigma, rays, problems.cameras[0])
+    weights = np.empty((len(rays), 3))
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        sigma = options.sigma if sigmas is None else sigmas[b]
+        weights[rows] = whitening_of(sigma, rays[rows], problems.camera(b))
+    return weights
+
+
+def _solve_optimal(
+    problems: Problems, options: FitOptions, points: FloatArray, sigmas: Sequence[Sigma] | None
+) -> Solutions:
+    """The maximum-likelihood solutions, with sigma estimated in rounds where it is unknown."""
+    if options.focal == "estimate":
+        # Only here: its kernels take time to import, and most cameras are calibrated.
+        from cadalign.estimation.focal_search import search_focal
+
+        search = partial(search_focal, problems, options, points, sigmas)
+    else:
+        rays, errors = _rays(problems)
+        whitening = _whitening(problems, options, rays, sigmas)
+        search = partial(_search, problems, options, points, rays, whitening, errors)
+    if options.sigma is None and sigmas is None:
+        found = _with_estimated_sigmas(problems, options, points, search)
+    else:
+        found = search(np.ones(len(problems)))
+    exact = (2 * problems.counts == options.unknowns) & (found.info[:, 0] > 1)
+    return _with_exact_sorted(found, exact) if exact.any() else found
+
+
+def _search(
+    problems: Problems,
+    options: FitOptions,
+    points: FloatArray,
+    rays: FloatArray,
+    whitening: FloatArray,
+    errors: Errors,
+    noises: FloatArray,
+) -> Solutions:
+    """Search at known focal lengths; ``noises`` (B,) multiply prior deviations and loss scales."""
+    given = points, rays, whitening, problems.offsets
+    scales = options.loss_scale * noises, options.prior_weight * noises**2
+    loss = LOSSES[options.loss]
+    minima = optimal_batch(*given, loss, *scales, options.free, options.min_points)
+    return Solutions(*minima, errors=errors)
+
+
+def _with_estimated_sigmas(
+    problems: Problems,
+    options: FitOptions,
+    points: FloatArray,
+    search: Callable[[FloatArray], Solutions],
+) -> Solutions:
+    """Search with the standard deviations that the residuals have."""
+    sigmas = np.ones(len(problems))
+    for _ in range(_SIGMA_ROUNDS):
+        found = search(sigmas)
+        previous, sigmas = sigmas, _estimate_sigmas(problems, options, points, found)
+        if not options.estimates_in_rounds or np.allclose(
+            sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0
+        ):
+            break
+    assert found.covariances is not None
+    covariances = found.covariances * (sigmas**2)[:, None, None]
+    overflows = ~np.isfinite(covariances).all(axis=(1, 2)) & (found.statuses == OK)
+    exact = np.flatnonzero(2 * problems.distinct_counts <= options.unknowns).tolist()
+    too_few = {b: no_redundancy_error(int(problems.distinct_counts[b])) for b in exact}
+    return found._replace(
+        costs=found.costs / sigmas[:, None] ** 2,
+        covariances=covariances,
+        statuses=np.where(overflows, OUT_OF_RANGE, found.statuses),
+        sigmas=sigmas,
+        errors={**found.errors, **too_few},
+    )
+
+
+def _estimate_sigmas(
+    problems: Problems, options: FitOptions, points: FloatArray, found: Solutions
+) -> FloatArray:
+    """Standard deviations (B,) [px] from the sum of squares, or an order statistic if robust.
+
+    Keypoints that are given repeatedly count once for the redundancy.
+    """
+    seen = problems if found.focals is None else problems.with_focals(found.focals[:, 0])
+    residuals, _ = _residuals(seen, points, found)
+    sigmas = np.ones(len(problems))
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        squares = (residuals[rows] ** 2).sum(axis=1)
+        redundancy = max(2 * int(problems.distinct_counts[b]) - options.unknowns, 1)
+        if options.loss == "linear":
+            sigma = np.sqrt(squares.sum() / redundancy)
+        else:
+            sigma = _robust_sigma(squares, redundancy)
+        least = _LEAST_SIGMA * np.sqrt(problems.points_2d[rows].var(axis=0).sum())
+        sigmas[b] = max(sigma, least, _TINY) if np.isfinite(sigma) else 1.0
+    return sigmas
+
+
+def _robust_sigma(squares: FloatArray, redundancy: int) -> float:
+    """Standard deviation [px] from a quantile of the squared lengths (n,) of residuals.
+
+    The unknowns can make as many keypoints fit exactly as they have equations. The quantile is the
+    median of the others' lengths: that of all would be zero with few keypoints.
+    """
+    count = len(squares)
+    place = math.ceil(count - redundancy / 4)
+    quantile = min((place - 0.5) / count, _HIGHEST_QUANTILE)
+    expected = -2 * math.log(1 - quantile) * redundancy / (2 * count)
+    return math.sqrt(float(np.partition(squares, place - 1)[place - 1]) / expected)
+
+
+def _residuals(
+    problems: Problems, points: FloatArray, found: Solutions
+) -> tuple[FloatArray, IntArray]:
+    """Projected minus observed keypoints (n, 2) [px], and the statuses (B,) that follow."""
+    given = points, problems.points_2d, problems.offsets
+    residuals, statuses = reproject_batch(
+        *given, found.poses, problems.calibrations, found.statuses
+    )
+    for b, camera in enumerate(problems.each_camera()):
+        if camera.distortion and statuses[b] == OK and b not in found.errors:
+            rows = problems.rows(b)
+            pixels = problems.points_2d[rows] + residuals[rows]
+            rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+            residuals[rows] = camera.pixels_from_normalized(rays) - problems.points_2d[rows]
+            if not np.isfinite(residuals[rows]).all():
+                statuses[b] = OUT_OF_RANGE
+    return residuals, statuses
+
+
+def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
+    """Order solutions that fit exactly by stretch, where ``exact`` (B,) marks such problems."""
+    order = np.tile(np.arange(found.costs.shape[1]), (len(found.costs), 1))
+    for b in np.flatnonzero(exact).tolist():
+        count = int((found.costs[b, : found.info[b, 0]] < _EXACT_COST).sum())
+        stretch = (np.log(found.poses[b, :count, 13:]) ** 2).sum(axis=1)
+        order[b, :count] = np.argsort(stretch, kind="stable")
+    return found._replace(
+        poses=np.take_along_axis(found.poses, order[:, :, None], axis=1),
+        costs=np.take_along_axis(found.costs, order, axis=1),
+        focals=None if found.focals is None else np.take_along_axis(found.focals, order, axis=1),
+    )
+
+
+def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
+    """Solve with a baseline, which is not compiled."""
+    if options.method == "epnp":
+        from cadalign.solvers.opencv import epnp as solver  # takes longer to import than the rest
+    else:
+        from cadalign.solvers.paper import aepnp_paper as solver
+    rays, errors = _rays(problems)
+    poses = np.zeros((len(problems), 1, POSE_SIZE))
+    for b in range(len(problems)):
+        rows = problems.rows(b)
+        try:
+            rotation, translation, scale = solver(points[rows], rays[rows])
+            poses[b, 0] = np.concatenate([rotation.ravel(), translation, scale])
+        except CadalignError as error:
+            errors.setdefault(b, error)
+    return _one_minimum(poses, np.zeros(len(problems), dtype=np.int64), errors)
+
+
+def _one_minimum(poses: FloatArray, statuses: IntArray, errors: Errors) -> Solutions:
+    """The solutions of a method that supports neither noise nor alternatives."""
+    costs = np.empty(poses.shape[:2])
+    costs.fill(np.inf)
+    info = np.empty((len(poses), 4), dtype=np.int64)
+    info[:] = _ONE_MINIMUM
+    return Solutions(poses, costs, None, statuses, info, errors=errors)
+
+
+def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
+    """Turn solutions for the reordered model axes into solutions for the model's own."""
+    covariances = found.covariances
+    if covariances is not None and options.known_axis == "y":  # solved as z, x
+        swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: covariances.shape[1]]
+        covariances = covariances[:, swapped][:, :, swapped]
+    return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)
+
+
+def solver_error(
+    status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
+) -> DegenerateError:
+    """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
+    if status == TOO_FEW:
+        method = f"the method {options.method!r}"
+        fix = f"give at least {options.min_points}"
+        if options.method == "optimal":
+            method = f"{options.unknowns} unknowns"
+            fix += ", fewer unknowns by stretch=, or a prior"
+        what = f"{len(points_3d)} keypoints are too few for {method}"
+        return DegenerateError(what, where="points_3d", fix=fix)
+    if status == OUT_OF_RANGE:
+        return out_of_range_error()
+    if status == NOT_FOUND:
+        return DegenerateError(
+            "no alignment with all keypoints in front of the camera was found",
+            where="points_2d",
+            fix="check that points_3d and points_2d correspond, row by row, and the camera",
+        )
+    if undetermined < 0:
+        return aepnp_error(points_3d)
+    reason = describe_plane(points_3d)
+    if undetermined < 3:
+        missing = "the rotation"
+    elif undetermined < 6:
+        missing = f"the translation along the camera's {'xyz'[undetermined - 3]}"
+    else:
+        missing = f"the scale s_{'xyz'[options.axis_order[undetermined - 5]]}"
+    if reason is None and 2 * len(points_3d) <= options.unknowns:
+        return DegenerateError(
+            f"no alignment reprojects the {len(points_3d)} keypoints exactly, and the nearest one "
+            f"leaves {missing} open",
+            where="points_3d",
+            fix="give more keypoints, or a scale_prior_sigma",
+        )
+    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+    if undetermined < 3 and _are_on_a_line(points_3d):
+        fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
+    return DegenerateError(
+        f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
+        where="points_3d",
+        fix=fix,
+    )
+
+
+def _are_on_a_line(points: FloatArray) -> bool:
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[1] <= _FLAT * sizes[0])
+
+
+def no_redundancy_error(count: int) -> DegenerateError:
+    """The error for a noise that is to be estimated from keypoints that always fit."""
+    return DegenerateError(
+        f"{count} keypoints fit exactly, so their noise cannot be estimated",
+        where="sigma",
+        fix="give sigma, or more keypoints",
+    )
+
+
+def camera_of(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
+    """The camera that goes with a minimum of the only problem."""
+    camera = problems.cameras[0]
+    return camera if solutions.focals is None else camera.with_focal(solutions.focals[0, minimum])
+
+
+def alternatives_of(
+    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
+) -> tuple[Alternative, ...]:
+    """The other minima that are likely enough."""
+    costs = solutions.costs[0, :minima]
+    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
+        # Costs are in units of sigma^2; below 1 they are those of exact fits.
+        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
+    else:
+        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    return tuple(
+        Alternative(
+            Alignment.from_packed(solutions.poses[0, k]),
+            float(ratios[k]),
+            camera_of(problems, solutions, k),
+        )
+        for k in range(1, minima)
+        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
+    )

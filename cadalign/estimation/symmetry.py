@@ -1,0 +1,181 @@
+"""Results in terms of a model's symmetry: one of all equal alignments, and its uncertainty.
+
+A model that a symmetry g takes to itself is placed by A g as by A. Of all such alignments a result
+has the canonical one (`SymmetryGroup.canonical`), together with the keypoints as that one has them,
+g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
+rotation vector in the camera frame, translation and log scales is one of A g by a linear map, which
+carries the covariance. How far the object is turned about an axis of the symmetry means nothing:
+deviations are stated without that step, such that points on the axis keep theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+from cadalign.estimation.uncertainty.weakness import unknown_axes
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import angle_between, vector_from_rotation
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
+
+if TYPE_CHECKING:
+    from cadalign.estimation.batch import BatchResult
+    from cadalign.estimation.options import FitOptions
+    from cadalign.estimation.result import FitResult
+
+SAME_SQUARES = 9.0
+"""Squared distance of rotations, in the best one's deviations, of equal estimates."""
+_SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
+_SAME_SCALE = 1e-4
+
+
+def checked_symmetry(symmetry: object) -> Symmetry | None:
+    """A symmetry whose motions make a group, or None.
+
+    Raises
+    ------
+    InputError
+        If it is something else, or its motions make none.
+    """
+    if symmetry is None:
+        return None
+    if not isinstance(symmetry, Symmetry):
+        what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
+        raise InputError(what, where="symmetry", fix="see cadalign.Symmetry.from_dict")
+    group_of(symmetry)
+    return symmetry
+
+
+def held_axes(stretched: str) -> tuple[bool, bool, bool]:
+    """The axes whose scale is held, where the others are estimated."""
+    x, y, z = (axis not in stretched for axis in "xyz")
+    return x, y, z
+
+
+def step_to(best: Equal, given: Alignment) -> FloatArray:
+    """Derivatives (9, 9) of an equal alignment by the given one.
+
+    Both by the rotation vector in the camera frame, the translation and the log scales.
+    """
+    turn, shift = best.motion[:3, :3], best.motion[:3, 3]
+    x, y, z = given.linear @ shift
+    step = np.eye(9)
+    step[3:6, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    step[3:6, 6:] = given.linear * shift
+    step[6:, 6:] = (turn**2).T
+    return step
+
+
+def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
+    """A covariance whose unknowns begin with rotation vector and translation, without free turns.
+
+    These are rotations about the symmetry's axes through its center.
+    """
+    arm = best.alignment.linear @ best.center
+    left = np.eye(len(covariance))
+    for axis in best.free:
+        direction = best.alignment.rotation @ axis
+        turn, share = np.zeros(len(covariance)), np.zeros(len(covariance))
+        turn[:3], turn[3:6], share[:3] = direction, -np.cross(direction, arm), direction
+        left = (np.eye(len(covariance)) - np.outer(turn, share)) @ left
+    return np.asarray(left @ covariance @ left.T)
+
+
+def is_same(
+    group: SymmetryGroup, best: Alignment, other: Alignment, covariance: FloatArray | None
+) -> bool:
+    """True for an estimate that is equal to the best one, by its rotation's deviations."""
+    near = group.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
+    if angle_between(near.rotation, best.rotation) < _SAME_DEG:
+        return True
+    if covariance is None:
+        return False
+    step = vector_from_rotation(near.rotation @ best.rotation.T)
+    information = np.linalg.pinv(covariance[:3, :3], hermitian=True)
+    return bool(step @ information @ step <= SAME_SQUARES)
+
+
+def equal_text(
+    alignment: Alignment, symmetry: Symmetry | None, *, held: tuple[bool, bool, bool]
+) -> str:
+    """A clause about the alignments that are equal to one; empty without a symmetry."""
+    if symmetry is None or symmetry.is_trivial:
+        return ""
+    group = group_of(symmetry)
+    found = group.canonical(alignment, held=held)
+    if len(found.free) > 1:
+        return "any rotation is equal under the model's symmetry"
+    if len(found.free):
+        axis = ", ".join(f"{value:.3g}" for value in (found.free[0] + 0.0).tolist())
+        return f"any rotation about ({axis}) is equal under the model's symmetry"
+    count = group.count(alignment, held)
+    if count == 1:
+        return "the stretch leaves no other alignment equal under the model's symmetry"
+    return f"{count} alignments are equal under the model's symmetry"
+
+
+class CanonicalFit(NamedTuple):
+    """A canonical result, and what led to it and to each of its alternatives."""
+
+    result: FitResult
+    best: Equal
+    others: tuple[Equal, ...]
+
+
+def canonical_fit(result: FitResult, symmetry: Symmetry) -> CanonicalFit:
+    """A fit's result with the canonical alignment, and alternatives that are truly others."""
+    group = group_of(symmetry)
+    held = held_axes(result.stretched_axes)
+    best = group.canonical(result.alignment, held=held)
+    covariance = result.covariance
+    if covariance is not None:
+        covariance = _carried(covariance, result.alignment, best, result.known_axis)
+    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
+    others = [
+        (equal, each)
+        for equal, each in canonical
+        if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+    ]
+    found = replace(
+        result,
+        alignment=best.alignment,
+        points_3d=best.relabelled(result.points_3d),
+        covariance=covariance,
+        alternatives=tuple(replace(each, alignment=equal.alignment) for equal, each in others),
+        symmetry=symmetry,
+    )
+    return CanonicalFit(found, best, tuple(equal for equal, _ in others))
+
+
+def canonical_batch(batch: BatchResult, symmetry: Symmetry, options: FitOptions) -> BatchResult:
+    """The results of a batch with canonical alignments, each as `canonical_fit` has it."""
+    group = group_of(symmetry)
+    if group.is_trivial:
+        return batch
+    rotation, translation = batch.rotation.copy(), batch.translation.copy()
+    scale = batch.scale.copy()
+    covariance = None if batch.covariance is None else batch.covariance.copy()
+    held = held_axes(options.stretched_axes)
+    for b in np.flatnonzero(batch.solved).tolist():
+        given = batch.alignment(b)
+        best = group.canonical(given, held=held)
+        rotation[b], translation[b] = best.alignment.rotation, best.alignment.translation
+        scale[b] = best.alignment.scale
+        if covariance is not None:
+            covariance[b] = _carried(covariance[b], given, best, options.known_axis)
+    return replace(
+        batch, rotation=rotation, translation=translation, scale=scale, covariance=covariance
+    )
+
+
+def _carried(covariance: FloatArray, given: Alignment, best: Equal, known_axis: str) -> FloatArray:
+    """The covariance (8, 8) or (9, 9) of an equal alignment."""
+    places = [*range(6), *(6 + axis for axis in unknown_axes(known_axis))]
+    step = np.eye(len(covariance))
+    step[:8, :8] = step_to(best, given)[np.ix_(places, places)]
+    return np.asarray(step @ covariance @ step.T)

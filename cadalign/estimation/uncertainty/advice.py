@@ -1,0 +1,426 @@
+"""Next-best evidence: what to add to the views of an object, by its predicted effect.
+
+The effect is predicted on a scene in which all evidence agrees with the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError, quote
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.estimates import (
+    curvature_of_rotations,
+    is_exact,
+    pose_and_lengths,
+    widened,
+    with_box,
+)
+from cadalign.estimation.model import Model, Size
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.evidence import Evidence, Shape, State
+
+TURN_DEG = 25.0  # of another view about the object
+_MASK_SIGMA = 1.5  # of a contour as segmentation gives it [px]
+LENGTH_SIGMA = 0.01
+_LENGTHS = ("width", "height", "length")
+_LEAST_SPREAD = 1e-6  # of points whose displacements a shape leaves out [model units]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """One piece of evidence that could be added, and its predicted effect.
+
+    Parameters
+    ----------
+    kind : {"keypoint", "mask", "view", "lengths"}
+    detail : int or str
+        Id of the keypoint; names of the two lengths; empty otherwise.
+    rotation_deg : float
+        Standard deviation of the rotation with the piece [degrees].
+    position : float
+        Of the translation, over the distance.
+    stretch : tuple of 3 float
+        Of the lengths along x, y, z, relative.
+    view : int
+        Number of the view that a keypoint or a mask is added to.
+    """
+
+    kind: str
+    detail: Hashable
+    rotation_deg: float
+    position: float
+    stretch: tuple[float, float, float]
+    view: int = 0
+
+    @property
+    def worst(self) -> float:
+        """The largest deviation: rotation in radians, position, stretch."""
+        return max(float(np.radians(self.rotation_deg)), self.position, *self.stretch)
+
+
+def rank_evidence(
+    model: Model | ShapeModel,
+    views: View | Sequence[View],
+    estimate: Alignment | AlignResult,
+    *,
+    candidates: Sequence[Hashable] = (),
+    mask: npt.ArrayLike | None = None,
+    size: Size | None = None,
+) -> tuple[Advice, ...]:
+    """Rank what could be added to the evidence of an object's views, the most useful first.
+
+    Compared is the largest deviation that is left, linearised at the estimate; what is known of a
+    learned or similar shape counts. A further view is one of the first view's keypoints from 25 deg
+    aside, its motion known where that of the others is. Lengths are the object's width and the less
+    certain of its height and length, measured to 1 %, or the one of them that is still unknown.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+    views : View or sequence of View
+        All that is there; of a depth image, what it tells at keypoints counts.
+    estimate : Alignment or AlignResult
+        The estimate from them. An alignment, in the first camera, suffices for an exact model and
+        one view, or views with ``cam_from_rig``.
+    candidates : sequence of int or str
+        Ids of keypoints that could be marked in any view that lacks them and whose image they lie
+        in, as precisely as the others on average.
+    mask : (h, w) bool, optional
+        The mask that is predicted for the estimate in the first view, where one could be drawn; the
+        model then needs its mesh. Its contour counts with a deviation of 1.5 px.
+    size : Size, optional
+        The lengths that are known.
+
+    Returns
+    -------
+    tuple of Advice
+
+    Raises
+    ------
+    InputError
+        If the model lacks a keypoint or the mesh, every view has a candidate, an alignment does not
+        suffice, or there is a mask and the model is not exact.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], np.ones(3))
+    >>> seen = View(camera, camera.project(truth.apply(corners[:6])), ids=range(6))
+    >>> first, *others = rank_evidence(Model(points_3d=corners), seen, truth, candidates=[6, 7])
+    >>> first.kind, len(others)
+    ('lengths', 3)
+    """
+    given = (views,) if isinstance(views, View) else tuple(views)
+    scene = scene_of(model, given, estimate, size)
+    found = [each for name in candidates for each in _keypoints(scene, name)]
+    found.append(_best(_view(scene, turn) for turn in _turns(scene)))
+    found.extend(_lengths(scene))
+    if mask is not None and given[0].mask is None:
+        first = replace(_without_scale(given[0]), mask=mask, mask_sigma=_MASK_SIGMA)
+        masked = scene_of(model, (first, *given[1:]), estimate, size)
+        found.append(_advice("mask", "", masked))
+    return tuple(sorted(found, key=lambda each: each.worst))
+
+
+def _turns(scene: KnownScene) -> tuple[float, ...]:
+    """Angles of a further view; beside several views, to the side that tells more."""
+    return (TURN_DEG,) if len(scene.views) == 1 else (TURN_DEG, -TURN_DEG)
+
+
+def _best(advice: Iterable[Advice]) -> Advice:
+    return min(advice, key=lambda each: each.worst)
+
+
+def _view(scene: KnownScene, turn_deg: float) -> Advice:
+    return _advice("view", "", scene.with_view(_turned(scene, turn_deg)))
+
+
+def _turned(scene: KnownScene, turn_deg: float) -> tuple[View, Alignment]:
+    """The first view's keypoints in a camera that went around the object."""
+    view, pose = scene.views[0], scene.poses[0]
+    centre = pose.apply(scene.bounds.mean(axis=0)[None])[0]
+    turn = rotation_from_vector(np.array([0.0, np.radians(turn_deg), 0.0]))
+    shift = centre - turn @ centre
+    moved = Alignment(turn @ pose.rotation, turn @ pose.translation + shift, pose.scale)
+    motion = None
+    if view.cam_from_rig is not None:
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = turn, shift
+        motion = step @ cast(FloatArray, view.cam_from_rig)
+        motion[:3, :3] = nearest_rotation(motion[:3, :3])
+    points = view.camera.project(moved.apply(scene.points_of(view.keypoint_ids)))
+    ids, sigma = view.keypoint_ids, view.sigma
+    return View(view.camera, points, ids=ids, sigma=sigma, cam_from_rig=motion), moved
+
+
+def _lengths(scene: KnownScene) -> Iterator[Advice]:
+    """The unknown one of the width and another length, or both, that leaves the least open."""
+    lengths = np.ptp(scene.bounds, axis=0) * scene.poses[0].scale
+    known = np.full(3, np.nan) if scene.size is None else scene.size.lengths
+    sigma = np.where(np.isfinite(known), _relative(scene.size), LENGTH_SIGMA)
+    rows = [(0, 1), (0, 2)] if np.isnan(known[0]) else [(1,), (2,)]
+    found = []
+    for axes in rows:
+        new = [axis for axis in axes if np.isnan(known[axis])]
+        if not new or not (lengths[new] > 0).all():
+            continue
+        all_of_them = known.copy()
+        all_of_them[new] = lengths[new]
+        told = dict(zip(_LENGTHS, all_of_them.tolist(), strict=True))
+        size = Size(**{name: value for name, value in told.items() if value == value}, sigma=sigma)
+        detail = " and ".join(_LENGTHS[axis] for axis in new)
+        found.append(_advice("lengths", detail, replace(scene, size=size)))
+    if found:
+        yield _best(found)
+
+
+def _relative(size: Size | None) -> FloatArray:
+    """Relative deviations (3,) of known lengths."""
+    given = LENGTH_SIGMA if size is None else size.sigma
+    return np.broadcast_to(np.asarray(given, dtype=np.float64), (3,))
+
+
+def _keypoints(scene: KnownScene, name: Hashable) -> Iterator[Advice]:
+    """A keypoint in every view that lacks it and can show it."""
+    lacking = [n for n, view in enumerate(scene.views) if name not in view.keypoint_ids]
+    if not lacking:
+        fix = "give those that a view lacks"
+        raise InputError(f"every view has the keypoint {quote(name)}", where="candidates", fix=fix)
+    for number in lacking:
+        place = scene.project((name,), number, "candidates")
+        camera = scene.views[number].camera
+        if len(scene.views) == 1 or camera.contains(place).all():
+            views = list(scene.views)
+            views[number] = _with_keypoint(views[number], name, place)
+            marked = _advice("keypoint", name, replace(scene, views=tuple(views)))
+            yield replace(marked, view=number)
+
+
+def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
+    count = len(view.keypoint_ids)
+    depth = view.depth
+    if depth is not None and view.depth_image is None:
+        depth = np.append(cast(FloatArray, depth), np.nan)
+    return replace(
+        _without_scale(view),
+        points_2d=np.vstack([cast(FloatArray, view.points_2d), place]),
+        ids=(*view.keypoint_ids, name),
+        sigma=_with_mean(view.sigma, count, is_one=np.ndim(view.sigma) == 0),
+        confidences=None,
+        depth=depth,
+        depth_sigma=_with_mean(view.depth_sigma, count, is_one=np.ndim(view.depth_sigma) == 0),
+    )
+
+
+def _with_mean(sigma: npt.ArrayLike, count: int, *, is_one: bool) -> npt.ArrayLike:
+    """Deviations of ``count`` values, and their mean for one more."""
+    given = np.asarray(sigma, dtype=np.float64)
+    if is_one or not count:
+        return given if is_one else 1.0
+    return np.concatenate([given, given.mean(axis=0, keepdims=True)])
+
+
+def _without_scale(view: View) -> View:
+    """The view as it is after its depths were read: they are not to be scaled again."""
+    return replace(view, depth_scale=None)
+
+
+def _advice(kind: str, detail: Hashable, scene: KnownScene) -> Advice:
+    """The effect of evidence that agrees with the estimate."""
+    return _summary(kind, detail, scene.covariance(), scene.poses[0])
+
+
+def _summary(kind: str, detail: Hashable, covariance: FloatArray, alignment: Alignment) -> Advice:
+    """Deviations up to scale, which is known or not according to the evidence."""
+    distance = float(np.linalg.norm(alignment.translation))
+    # Translation over the distance, and lengths, relative to the length along x.
+    terms = np.zeros((9, 9))
+    terms[:3, :3] = np.eye(3)
+    terms[3:6, 3:6] = np.eye(3) / distance
+    terms[3:6, 6] = -alignment.translation / distance
+    terms[6:, 6:] = np.eye(3)
+    terms[6:, 6] -= 1.0
+    deviations = np.sqrt(np.maximum((terms @ covariance @ terms.T).diagonal(), 0.0))
+    x, y, z = deviations[6:].tolist()
+    return Advice(
+        kind,
+        detail,
+        float(np.degrees(np.linalg.norm(deviations[:3]))),
+        float(np.linalg.norm(deviations[3:6])),
+        (x, y, z),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class KnownScene:
+    """Views of an object whose pose, stretch and shape are taken as known.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+    prior : ShapePrior
+        Its one component is that of the object.
+    views : tuple of View
+    poses : tuple of Alignment
+        The alignment in every view's camera.
+    points_3d : (m, 3) float
+        Keypoints before the stretch.
+    bounds : (2, 3) float
+    size : Size, optional
+    """
+
+    model: Model | ShapeModel
+    prior: ShapePrior
+    views: tuple[View, ...]
+    poses: tuple[Alignment, ...]
+    points_3d: FloatArray
+    bounds: FloatArray
+    size: Size | None
+
+    def with_view(self, added: tuple[View, Alignment]) -> KnownScene:
+        """The scene with one more view and the alignment in its camera."""
+        view, pose = added
+        return replace(self, views=(*self.views, view), poses=(*self.poses, pose))
+
+    def points_of(self, ids: Sequence[Hashable], where: str = "ids") -> FloatArray:
+        """Keypoints (n, 3) by their ids."""
+        return np.asarray(self.points_3d[self.prior.rows_of(tuple(ids), where)])
+
+    def project(self, ids: Sequence[Hashable], number: int, where: str) -> FloatArray:
+        """Places (n, 2) of keypoints in a view [px]."""
+        seen = self.poses[number].apply(self.points_of(ids, where))
+        return self.views[number].camera.project(seen)
+
+    def covariance(self) -> FloatArray:
+        """Covariance (9, 9) of an estimate, as `AlignResult.covariance`, linearised."""
+        evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
+        evidence, state = self._widened(evidence, self._state(evidence))
+        own = evidence
+        if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
+            from cadalign.estimation.contours.fit import with_contours  # with OpenCV and embree
+
+            evidence, state = with_contours(self.model, self.views, evidence, state)
+        covariance = pose_and_lengths(evidence, state, joint_covariance(evidence, state).unknowns)
+        symmetry = self.model.symmetry if isinstance(self.model, Model) else None
+        if symmetry is None and not is_exact(own):
+            covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
+        return covariance
+
+    def _widened(self, evidence: Evidence, state: State) -> tuple[Evidence, State]:
+        """With the deviations and the box that results state of a learned shape."""
+        evidence, state = widened(evidence, state, self.prior.inflation)
+        if self.prior.box_margins is None:
+            return evidence, state
+        return with_box(evidence, state, len(self.points_3d), self.prior.box_margins)
+
+    def _state(self, evidence: Evidence) -> State:
+        poses = [np.append(each.rotation.ravel(), each.translation) for each in self._free_poses()]
+        log_scales = np.log(self.poses[0].scale)
+        points = np.concatenate([self.points_3d, self.bounds])
+        coefficients, rest = _explained(evidence.shape, points)
+        return State(np.array(poses), log_scales, coefficients, rest * self.poses[0].scale)
+
+    def _free_poses(self) -> tuple[Alignment, ...]:
+        """One for every view, or one in the frame that the views share."""
+        if self.views[0].cam_from_rig is None:
+            return self.poses
+        camera, pose = cast(FloatArray, self.views[0].cam_from_rig), self.poses[0]
+        turn, shift = camera[:3, :3].T, pose.translation - camera[:3, 3]
+        return (Alignment(turn @ pose.rotation, turn @ shift, pose.scale),)
+
+
+def scene_of(
+    model: Model | ShapeModel,
+    views: tuple[View, ...],
+    estimate: object,
+    size: Size | None,
+) -> KnownScene:
+    """The scene of views, a size, and the estimate from them.
+
+    Raises
+    ------
+    InputError
+        If the estimate is neither an Alignment nor an AlignResult, or does not tell shape and all
+        poses, or a view has a mask that is not of an exact model.
+    """
+    if not views:
+        raise InputError("none is given", where="views")
+    prior = prior_of(model)
+    _check_masks(model, views)
+    if isinstance(estimate, Alignment):
+        poses = _poses_from(model, views, estimate)
+        shape = prior.components[0].mean
+        return KnownScene(model, prior, views, poses, shape[:-2], shape[-2:], size)
+    if not isinstance(estimate, AlignResult):
+        what = f"expected an Alignment or an AlignResult, got {type(estimate).__name__}"
+        raise InputError(what, where="estimate")
+    if len(estimate.poses) != len(views):
+        what = f"the estimate is from {len(estimate.poses)} views, given are {len(views)}"
+        raise InputError(what, where="views", fix="give the views that it is from")
+    own = replace(prior, components=(prior.components[estimate.component],), weights=(1.0,))
+    points = np.asarray(estimate.points_3d)
+    return KnownScene(model, own, views, estimate.poses, points, estimate.bounds, size)
+
+
+def _check_masks(model: Model | ShapeModel, views: Sequence[View]) -> None:
+    if isinstance(model, Model) and model.shape_sigma is None:
+        return
+    masked = [number for number, view in enumerate(views) if view.mask is not None]
+    if masked:
+        what = "the effect of a mask is predicted for an exact model only"
+        fix = "leave it away, or give a Model without `shape_sigma`"
+        raise InputError(what, where=f"views[{masked[0]}].mask", fix=fix)
+
+
+def _poses_from(
+    model: Model | ShapeModel, views: Sequence[View], first: Alignment
+) -> tuple[Alignment, ...]:
+    """Poses in every camera from that in the first."""
+    fix = "give the AlignResult of `align`"
+    if isinstance(model, ShapeModel) or model.shape_sigma is not None:
+        raise InputError("an alignment does not tell the shape", where="estimate", fix=fix)
+    if len(views) == 1:
+        return (first,)
+    cameras = [cast("FloatArray | None", view.cam_from_rig) for view in views]
+    known = [each for each in cameras if each is not None]
+    if len(known) < len(views):
+        what = "an alignment does not tell the poses of the other views"
+        raise InputError(what, where="estimate", fix=fix)
+    steps = [camera @ np.linalg.inv(known[0]) for camera in known[1:]]
+    others = [
+        Alignment(
+            step[:3, :3] @ first.rotation,
+            step[:3, :3] @ first.translation + step[:3, 3],
+            first.scale,
+        )
+        for step in steps
+    ]
+    return (first, *others)
+
+
+def _explained(shape: Shape, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The likeliest coefficients (K,) and displacements (m, 3) of a shape with these points."""
+    rest = points - shape.mean
+    weight = 1 / np.maximum(shape.spread, _LEAST_SPREAD)
+    modes = shape.modes * weight[:, None]
+    flat = modes.reshape(len(modes), points.size)
+    normal = flat @ flat.T + np.eye(len(flat))
+    coefficients = np.asarray(np.linalg.solve(normal, flat @ (rest * weight[:, None]).ravel()))
+    left = rest - np.tensordot(coefficients, shape.modes, axes=1)
+    return coefficients, np.asarray(np.where(shape.spread[:, None] > 0, left, 0.0))

@@ -1,0 +1,225 @@
+"""Pieces of evidence that contradict the others, found by leaving each out.
+
+Without a piece the cost at the optimum falls by the square of what the others predict of it wrong,
+whitened by the covariance of the prediction and of the piece together: a chi-square of as many
+degrees as the piece has redundant equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.estimation.prior import has_scale_prior
+from cadalign.estimation.uncertainty.evidence import (
+    Piece,
+    depth_factor,
+    kept_rows,
+    pieces_of,
+    plane_distances,
+    without,
+)
+from cadalign.estimation.uncertainty.summary import name_of
+from cadalign.solvers.joint.evidence import Evidence, State, copy_state
+from cadalign.solvers.joint.reduction import reduce_modes
+from cadalign.solvers.joint.refine import refine_joint
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+_FALSE_ALARMS = 0.005  # of all tests of an estimate together
+_REFITTING = 12  # iterations that show if a piece contradicts the others
+_LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown of
+_HIDDEN = 6.0  # [sigma], of a depth from most others of its image
+_WRONG_UNIT = 100.0  # factor between measured and expected depths
+_PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
+_AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
+
+Search = Callable[[Evidence], tuple[State, float] | None]
+
+
+class _Trial(NamedTuple):
+    """The estimate without a piece: the cost that it saves, for so many equations."""
+
+    piece: Piece
+    saved: float
+    equations: int
+    misfit: float  # reduced chi-square of the rest, at least 1
+    state: State
+
+
+class _Determined(NamedTuple):
+    redundancy: int
+    rank: int
+
+
+def contradictions(
+    evidence: Evidence, state: State, cost: float, search: Search
+) -> tuple[str, ...]:
+    """Warnings that name the pieces which contradict the rest.
+
+    Parameters
+    ----------
+    evidence, state, cost
+        The estimate.
+    search
+        Finds the best estimate of other evidence.
+    """
+    pieces = pieces_of(evidence)
+    if len(pieces) < 2:
+        return ()
+    evidence, basis = reduce_modes(evidence)
+    state = state._replace(coefficients=state.coefficients @ basis)
+    if len(evidence.planes.point):
+        evidence = _without_hidden(evidence, state)
+        state = copy_state(state)
+        cost, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
+    level = _FALSE_ALARMS / len(pieces)
+    if not _is_suspicious(evidence, state, cost, pieces, level):
+        return ()
+    whole = _determined(evidence, state)
+    found = [_searched(evidence, state, cost, whole, piece, search) for piece in pieces]
+    suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
+    if not suspects:
+        return ()
+    noise = min(trial.misfit for trial in suspects)
+    suspects.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
+    best = suspects[0]
+    alike = _as_likely(best, suspects, noise)
+    names = [name_of(*trial.piece) for trial in alike]
+    sigmas = np.sqrt(best.saved / best.misfit / best.equations)
+    unit = next((text for trial in alike if (text := _wrong_unit(evidence, trial))), "")
+    if len(names) == 1:
+        return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+    listed = f"{', '.join(names[:-1])} or {names[-1]}"
+    return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _is_suspicious(
+    evidence: Evidence, state: State, cost: float, pieces: Sequence[Piece], level: float
+) -> bool:
+    """True if leaving out a piece, by a short refinement, saves more than is likely."""
+    from scipy.special import chdtri  # takes longer to import than all that is compiled
+
+    least = chdtri(1, level)
+    for piece in pieces:
+        rest, start = without(evidence, state, piece)
+        refitted = copy_state(start)
+        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
+        if not cost - lower >= least:  # of one equation; of more, more is likely
+            continue
+        trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
+        if trial is not None and _is_unlikely(trial, level):
+            return True
+    return False
+
+
+def _without_hidden(evidence: Evidence, state: State) -> Evidence:
+    """The evidence without depths that differ from most of their image: of something else."""
+    expected, measured, weights, images = plane_distances(evidence, state)
+    kept = np.ones(len(images), dtype=bool)
+    for view in np.unique(images):
+        rows = images == view
+        factor = np.median(measured[rows] / expected[rows])
+        kept[rows] = np.abs(measured / factor - expected)[rows] * weights[rows] < _HIDDEN
+    return evidence._replace(planes=kept_rows(evidence.planes, kept))
+
+
+def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
+    """Trials that explain the misfit as well as the best; the fewest equations of one view."""
+    found = []
+    for trial in suspects:
+        shortfall = (best.saved - trial.saved) / noise
+        fewer = max(best.equations - trial.equations, 0)
+        if shortfall < _AS_LIKELY + _PER_EQUATION * fewer:
+            found.append(trial)
+    freed = {trial.piece.view for trial in found if trial.piece.kind == "rig"}
+    return [
+        trial
+        for trial in found
+        if trial is best or trial.piece.kind != "keypoints" or trial.piece.view not in freed
+    ]
+
+
+def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
+    """A hint at depths that are hundreds of times too large or small; else nothing."""
+    if trial.piece.kind != "depth" or trial.piece.view is None:
+        return ""
+    factor = depth_factor(evidence, trial.state, trial.piece.view)
+    if 1 / _WRONG_UNIT < factor < _WRONG_UNIT:
+        return ""
+    return (
+        f": the depths are {factor:.3g} times what is expected, are they in another unit "
+        "(millimetres for metres)?"
+    )
+
+
+def _searched(
+    evidence: Evidence,
+    state: State,
+    cost: float,
+    whole: _Determined,
+    piece: Piece,
+    search: Search,
+) -> _Trial | None:
+    """The trial of a piece by a search, since the estimate may lie far from that without it."""
+    rest, start = without(evidence, state, piece)
+    refitted = copy_state(start)
+    lower, _, _ = refine_joint(rest, 10 * _REFITTING, refitted)
+    found = search(rest)
+    if found is not None and found[1] < lower:
+        refitted, lower = found
+    return _trial(piece, whole, rest, refitted, cost, lower)
+
+
+def _trial(
+    piece: Piece, whole: _Determined, rest: Evidence, state: State, cost: float, lower: float
+) -> _Trial | None:
+    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
+    left = _determined(rest, state)
+    equations = whole.redundancy - left.redundancy
+    if equations <= 0 or not lower < np.inf:
+        return None
+    if piece.kind != "rig" and left.rank < whole.rank:
+        return None
+    misfit = lower / left.redundancy if left.redundancy > 0 else 1.0
+    return _Trial(piece, cost - lower, equations, max(misfit, 1.0), state)
+
+
+def _is_unlikely(trial: _Trial, level: float) -> bool:
+    from scipy.special import chdtrc  # takes longer to import than all that is compiled
+
+    return bool(chdtrc(trial.equations, max(trial.saved / trial.misfit, 0.0)) < level)
+
+
+def _determined(evidence: Evidence, state: State) -> _Determined:
+    """Equations beyond the unknowns that they determine, and the number of these."""
+    system = empty_system(evidence)
+    evaluate_joint(evidence, state, system)
+    rank = _rank(system.hessian)
+    held = int(3 - evidence.scales.free.sum())
+    return _Determined(count_equations(evidence) - (rank - held), rank)
+
+
+def _rank(hessian: FloatArray) -> int:
+    diagonal = np.sqrt(np.maximum(hessian.diagonal(), 0.0))
+    if not np.isfinite(hessian).all():
+        return 0
+    safe = np.where(diagonal > 0, diagonal, 1.0)
+    values = np.linalg.eigvalsh(hessian / np.outer(safe, safe))
+    return int((values > _LEAST_INFORMATION * len(values)).sum())
+
+
+def count_equations(evidence: Evidence) -> int:
+    """Number of equations, those of priors included; what is exact adds none."""
+    sightings = evidence.sightings
+    count = 2 * int((sightings.whitening[:, 2] > 0).sum())
+    count += int((sightings.whitening[sightings.whitening[:, 2] == 0].any(axis=1)).sum())
+    count += int((sightings.depths[:, 1] > 0).sum())
+    count += 2 * len(evidence.directions.image) + len(evidence.lengths.weight)
+    count += len(evidence.heights.weight) + len(evidence.planes.weight)
+    count += len(evidence.shape.modes)
+    if has_scale_prior(evidence.scales):
+        count += int(np.linalg.matrix_rank(evidence.scales.precision))
+    return count

@@ -1,0 +1,327 @@
+"""Pieces of evidence: what each tells, how well it agrees with an estimate, what it contributes.
+
+What a piece contributes is told by the deviations without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.pack import SingleBasis
+from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
+from cadalign.estimation.uncertainty.weakness import Uncertainty
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.joint.evidence import Evidence, Planes, Rig, Sightings, State, points_of
+from cadalign.solvers.joint.system import empty_system, evaluate_joint
+
+Rows = TypeVar("Rows", bound=tuple[Any, ...])
+_OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
+_WEAKEST = 1e-12  # share of the information about an unknown that counts as none
+_UNKNOWN_ROTATION_DEG = 120.0
+_UNKNOWN_SCALE = 5.0
+
+
+class Piece(NamedTuple):
+    """A kind of evidence (see `cadalign.EvidenceSummary`) and its view."""
+
+    kind: str
+    view: int | None
+
+
+def pieces_of(evidence: Evidence) -> list[Piece]:
+    """All pieces, view by view."""
+    pieces: list[Piece] = []
+    poses = np.bincount(evidence.rig.pose)
+    for view, pose in enumerate(evidence.rig.pose.tolist()):
+        told = {
+            "keypoints": keypoints_in(evidence, view),
+            "mask": contours_in(evidence, view),
+            "depth": np.append(depths_in(evidence, view), evidence.planes.image == view),
+            "gravity": evidence.directions.image == view,
+            "camera height": evidence.heights.image == view,
+            "rig": np.array([poses[pose] > 1]),
+        }
+        pieces.extend(Piece(kind, view) for kind, rows in told.items() if rows.any())
+    if len(evidence.lengths.value):
+        pieces.append(Piece("size", None))
+    return pieces
+
+
+def keypoints_in(evidence: Evidence, view: int) -> BoolArray:
+    """Sightings (N,) of a view that tell both coordinates of a ray."""
+    sightings = evidence.sightings
+    return np.asarray((sightings.image == view) & (sightings.whitening[:, 2] > 0))
+
+
+def contours_in(evidence: Evidence, view: int) -> BoolArray:
+    """Sightings (N,) of a view that tell a ray along a contour's normal alone."""
+    sightings = evidence.sightings
+    is_contour = (sightings.whitening[:, 2] == 0) & sightings.whitening[:, :2].any(axis=1)
+    return np.asarray((sightings.image == view) & is_contour)
+
+
+def depths_in(evidence: Evidence, view: int) -> BoolArray:
+    """Sightings (N,) of a view that tell a depth."""
+    sightings = evidence.sightings
+    return np.asarray((sightings.image == view) & (sightings.depths[:, 1] > 0))
+
+
+def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, State]:
+    """The evidence without a piece, and a state of its unknowns.
+
+    Without the known motion of its camera, a view has a pose of its own.
+    """
+    view = piece.view
+    if view is None:
+        none = np.zeros(len(evidence.lengths.value), dtype=bool)
+        return evidence._replace(lengths=kept_rows(evidence.lengths, none)), state
+    if piece.kind == "rig":
+        return _unlinked(evidence, state, view)
+    if piece.kind == "keypoints":
+        return evidence._replace(sightings=_unseen(evidence, view)), state
+    if piece.kind == "mask":
+        kept = ~contours_in(evidence, view)
+        return evidence._replace(sightings=kept_rows(evidence.sightings, kept)), state
+    if piece.kind == "depth":
+        return _without_depth(evidence, view), state
+    if piece.kind == "gravity":
+        rest = kept_rows(evidence.directions, evidence.directions.image != view)
+        return evidence._replace(directions=rest), state
+    rest_of_heights = kept_rows(evidence.heights, evidence.heights.image != view)
+    return evidence._replace(heights=rest_of_heights), state
+
+
+def kept_rows(rows: Rows, kept: BoolArray) -> Rows:
+    """Some rows of a table of columns."""
+    columns: list[Any] = [np.ascontiguousarray(column[kept]) for column in rows]
+    return type(rows)(*columns)
+
+
+def _unseen(evidence: Evidence, view: int) -> Sightings:
+    """The sightings without a view's keypoints, whose depths stay."""
+    hidden = keypoints_in(evidence, view)
+    kept = ~hidden | depths_in(evidence, view)
+    whitening = np.where(hidden[:, None], 0.0, evidence.sightings.whitening)
+    return kept_rows(evidence.sightings._replace(whitening=whitening), kept)
+
+
+def _without_depth(evidence: Evidence, view: int) -> Evidence:
+    there = depths_in(evidence, view)
+    depths = np.where(there[:, None], 0.0, evidence.sightings.depths)
+    planes: Planes = kept_rows(evidence.planes, evidence.planes.image != view)
+    sightings = evidence.sightings._replace(depths=depths)
+    kept = ~there | sightings.whitening.any(axis=1)
+    return evidence._replace(sightings=kept_rows(sightings, kept), planes=planes)
+
+
+def _unlinked(evidence: Evidence, state: State, view: int) -> tuple[Evidence, State]:
+    pose: IntArray = evidence.rig.pose.copy()
+    own = state.poses[pose[view]]
+    pose[view] = len(state.poses)
+    rig = Rig(evidence.rig.cam_from_rig, pose)
+    return evidence._replace(rig=rig), state._replace(poses=np.vstack([state.poses, own]))
+
+
+def summaries_of(
+    evidence: Evidence, state: State, cameras: Sequence[Camera]
+) -> tuple[EvidenceSummary, ...]:
+    """Root mean square residuals of all pieces but masks, view by view."""
+    points = points_of(evidence.shape, state)
+    found = []
+    for view, camera in enumerate(cameras):
+        found.extend(_of_keypoints(evidence, state, points, view, camera))
+        found.extend(_of_depths(evidence, state, points, view))
+        found.extend(_of_up(evidence, state, view))
+        found.extend(_of_height(evidence, state, points, view))
+    lengths = evidence.lengths
+    if len(lengths.value):
+        box = points[lengths.points[:, 1]] - points[lengths.points[:, 0]]
+        errors = box[np.arange(len(box)), lengths.axis] - lengths.value
+        found.append(_summary("size", None, errors, errors * lengths.weight, ""))
+    return tuple(found)
+
+
+def seen_in_cameras(
+    evidence: Evidence, state: State, points: FloatArray, image: IntArray
+) -> FloatArray:
+    """Points (N, 3) of the model in the cameras (N,) of views."""
+    rig = evidence.rig
+    for motion in (state.poses[rig.pose[image]], rig.cam_from_rig[image]):
+        turned = np.einsum("nij,nj->ni", motion[:, :9].reshape(-1, 3, 3), points)
+        points = turned + motion[:, 9:]
+    return points
+
+
+def _of_keypoints(
+    evidence: Evidence, state: State, points: FloatArray, view: int, camera: Camera
+) -> list[EvidenceSummary]:
+    sightings, rows = evidence.sightings, keypoints_in(evidence, view)
+    if not rows.any():
+        return []
+    seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
+    errors = seen[:, :2] / seen[:, 2:] - sightings.rays[rows]
+    return [summary_of_keypoints(errors, sightings.whitening[rows], view, camera)]
+
+
+def summary_of_keypoints(
+    errors: FloatArray, whitening: FloatArray, view: int, camera: Camera
+) -> EvidenceSummary:
+    """The summary of errors (n, 2) of rays, with their whitening (n, 3)."""
+    a, b, c = whitening.T
+    whitened = np.hypot(a * errors[:, 0] + b * errors[:, 1], c * errors[:, 1])
+    in_pixels = np.hypot(errors[:, 0] * camera.fx, errors[:, 1] * camera.fy)
+    return _summary("keypoints", view, in_pixels, whitened, "px", 2)
+
+
+def _of_depths(
+    evidence: Evidence, state: State, points: FloatArray, view: int
+) -> list[EvidenceSummary]:
+    if not depths_in(evidence, view).any() and not (evidence.planes.image == view).any():
+        return []
+    expected, measured, weights = _depths(evidence, state, points, view)
+    errors = expected - measured
+    counted = np.abs(errors * weights) < _OUTLIER
+    if not counted.any():
+        counted[:] = True
+    return [_summary("depth", view, errors[counted], (errors * weights)[counted], "")]
+
+
+def depth_factor(evidence: Evidence, state: State, view: int) -> float:
+    """Median of measured over expected depths of a view."""
+    expected, measured, _ = _depths(evidence, state, points_of(evidence.shape, state), view)
+    return float(np.median(measured / expected))
+
+
+def _depths(
+    evidence: Evidence, state: State, points: FloatArray, view: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Expected and measured depths of a view (n,), with the inverse deviations."""
+    sightings, rows = evidence.sightings, depths_in(evidence, view)
+    seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
+    expected, measured, weights, images = plane_distances(evidence, state)
+    others = images == view
+    return (
+        np.concatenate([seen[:, 2], expected[others]]),
+        np.concatenate([sightings.depths[rows, 0], measured[others]]),
+        np.concatenate([sightings.depths[rows, 1], weights[others]]),
+    )
+
+
+def plane_distances(
+    evidence: Evidence, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Expected and measured distances along planes' normals, inverse deviations, and views."""
+    planes = evidence.planes
+    points = points_of(evidence.shape, state)[planes.point]
+    seen = seen_in_cameras(evidence, state, points, planes.image)
+    return (seen * planes.normal).sum(axis=1), planes.offset, planes.weight, planes.image
+
+
+def _of_up(evidence: Evidence, state: State, view: int) -> list[EvidenceSummary]:
+    directions, rig = evidence.directions, evidence.rig
+    rows = directions.image == view
+    if not rows.any():
+        return []
+    rotation = rig.cam_from_rig[view][:9].reshape(3, 3) @ state.poses[rig.pose[view]][:9].reshape(
+        3, 3
+    )
+    differences = directions.model[rows] @ rotation.T - directions.camera[rows]
+    whitened = np.einsum("nij,nj->ni", directions.whitening[rows], differences)
+    halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)
+    angles = np.degrees(2 * np.arcsin(halves))
+    return [_summary("gravity", view, angles, np.linalg.norm(whitened, axis=1), "deg", 2)]
+
+
+def _of_height(
+    evidence: Evidence, state: State, points: FloatArray, view: int
+) -> list[EvidenceSummary]:
+    heights, rig = evidence.heights, evidence.rig
+    rows = heights.image == view
+    if not rows.any():
+        return []
+    seen = seen_in_cameras(evidence, state, points[heights.point[rows]], heights.image[rows])
+    rotation = rig.cam_from_rig[view][:9].reshape(3, 3) @ state.poses[rig.pose[view]][:9].reshape(
+        3, 3
+    )
+    errors = -(seen * (heights.direction[rows] @ rotation.T)).sum(axis=1) - heights.value[rows]
+    return [_summary("camera height", view, errors, errors * heights.weight[rows], "")]
+
+
+def _numbers(rows: BoolArray, view: int) -> IntArray:
+    return np.full(int(rows.sum()), view)
+
+
+def _summary(
+    kind: str,
+    view: int | None,
+    errors: FloatArray,
+    whitened: FloatArray,
+    unit: str,
+    equations: int = 1,
+) -> EvidenceSummary:
+    """The summary of residuals (n,) and their lengths in sigmas, of so many equations each."""
+    count = len(errors)
+    in_sigmas = np.sqrt((whitened * whitened).sum() / (equations * count))
+    return EvidenceSummary(
+        kind, view, count, float(in_sigmas), float(np.sqrt((errors * errors).mean())), unit
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """The evidence in the form of the kernels, and the state that was estimated from it.
+
+    ``numbers`` are those of its views among all that were given; None where all are used.
+    """
+
+    evidence: Evidence
+    state: State
+    numbers: tuple[int, ...] | None = None
+
+
+AnyBasis = Basis | SingleBasis
+"""What contributions are computed from."""
+
+
+def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
+    """Deviations at the estimate without each piece."""
+    found = []
+    for piece in pieces_of(basis.evidence):
+        rest, state = without(basis.evidence, basis.state, piece)
+        view = piece.view
+        if view is not None and basis.numbers is not None:
+            view = basis.numbers[view]
+        found.append(Contribution(piece.kind, view, _deviations(rest, state)))
+    return tuple(found)
+
+
+def _deviations(evidence: Evidence, state: State) -> Uncertainty:
+    system = empty_system(evidence)
+    evaluate_joint(evidence, state, system)
+    sizes = np.sqrt(system.hessian.diagonal())
+    sizes[~(sizes > 0)] = _WEAKEST  # nothing is known of it
+    scaled = system.hessian / np.outer(sizes, sizes)
+    inverse = np.linalg.inv(scaled + _WEAKEST * np.eye(len(sizes)))
+    covariance = inverse / np.outer(sizes, sizes)
+    first = len(sizes) - len(evidence.shape.modes) - 3
+    held = first + np.flatnonzero(evidence.scales.free == 0)
+    covariance[held] = covariance[:, held] = 0.0
+    of_all = pose_and_lengths(evidence, state, covariance)
+    deviations = np.sqrt(np.maximum(of_all.diagonal(), 0.0))
+    distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
+    rotation = float(np.degrees(np.linalg.norm(deviations[:3])))
+    x, y, z = (_or_infinite(each, _UNKNOWN_SCALE * distance) for each in deviations[3:6])
+    sx, sy, sz = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:])
+    return Uncertainty(
+        _or_infinite(rotation, _UNKNOWN_ROTATION_DEG), (x, y, z), (sx, sy, sz), focal=0.0
+    )
+
+
+def _or_infinite(deviation: float, limit: float) -> float:
+    return float(deviation) if deviation < limit else float("inf")

@@ -1,0 +1,427 @@
+"""Test of the residuals against the keypoints' standard deviations, and the outliers that fail it.
+
+An outlier is far from where the other keypoints predict it, by the covariance of the prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result import FitResult
+from cadalign.estimation.uncertainty.distributions import chi_square_tail
+from cadalign.estimation.uncertainty.posterior import Likelihood
+from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import perspective
+from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.projection import ray_derivatives
+
+_FALSE_ALARMS = 0.004
+_FALSE_STRETCH_ALARMS = 0.002
+_MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
+_MOST_NAMED = 5
+_SCALES = 2  # unknown ones, of an alignment without constraints
+Rows = npt.NDArray[np.intp]
+FitRows = Callable[[Rows, bool], FitResult]
+"""Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
+True."""
+
+_FALSE_OUTLIER_ALARMS = 0.01
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Residuals that are larger than the standard deviations of the keypoints explain.
+
+    Parameters
+    ----------
+    chi_square : float
+        Sum of the losses on the whitened residuals: of their squares, with the linear loss.
+    redundancy : int
+        What is expected of it: the equations minus the unknowns.
+    free_scale : tuple of 3 float, optional
+        The scales without the constraints on them (stretch=, scale_prior_sigma), where it is these
+        that contradict the keypoints.
+    outliers : mapping of int to float
+        The keypoints without which the others fit, and their distances from where the others put
+        them [px]; empty where no few keypoints are to blame.
+    """
+
+    chi_square: float
+    redundancy: int
+    free_scale: tuple[float, float, float] | None = None
+    outliers: Mapping[int, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, for JSON."""
+        outliers = [{"row": row, "distance_px": px} for row, px in self.outliers.items()]
+        return {
+            "chi_square": self.chi_square,
+            "redundancy": self.redundancy,
+            "free_scale": None if self.free_scale is None else list(self.free_scale),
+            "outliers": outliers,
+        }
+
+    def __str__(self) -> str:
+        if self.free_scale is not None:
+            scale = ", ".join(f"{value:.3g}" for value in self.free_scale)
+            return (
+                f"the keypoints contradict the constraint on the stretch: without it they fit "
+                f"better, with the scale ({scale})"
+            )
+        ratio = math.sqrt(self.chi_square / self.redundancy)
+        text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
+        if not self.outliers:
+            return text + (
+                "the keypoints do not fit the model together (wrong pairs, model, stretch or "
+                "camera), or sigma is too small; sigma=None suits a model that is only similar"
+            )
+        worst = sorted(self.outliers, key=lambda row: -self.outliers[row])[:_MOST_NAMED]
+        named = ", ".join(f"{row} ({self.outliers[row]:.3g} px)" for row in worst)
+        if len(worst) < len(self.outliers):
+            named += f" and {len(self.outliers) - len(worst)} more"
+        one = len(self.outliers) == 1
+        return text + (
+            f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
+            "(counted from 0, with the distance from where those put it)"
+        )
+
+
+def find_misfit(result: FitResult, options: FitOptions) -> Misfit | None:
+    """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
+
+    The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
+    at most the square, only makes the test more cautious, and so does the cut of RANSAC. Priors
+    count as equations that are always met. A constraint on the scales is tested by the decrease of
+    the sum without it, which has one degree of freedom for each scale.
+    """
+    if options.sigma is None:
+        return None
+    try:
+        tested = _Tested.of(result, options)
+    except InputError:  # a depth that rounds to zero has no projection
+        return None
+    free_scale = _contradicting_scale(tested)
+    if free_scale is not None:
+        return Misfit(tested.chi_square, tested.redundancy, free_scale)
+    if tested.passes:
+        return None
+    return Misfit(tested.chi_square, tested.redundancy, outliers=_outliers(tested))
+
+
+def unverified_stretch(result: FitResult, options: FitOptions) -> str | None:
+    """Warn about scales held at 1 where the keypoints would not contradict another value.
+
+    None where nothing is held, sigma is estimated, or the free scales are not determined at all,
+    which is what holding them is for.
+    """
+    held = set("xyz") - {options.known_axis} - set(options.stretched_axes)
+    if not held or options.sigma is None:
+        return None
+    try:
+        free = _Tested.of(result, options).fit(stretch=None)
+    except CadalignError:
+        return None
+    assert free.covariance is not None
+    scale = uncertainty_of(free.covariance, free.known_axis).scale
+    doubtful = [axis for axis in sorted(held) if scale["xyz".index(axis)] > WEAK_SCALE]
+    if not doubtful:
+        return None
+    known = " and ".join(f"s_{axis} to +-{percent(scale['xyz'.index(axis)])}" for axis in doubtful)
+    return (
+        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Tested:
+    """A result's inliers, with their noise and the sum of their losses."""
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    covariances: FloatArray
+    rows: IntArray
+    camera: Camera
+    options: FitOptions
+    chi_square: float
+
+    @classmethod
+    def of(cls, result: FitResult, options: FitOptions) -> _Tested:
+        rows = np.flatnonzero(result.inliers)
+        points_3d, residuals = result.points_3d[rows], result.residuals[rows]
+        projected = result.camera.project(result.alignment.apply(points_3d))
+        likelihood = Likelihood.of(result, options)
+        covariances = np.linalg.inv(likelihood.information)
+        return cls(
+            points_3d,
+            projected - residuals,
+            np.broadcast_to(covariances, (len(rows), 2, 2)),
+            rows,
+            result.camera,
+            options,
+            float(likelihood.losses(residuals).sum()),
+        )
+
+    @property
+    def redundancy(self) -> int:
+        """Equations, of the priors too, minus unknowns."""
+        priors = int(self.options.focal_prior is not None)
+        if self.options.scale_prior_sigma is not None:
+            priors += len(self.options.stretched_axes)
+        return 2 * len(self.rows) - self.options.unknowns + priors
+
+    @property
+    def passes(self) -> bool:
+        """True if the noise explains the sum."""
+        redundancy = self.redundancy
+        return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
+
+    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FitResult:
+        """Fit some of the keypoints anew, with changed options."""
+        from cadalign.estimation.fit import fit
+
+        chosen = {**vars(self.options), "sigma": self.covariances[rows], **changes}
+        return fit(self.points_3d[rows], self.points_2d[rows], self.camera, **chosen)
+
+
+def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
+    """The scales without the constraints on them, if these contradict the keypoints."""
+    options = tested.options
+    if len(options.stretched_axes) == _SCALES and options.scale_prior_sigma is None:
+        return None
+    try:
+        free = tested.fit(stretch=None, scale_prior_sigma=None)
+        assert free.options is not None
+        decrease = tested.chi_square - _Tested.of(free, free.options).chi_square
+    except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
+        return None
+    if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
+        return None
+    x, y, z = free.alignment.scale.tolist()
+    return x, y, z
+
+
+def _outliers(tested: _Tested) -> dict[int, float]:
+    """The few keypoints without which the others pass the test, with their distances [px]."""
+
+    def fit_rows(rows: Rows, robust: bool) -> FitResult:
+        loss = "cauchy" if robust else "linear"
+        return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
+
+    found = find_outliers(
+        tested.points_3d,
+        tested.points_2d,
+        fit_rows,
+        unknowns=tested.options.unknowns,
+        noise=tested.covariances,
+        level=NoiseLevel(),
+    )
+    if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
+        return {}
+    rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
+    assert rest.options is not None
+    if not _Tested.of(rest, rest.options).passes:
+        return {}
+    return {int(tested.rows[row]): length for row, length in found.items()}
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Prior on the keypoints' noise, relative to that of the fits.
+
+    Parameters
+    ----------
+    sigma : float
+        Expected standard deviation.
+    equations : float
+        Weight of the prior, as that of so many equations; infinite for a known noise.
+    """
+
+    sigma: float = 1.0
+    equations: float = math.inf
+
+    def variance(self, squares: float, redundancy: float) -> float:
+        """The variance, by the prior and a sum of squares with that redundancy."""
+        if math.isinf(self.equations):
+            return self.sigma**2
+        return (squares + self.equations * self.sigma**2) / (redundancy + self.equations)
+
+
+CLICKS = NoiseLevel(2.0, 4)
+"""Hands click to about 2 px, and shapes differ by as much."""
+
+
+def find_outliers(
+    points_3d: FloatArray,
+    points_2d: FloatArray,
+    fit_rows: FitRows,
+    *,
+    unknowns: int,
+    noise: FloatArray | None = None,
+    level: NoiseLevel = CLICKS,
+) -> dict[int, float]:
+    """Find the keypoints that lie farther from the others' prediction than noise explains.
+
+    A forward search (Hadi, "Identifying multiple outliers in multivariate data", 1992): it begins
+    with the better half of the keypoints in a robust fit and adds all that agree, until nothing
+    changes, so that several outliers do not mask each other. ``noise`` (n, 2, 2) are the
+    covariances [px^2] of the fits, by default those of 1 px; unless ``level`` says that it is
+    known, their common factor is estimated from the inliers, since all keypoints of a model that is
+    only similar to the object are some pixels off.
+
+    Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
+    with too few keypoints: without one, at least two more equations than unknowns must be left.
+    """
+    count = len(points_3d)
+    least = unknowns // 2 + 1
+    if count <= least:
+        return {}
+    if noise is None:
+        noise = np.tile(np.eye(2), (count, 1, 1))
+    search = _Search(points_3d, points_2d, noise, fit_rows, level, unknowns)
+    try:
+        inliers = search.run(least)
+        if inliers.all():
+            return {}
+        result = fit_rows(np.flatnonzero(inliers), False)
+    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
+        return {}
+    lengths = np.linalg.norm(search.residuals(result), axis=1)
+    return {int(row): float(lengths[row]) for row in np.flatnonzero(~inliers)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The forward search of `find_outliers`."""
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    noise: FloatArray
+    fit_rows: FitRows
+    level: NoiseLevel
+    unknowns: int
+
+    def run(self, least: int) -> BoolArray:
+        """Find the inliers, (n,) bool, at least so many."""
+        count = len(self.points_3d)
+        start = max(least, count // 2 + 1)
+        robust = self.residuals(self.fit_rows(np.arange(count), True))
+        lengths = _squares(robust, self.noise)
+        rows = np.sort(np.argsort(lengths, kind="stable")[:start])
+        for _ in range(2 * count):
+            statistic, redundancy = self._statistic(rows)
+            quantile = _f_quantile(_FALSE_OUTLIER_ALARMS / count, redundancy + self.level.equations)
+            agreed = np.flatnonzero(statistic <= quantile)
+            if len(agreed) < start:
+                agreed = np.sort(np.argsort(statistic, kind="stable")[:start])
+            if np.array_equal(agreed, rows):
+                break
+            rows = agreed
+        inliers = np.zeros(count, dtype=bool)
+        inliers[rows] = True
+        return inliers
+
+    def _statistic(self, rows: Rows) -> tuple[FloatArray, int]:
+        """Squared residuals (n,) per equation over their expectation, and the fit's redundancy.
+
+        For keypoints outside the fit, the covariance of the prediction adds to the noise.
+        """
+        result = self.fit_rows(rows, False)
+        residuals = self.residuals(result)
+        redundancy = 2 * len(rows) - self.unknowns
+        total = float(_squares(residuals[rows], self.noise[rows]).sum())
+        expected = self.noise.copy()
+        others = np.setdiff1d(np.arange(len(self.points_3d)), rows)
+        others = others[result.alignment.apply(self.points_3d[others])[:, 2] > 0]
+        if len(others) and result.covariance is not None:
+            jacobian = projection_jacobian(
+                self.points_3d[others],
+                result.camera,
+                result.alignment,
+                known_axis=result.known_axis,
+                unknowns=len(result.covariance),
+            )
+            expected[others] += predicted_covariances(jacobian, result.covariance)
+        squares = _squares(residuals, expected) / 2
+        return squares / self.level.variance(total, redundancy), redundancy
+
+    def residuals(self, result: FitResult) -> FloatArray:
+        """Projected minus observed (n, 2) [px]; infinite behind the camera."""
+        in_camera = result.alignment.apply(self.points_3d)
+        ahead = in_camera[:, 2] > 0
+        residuals = np.full((len(in_camera), 2), np.inf)
+        residuals[ahead] = result.camera.project(in_camera[ahead]) - self.points_2d[ahead]
+        return residuals
+
+
+def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Squared lengths (n,) of residuals (n, 2) whitened by their covariances (n, 2, 2)."""
+    finite = np.nan_to_num(residuals, posinf=1e9)
+    squares = np.einsum("na,nab,nb->n", finite, np.linalg.inv(covariances), finite)
+    return np.asarray(squares)
+
+
+def _f_quantile(chance: float, equations: float) -> float:
+    """Value that an F variable with (2, equations) degrees of freedom exceeds by this chance."""
+    if math.isinf(equations):
+        return -math.log(chance)
+    return equations / 2 * (math.pow(chance, -2 / equations) - 1)
+
+
+def projection_jacobian(
+    points_3d: FloatArray,
+    camera: Camera,
+    alignment: Alignment,
+    *,
+    known_axis: str,
+    unknowns: int,
+) -> FloatArray:
+    """Derivatives (n, 2, unknowns) of projected points, in the order of `FitResult.covariance`.
+
+    In pixels per rad, model unit, and unit of a logarithm; 9 unknowns include that of the focal
+    length. Refuses points behind the camera.
+    """
+    if unknowns not in (UNKNOWNS, UNKNOWNS + 1):
+        raise InputError(f"{unknowns} is neither 8 nor 9", where="unknowns")
+    in_camera = alignment.apply(points_3d)
+    if not (in_camera[:, 2] > 0).all():
+        raise InputError("a point lies behind the camera", where="points_3d")
+    rays = perspective(in_camera)
+    # The kernel takes the known axis first, and has the scales of the other two in cyclic order.
+    first = "xyz".index(known_axis)
+    order = [first, (first + 1) % 3, (first + 2) % 3]
+    ordered = Alignment(
+        alignment.rotation[:, order], alignment.translation, alignment.scale[order], is_valid=True
+    )
+    of_rays = ray_derivatives(np.ascontiguousarray(points_3d[:, order], float), ordered.packed)
+    if order[1] > order[2]:
+        of_rays = of_rays[:, :, [0, 1, 2, 3, 4, 5, 7, 6]]
+    to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
+    jacobian = to_pixels @ of_rays
+    if unknowns > UNKNOWNS:
+        off_center = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
+        jacobian = np.concatenate([jacobian, off_center[:, :, None]], axis=2)
+    return np.asarray(jacobian)
+
+
+def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
+
+    Parameters
+    ----------
+    jacobian : (n, 2, k) float
+        See `projection_jacobian`.
+    covariance : (k, k) float
+        Of the unknowns.
+    """
+    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

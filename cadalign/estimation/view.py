@@ -1,0 +1,279 @@
+"""A view: what one image tells about an object, with checked depths, masks and directions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import (
+    BoolArray,
+    FloatArray,
+    as_floats,
+    as_points,
+    as_positive,
+    is_number,
+    read_only,
+)
+from cadalign.errors import InputError, quote
+from cadalign.estimation.model import checked_ids
+from cadalign.estimation.options import Sigma
+from cadalign.geometry.camera import Camera
+from cadalign.io.images import read_grey
+
+_ROTATION_TOLERANCE = 1e-6
+_FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
+_SYMMETRY_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Evidence of one image about an object.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    points_2d : (n, 2) float
+        Keypoints in the image [px]; integers are pixel centres.
+    ids : sequence of n int or str, optional
+        The model's ids or names of these keypoints; by default its first n, in its order.
+    sigma : float, (n,) float, or (n, 2, 2) float
+        Standard deviation of the keypoints, of each, or covariance of each [px].
+    confidences : (n,) float, optional
+        Confidences of the keypoints, for a robust search.
+    depth : (n,) or (h, w) float, or path, optional
+        Depths of the keypoints, their z in the camera's frame, or an image of such depths that is
+        registered to the photo, as an array or as a 16-bit PNG [model units, or the unit in which
+        the object's size is wanted]; 0 or NaN where unknown. A depth image is sampled robustly at
+        the keypoints and, with a mask and a mesh, over the visible surface.
+    depth_sigma : float or (n,) float
+        Standard deviation of the depths, relative (0.005 is 0.5 %).
+    depth_scale : float, optional
+        Units per count of a depth image; by default 0.001 for a file (millimetres to metres), 1 for
+        an array of floats.
+    up : (3,) float, optional
+        The direction of the model's up axis in the camera's frame (OpenCV's: y points down), of any
+        length; `cadalign.geometry.gravity` computes it from gravity, pitch and roll, a phone's
+        pose, or clicks on vertical edges.
+    up_sigma_deg : float or (3, 3) float
+        Its standard deviation about each axis across it [degrees], or the covariance of the
+        direction [degrees squared].
+    camera_height : float, optional
+        Height of the camera above the plane that the object stands on with its lowest face [the
+        unit in which the object's size is wanted]. ``up`` says how the plane lies.
+    camera_height_sigma : float
+        Its standard deviation, relative.
+    cam_from_rig : (4, 4) float, optional
+        The camera's known pose in a frame that several views share. Where no view has one, the
+        cameras moved in an unknown way between them.
+    mask : (h, w) bool or float, or path, optional
+        Pixels of the object in an image of the camera's size: True, or their probabilities in
+        [0, 1], or an 8-bit grey PNG that is not zero there.
+    mask_sigma : float, optional
+        Standard deviation of the mask's contour along its normal [px]; None estimates it.
+
+    Raises
+    ------
+    InputError
+        If shapes don't match, ids repeat, a value is NaN or infinite, a pose is no rigid motion, or
+        an image has another size than the camera.
+    DataError
+        If a file cannot be read.
+
+    Examples
+    --------
+    >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+    >>> View(camera, [[320.0, 240.0], [330.0, 250.0]], ids=["nose", "tail"]).ids
+    ('nose', 'tail')
+    """
+
+    camera: Camera
+    points_2d: npt.ArrayLike = ()
+    ids: Sequence[Hashable] | None = None
+    sigma: Sigma = 1.0
+    confidences: npt.ArrayLike | None = None
+    depth: npt.ArrayLike | str | os.PathLike[str] | None = None
+    depth_sigma: npt.ArrayLike = 0.01
+    up: npt.ArrayLike | None = None
+    up_sigma_deg: npt.ArrayLike = 1.0
+    cam_from_rig: npt.ArrayLike | None = None
+    depth_scale: float | None = None
+    camera_height: float | None = None
+    camera_height_sigma: float = 0.02
+    mask: npt.ArrayLike | str | os.PathLike[str] | None = None
+    mask_sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_camera(self.camera)
+        points = np.empty((0, 2)) if np.size(self.points_2d) == 0 else self.points_2d
+        points = as_points(points, name="points_2d", dimension=2)
+        object.__setattr__(self, "points_2d", read_only(points))
+        object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        if self.depth is not None:
+            depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
+            object.__setattr__(self, "depth", read_only(depth))
+        checked_depth_sigma(self.depth_sigma, self.depth, len(points))
+        self._check_up()
+        if self.camera_height is not None:
+            height = as_positive(self.camera_height, name="camera_height")
+            object.__setattr__(self, "camera_height", height)
+        as_positive(self.camera_height_sigma, name="camera_height_sigma")
+        if self.cam_from_rig is not None:
+            object.__setattr__(self, "cam_from_rig", read_only(_rigid(self.cam_from_rig)))
+        if self.mask is not None:
+            object.__setattr__(self, "mask", read_only(checked_mask(self.mask, self.camera)))
+        if self.mask_sigma is not None:
+            as_positive(self.mask_sigma, name="mask_sigma")
+
+    def __repr__(self) -> str:
+        names = ("mask", "depth", "up", "camera_height", "cam_from_rig")
+        given = [name for name in names if getattr(self, name) is not None]
+        return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *given])})"
+
+    @property
+    def keypoint_ids(self) -> tuple[Hashable, ...]:
+        """Ids of the keypoints; see ``ids``."""
+        return cast("tuple[Hashable, ...]", self.ids)
+
+    @property
+    def depth_image(self) -> FloatArray | None:
+        """The depth image (h, w), NaN where unknown; None where ``depth`` is none."""
+        is_image = self.depth is not None and np.ndim(cast(FloatArray, self.depth)) == 2
+        return cast(FloatArray, self.depth) if is_image else None
+
+    @property
+    def mask_image(self) -> FloatArray | BoolArray | None:
+        """The mask (h, w), bool or probabilities."""
+        return cast("FloatArray | BoolArray | None", self.mask)
+
+    def _check_up(self) -> None:
+        if self.up is None:
+            return
+        up = as_floats(self.up, name="up", shape=(3,))
+        length = float(np.linalg.norm(up))
+        if not length > 0:
+            raise InputError("a direction must not be zero", where="up")
+        checked_up_sigma(self.up_sigma_deg)
+        object.__setattr__(self, "up", read_only(up / length))
+
+
+def _check_camera(camera: object) -> None:
+    if not isinstance(camera, Camera):
+        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+    if not camera.focal_known:
+        fix = "give a camera with one, for example from fit(..., focal='estimate').camera"
+        raise InputError("its focal length is unknown", where="camera", fix=fix)
+
+
+def _rigid(pose: npt.ArrayLike) -> FloatArray:
+    """A checked rigid motion (4, 4)."""
+    matrix = as_floats(pose, name="cam_from_rig", shape=(4, 4))
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        fix = "its upper left 3 x 3 must be a rotation, without scale"
+        raise InputError("not a rigid motion", where="cam_from_rig", fix=fix)
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
+        raise InputError("its last row must be 0, 0, 0, 1", where="cam_from_rig")
+    return matrix
+
+
+def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
+    """Depths of the keypoints (n,), or a depth image (h, w); NaN where unknown.
+
+    Raises
+    ------
+    InputError
+        If it has neither shape, or a depth is negative.
+    """
+    factor = None if scale is None else as_positive(scale, name="depth_scale")
+    if isinstance(given, str | os.PathLike):
+        depth = read_grey(Path(given)).astype(np.float64)
+        factor = _FILE_SCALE if factor is None else factor
+    else:
+        depth = np.asarray(given)
+        if depth.ndim == 2 and depth.dtype.kind in "iu" and factor is None:
+            fix = "give `depth_scale`, 0.001 for millimetres where metres are wanted"
+            raise InputError("whole numbers have no unit", where="depth", fix=fix)
+        shape = (None,) if depth.ndim == 1 else (None, None)
+        depth = as_floats(depth, name="depth", shape=shape, finite=False)
+    wanted = (count,) if depth.ndim == 1 else (camera.height, camera.width)
+    if depth.shape != wanted:
+        what = f"shape {depth.shape}, expected ({count},) or ({camera.height}, {camera.width})"
+        fix = "give a depth per keypoint, or a depth image of the camera's size"
+        raise InputError(what, where="depth", fix=fix)
+    known = np.isfinite(depth)
+    if depth.ndim == 1:
+        bad = (depth[known] <= 0).any()
+    else:
+        known &= depth != 0
+        bad = (depth[known] < 0).any()
+    if bad:
+        fix = "give NaN where it is unknown"
+        raise InputError("has values that are not positive", where="depth", fix=fix)
+    return np.where(known, depth * (1.0 if factor is None else factor), np.nan)
+
+
+def checked_depth_sigma(sigma: npt.ArrayLike, depth: object, count: int) -> None:
+    """Check the relative deviation of depths.
+
+    Raises
+    ------
+    InputError
+        If it is not positive, or neither one nor one per depth.
+    """
+    relative = np.asarray(sigma, dtype=np.float64)
+    shapes = [()] if isinstance(depth, np.ndarray) and depth.ndim == 2 else [(), (count,)]
+    if relative.shape not in shapes or not (relative > 0).all():
+        raise InputError("must be positive, one or one per keypoint", where="depth_sigma")
+
+
+def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
+    """A mask (h, w): bool, or probabilities.
+
+    Raises
+    ------
+    InputError
+        If it has another size than the camera, or holds other values.
+    """
+    is_file = isinstance(given, str | os.PathLike)
+    mask = read_grey(Path(given)) != 0 if is_file else np.asarray(given)
+    if mask.shape != (camera.height, camera.width):
+        size = " x ".join(str(length) for length in mask.shape[::-1])
+        what = f"the mask is {size or 'a number'}, the camera {camera.width} x {camera.height}"
+        raise InputError(what, where="mask", fix="give the mask of this image, in its size")
+    if mask.dtype == bool:
+        return mask
+    probabilities = as_floats(mask, name="mask", shape=(None, None))
+    if probabilities.min() < 0 or probabilities.max() > 1:
+        fix = "give a bool array, or probabilities; of an image of bytes give `image > 0`"
+        raise InputError("has values outside of [0, 1]", where="mask", fix=fix)
+    return probabilities
+
+
+def checked_up_sigma(sigma: Any) -> None:
+    """Check the deviation of a direction, or its covariance (3, 3).
+
+    Raises
+    ------
+    InputError
+        If it is neither positive nor a covariance.
+    """
+    if np.ndim(sigma) == 0:
+        if not is_number(sigma) or not sigma > 0:
+            raise InputError(f"{quote(sigma)} is not positive", where="up_sigma_deg")
+        return
+    covariance = as_floats(sigma, name="up_sigma_deg", shape=(3, 3))
+    size = np.abs(covariance).max()
+    values = np.linalg.eigvalsh(covariance)
+    is_symmetric = np.abs(covariance - covariance.T).max() <= _SYMMETRY_TOLERANCE * size
+    if not is_symmetric or values[0] < -_SYMMETRY_TOLERANCE * size or not values[1] > 0:
+        what = "not a covariance of rank 2 or more"
+        fix = "give a positive number [degrees], or the covariance of the direction"
+        raise InputError(what, where="up_sigma_deg", fix=fix)

@@ -1,0 +1,149 @@
+"""Views of unknown motion whose keypoints determine no pose; these are left out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, DegenerateError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.refine import refine_joint
+
+_LEAST_POINTS = 3
+_ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
+_ITERATIONS = 50
+
+
+def views_without_pose(prior: ShapePrior, views: Sequence[View], *, is_started: bool) -> list[int]:
+    """Numbers of the views of unknown motion whose keypoints determine no pose.
+
+    Those are fewer than three keypoints, or keypoints on one line. A single view, views of a rig,
+    the first view of an estimate that ``is_started`` from a given alignment, and views that tell
+    nothing at all are never among them.
+    """
+    if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
+        return []
+    mean = prior.components[0].mean
+    return [
+        number
+        for number, view in enumerate(views)
+        if not (is_started and number == 0)
+        and (len(view.keypoint_ids) or view.mask is not None or view.up is not None)
+        and _is_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
+    ]
+
+
+def check_first(without_pose: Sequence[int]) -> None:
+    """Refuse a first view that is left out, for its camera's frame is that of the result.
+
+    Raises
+    ------
+    DegenerateError
+        If it is among the numbers.
+    """
+    if 0 in without_pose:
+        raise DegenerateError(
+            "its keypoints do not determine its pose, and the result is in its camera's frame",
+            where="views[0]",
+            fix="give at least 3 keypoints, not on one line, or another view first",
+        )
+
+
+def with_views_left_out(
+    result: AlignResult, prior: ShapePrior, views: Sequence[View], left_out: Sequence[int]
+) -> AlignResult:
+    """The result of all views from that of the views that are not ``left_out``.
+
+    The pose of a view that is left out is one of those that explain its keypoints.
+    """
+    used = [number for number in range(len(views)) if number not in left_out]
+    poses = dict(zip(used, result.poses, strict=True))
+    residuals = dict(zip(used, result.residuals, strict=True))
+    inliers = dict(zip(used, result.inliers, strict=True))
+    masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
+    for number in left_out:
+        view = views[number]
+        poses[number] = _explaining(prior, view, result)
+        rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
+        seen = view.camera.project(poses[number].apply(result.points_3d[rows]))
+        residuals[number] = seen - cast(FloatArray, view.points_2d)
+        inliers[number] = np.zeros(len(rows), dtype=bool)
+    numbers = range(len(views))
+    warnings = [
+        f"views[{number}] is left out: its {len(views[number].keypoint_ids)} keypoints do not "
+        "determine its pose"
+        for number in left_out
+    ]
+    return replace(
+        result,
+        poses=tuple(poses[number] for number in numbers),
+        residuals=tuple(residuals[number] for number in numbers),
+        inliers=tuple(inliers[number] for number in numbers),
+        mask_residuals=tuple(masks.get(number) for number in numbers) if masks else (),
+        evidence=tuple(
+            replace(each, view=None if each.view is None else used[each.view])
+            for each in result.evidence
+        ),
+        warnings=(*(_renumbered(text, used) for text in result.warnings), *warnings),
+        basis=result.basis and replace(result.basis, numbers=tuple(used)),
+        cameras=tuple(view.camera for view in views),
+        observed=tuple(cast(FloatArray, view.points_2d) for view in views),
+    )
+
+
+@contextmanager
+def numbered_without(left_out: Sequence[int], count: int) -> Iterator[None]:
+    """Let errors about the views that are used name these by their numbers among all views."""
+    used = [number for number in range(count) if number not in left_out]
+    try:
+        yield
+    except CadalignError as error:
+        where = error.where and _renumbered(error.where, used)
+        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
+
+
+def _renumbered(text: str, used: Sequence[int]) -> str:
+    return re.sub(r"views\[(\d+)\]", lambda found: f"views[{used[int(found[1])]}]", text)
+
+
+def _is_on_a_line(points: FloatArray) -> bool:
+    if len(points) < _LEAST_POINTS:
+        return True
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= _ON_A_LINE * extents[0])
+
+
+def _explaining(prior: ShapePrior, view: View, result: AlignResult) -> Alignment:
+    """A pose near that of the first view under which a view's keypoints fit."""
+    scale = result.alignment.scale
+    alone = replace(view, depth=None, mask=None, mask_sigma=None, camera_height=None)
+    if not len(view.keypoint_ids) and view.up is None:
+        return result.alignment
+    evidence = evidence_of(prior, [alone], None, loss=LINEAR, loss_scale=1.0)
+    points = np.concatenate([result.points_3d, result.bounds])
+    shape = evidence.shape
+    evidence = evidence._replace(
+        shape=shape._replace(mean=points, modes=shape.modes[:0], spread=np.zeros(len(points))),
+        scales=evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
+    )
+    first = result.alignment
+    state = State(
+        np.append(first.rotation.ravel(), first.translation)[None],
+        np.log(scale),
+        np.zeros(0),
+        np.zeros_like(points),
+    )
+    refine_joint(evidence, _ITERATIONS, state)
+    return Alignment(state.poses[0, :9].reshape(3, 3), state.poses[0, 9:], scale)

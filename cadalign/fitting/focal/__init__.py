@@ -1,1 +1,0 @@
-"""Fits of unknown focal length: priors, the grid of focal lengths, the search."""

@@ -1,0 +1,94 @@
+"""Contours of masks: sub-pixel places, outward normals, borders, small pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign.errors import InputError
+from cadalign.estimation.contours.contour import (
+    SPACING,
+    Contour,
+    contour_of,
+    correlation_length,
+    mask_contour,
+)
+
+WIDTH, HEIGHT = 160, 120
+
+
+def distances(center: tuple[float, float]) -> np.ndarray:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.hypot(columns - center[0], rows - center[1])
+
+
+def disc(center: tuple[float, float], radius: float) -> np.ndarray:
+    return distances(center) < radius
+
+
+@pytest.mark.long
+@given(x=st.floats(60, 100), y=st.floats(50, 70), radius=st.floats(12, 40), soft=st.booleans())
+def test_a_disc_has_its_own_radius_and_normals(
+    x: float, y: float, radius: float, soft: bool
+) -> None:
+    mask = np.clip(radius - distances((x, y)) + 0.5, 0, 1) if soft else disc((x, y), radius)
+    contour = contour_of(mask)
+    outwards = contour.points - [x, y]
+    found = np.linalg.norm(outwards, axis=1)
+    of_area = np.sqrt(mask.sum() / np.pi)  # of the pixels, whose number is whole
+    assert abs(found.mean() - of_area) < 0.08
+    assert np.abs(found - radius).max() < (0.2 if soft else 0.7)
+    assert ((outwards / found[:, None] * contour.normals).sum(axis=1) > 0.95).all()
+    steps = np.linalg.norm(np.diff(contour.points, axis=0), axis=1)
+    assert abs(steps.mean() - SPACING) < 0.2
+
+
+def test_a_ring_has_two_curves_with_normals_away_from_the_object() -> None:
+    ring = disc((80, 60), 40) & ~disc((80, 60), 20)
+    contour = contour_of(ring)
+    assert set(contour.curve.tolist()) == {0, 1}
+    radii = np.linalg.norm(contour.points - [80, 60], axis=1)
+    outwards = ((contour.points - [80, 60]) * contour.normals).sum(axis=1)
+    assert (outwards[radii > 30] > 0).all()
+    assert (outwards[radii < 30] < 0).all()
+
+
+def test_nothing_is_told_at_the_border_of_the_image() -> None:
+    contour = contour_of(disc((0, 60), 30))
+    assert contour.points[:, 0].min() > 2
+    assert np.abs(np.linalg.norm(contour.points - [0, 60], axis=1) - 30).max() < 0.7
+    assert len(set(contour.curve.tolist())) == 1
+
+
+def test_small_pieces_and_holes_are_dropped() -> None:
+    clean = disc((60, 60), 30)
+    spotted = (clean & ~disc((60, 60), 1.2)) | disc((140, 100), 1.8)
+    assert len(contour_of(spotted).points) == len(contour_of(clean).points)
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (np.zeros((HEIGHT, WIDTH), dtype=bool), "no pixel of the object"),
+        (np.ones((HEIGHT, WIDTH)), "covers all of the image"),
+        (disc((80, 60), 1.0), "larger than a few pixels"),
+        (distances((80, 60)) >= 0, "covers all"),
+    ],
+)
+def test_masks_without_a_contour_are_refused(mask: np.ndarray, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        mask_contour(mask, "views[1].mask")
+    assert "views[1].mask" in str(caught.value)
+
+
+def test_correlated_residuals_count_less() -> None:
+    rng = np.random.default_rng(0)
+    count = 4000
+    contour = Contour(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count, dtype=int))
+    every = np.ones(count, dtype=bool)
+    independent = rng.normal(size=count)
+    alike = np.convolve(independent, np.ones(10) / np.sqrt(10), mode="same")
+    assert correlation_length(contour, independent, every) < 1.3
+    assert 8 < correlation_length(contour, alike, every) < 12

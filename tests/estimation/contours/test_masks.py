@@ -1,0 +1,259 @@
+"""`align` with masks: accuracy, damages, other objects' masks, starts without keypoints."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Model, View, align
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, DegenerateError, InputError
+from cadalign.estimation.contours.fit import contour_bound
+from cadalign.evaluation.accuracy.masks import damaged_mask
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.metrics import alignment_box_iou, rotation_error
+from cadalign.render import Scene, cast_geometry, sample_view
+
+pytestmark = pytest.mark.long
+
+CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+
+
+class Case(NamedTuple):
+    scene: Scene
+    model: Model
+    truth: Alignment
+    ids: list[int]
+    points_2d: np.ndarray
+    mask: np.ndarray
+
+    def view(self, **options: object) -> View:
+        return View(CAMERA, self.points_2d, ids=self.ids, **options)  # type: ignore[arg-type]
+
+
+def case_of(model: object, seed: int, *, noise_px: float = 1.0) -> Case:
+    """A random view of a stretched model with its exact mask."""
+    rng = np.random.default_rng(seed)
+    scene = Scene(model.load_mesh())  # type: ignore[attr-defined]
+    points = model.keypoints.xyz  # type: ignore[attr-defined]
+    scale = np.array([1.0, *np.exp(rng.uniform(-0.6, 0.6, 2))])
+    view = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, scale=scale, roll=10.0)
+    ids = np.flatnonzero(view.visible).tolist()
+    truth = view.cam_from_model
+    pixels = CAMERA.project(truth.apply(points[ids])) + rng.normal(0, noise_px, (len(ids), 2))
+    exact = Model(points_3d=points, mesh=scene.mesh)
+    return Case(scene, exact, truth, ids, pixels, cast_geometry(scene, CAMERA, truth).mask)
+
+
+@cache
+def chair(root: Path) -> Case:
+    return case_of(KeypointNet(root)["chair"][0], 1)
+
+
+def stretch_error(case: Case, estimate: Alignment) -> float:
+    return float(np.abs(estimate.scale / case.truth.scale - 1).max())
+
+
+def moved(alignment: Alignment, angle_deg: float, shift: float, stretch: float) -> Alignment:
+    turn = rotation_from_vector(np.radians(angle_deg) * np.array([0.6, -0.64, 0.48]))
+    return Alignment(
+        turn @ alignment.rotation,
+        alignment.translation * (1 + shift),
+        alignment.scale * [1, 1 + stretch, 1 - stretch],
+    )
+
+
+class TestExactMasks:
+    def test_real_models_are_aligned_as_well_as_the_bound_allows(self, real_data: Path) -> None:
+        root = real_data / "keypointnet"
+        dataset = KeypointNet(root)
+        found = []
+        for category in ("bottle", "mug", "chair"):
+            models = [each for each in dataset[category] if each.mesh_path is not None]
+            for number in range(2 * len(models)):
+                case = case_of(models[number // 2], number)
+                alone = align(case.model, case.view()).alignment
+                result = align(case.model, case.view(mask=case.mask))
+                bound = contour_bound(case.model, case.view(mask=case.mask), case.truth)
+                found.append(
+                    [
+                        rotation_error(est=alone, gt=case.truth),
+                        rotation_error(est=result.alignment, gt=case.truth),
+                        np.degrees(np.sqrt(np.trace(bound[:3, :3]))),
+                        stretch_error(case, result.alignment),
+                        alignment_box_iou(
+                            est=result.alignment, gt=case.truth, bounds=case.scene.bounds
+                        ),
+                    ]
+                )
+                assert not any("mask" in text for text in result.warnings)
+        errors = np.array(found)
+        alone, joint, _, stretch, iou = np.median(errors, axis=0)
+        assert joint < 0.3 * alone
+        assert np.median(errors[:, 1] / errors[:, 2]) < 1.2
+        assert joint < 0.25
+        assert stretch < 0.005
+        assert iou > 0.97
+
+    def test_the_sample_chair_and_what_the_result_says(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        alone = align(case.model, case.view())
+        result = align(case.model, case.view(mask=case.mask))
+        error = rotation_error(est=result.alignment, gt=case.truth)
+        assert error < 0.2
+        assert error < 4 * result.std.rotation_deg
+        assert result.std.rotation_deg < alone.std.rotation_deg / 3
+        (residuals,) = result.mask_residuals
+        assert residuals is not None
+        assert residuals.is_used
+        assert residuals.support > 0.9
+        assert residuals.rms < 0.5
+        assert len(residuals.points) == len(residuals.residuals) > 200
+        (summary,) = [each for each in result.evidence if each.kind == "mask"]
+        assert summary.view == 0
+        assert summary.rms == pytest.approx(residuals.rms)
+        assert 0.5 < summary.rms_sigmas < 1.5
+
+    def test_probabilities_and_files_serve_as_well(self, sample_root: Path, tmp_path: Path) -> None:
+        import cv2
+
+        case = chair(sample_root)
+        path = tmp_path / "mask.png"
+        cv2.imwrite(str(path), case.mask.astype(np.uint8) * 255)
+        expected = align(case.model, case.view(mask=case.mask)).alignment
+        of_file = align(case.model, case.view(mask=str(path))).alignment
+        of_probabilities = align(case.model, case.view(mask=case.mask * 0.9)).alignment
+        assert of_file == expected
+        assert rotation_error(est=of_probabilities, gt=case.truth) < 0.3
+
+    def test_two_views_share_the_stretch(self, sample_root: Path) -> None:
+        first = chair(sample_root)
+        turn = rotation_from_vector(np.array([0.0, 0.5, 0.0]))
+        middle = first.truth.translation
+        other = Alignment(turn @ first.truth.rotation, middle, first.truth.scale)
+        mask = cast_geometry(first.scene, CAMERA, other).mask
+        pixels = CAMERA.project(other.apply(np.asarray(first.model.points_3d)[first.ids]))
+        second = View(CAMERA, pixels, ids=first.ids, mask=mask)
+        result = align(first.model, [first.view(mask=first.mask), second])
+        assert rotation_error(est=result.poses[0], gt=first.truth) < 0.15
+        assert rotation_error(est=result.poses[1], gt=other) < 0.15
+        assert stretch_error(first, result.alignment) < 0.003
+
+
+@pytest.mark.parametrize("kind", ["dilated", "eroded", "smoothed", "hidden", "hole", "blob"])
+def test_damaged_masks_still_help(sample_root: Path, kind: str) -> None:
+    case = chair(sample_root)
+    mask = damaged_mask(case.mask, kind, np.random.default_rng(0))
+    alone = align(case.model, case.view())
+    result = align(case.model, case.view(mask=mask))
+    error = rotation_error(est=result.alignment, gt=case.truth)
+    assert error < (0.5 if kind in ("dilated", "eroded") else 1.1) * alone.std.rotation_deg
+    (residuals,) = result.mask_residuals
+    assert residuals is not None
+    assert residuals.is_used
+    if kind in ("dilated", "eroded"):
+        assert abs(residuals.offset) == pytest.approx(2, abs=0.5)
+
+
+@pytest.mark.parametrize("kind", ["exact", "dilated", "eroded", "smoothed"])
+def test_deviations_are_those_of_the_errors(sample_root: Path, kind: str) -> None:
+    dataset = KeypointNet(sample_root)
+    whitened = []
+    for category in ("chair", "vessel", "car"):
+        for seed in range(4):
+            case = case_of(dataset[category][0], seed)
+            mask = damaged_mask(case.mask, kind, np.random.default_rng(seed))
+            result = align(case.model, case.view(mask=mask))
+            turn = result.alignment.rotation @ case.truth.rotation.T
+            errors = np.concatenate(
+                [
+                    vector_from_rotation(turn),
+                    result.alignment.translation - case.truth.translation,
+                    np.log(result.alignment.scale / case.truth.scale)[1:],
+                ]
+            )
+            deviations = np.sqrt(result.covariance.diagonal())[[0, 1, 2, 3, 4, 5, 7, 8]]
+            whitened.append(np.abs(errors / deviations))
+    assert np.mean(np.array(whitened) < 1.96) > 0.9
+    assert 0.4 < np.sqrt(np.mean(np.square(whitened))) < 1.3
+
+
+class TestOtherObjects:
+    def test_the_mask_of_a_neighbour_is_named_and_left_out(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        neighbour = np.roll(case.mask, 150, axis=1)
+        alone = align(case.model, case.view())
+        result = align(case.model, case.view(mask=neighbour))
+        assert any("views[0].mask" in text for text in result.warnings)
+        (residuals,) = result.mask_residuals
+        assert residuals is not None
+        assert not residuals.is_used
+        assert rotation_error(est=result.alignment, gt=alone.alignment) < 1e-3
+
+    def test_neighbours_are_named_at_least_19_times_of_20(self, sample_root: Path) -> None:
+        dataset = KeypointNet(sample_root)
+        models = [dataset[category][0] for category in ("bottle", "car", "chair", "vessel")]
+        cases = [case_of(model, seed) for seed in range(5) for model in models]
+        named = []
+        for number, case in enumerate(cases):
+            columns = np.flatnonzero(case.mask.any(axis=0))
+            step = (len(columns) if number % 2 else -len(columns)) * 3 // 4
+            neighbour = np.roll(cases[(7 * number + 1) % len(cases)].mask, step, axis=1)
+            warnings = align(case.model, case.view(mask=neighbour)).warnings
+            named.append(any(text.startswith("views[0].mask contradicts") for text in warnings))
+        assert np.mean(named) >= 0.95
+
+
+class TestStarts:
+    def test_a_mask_alone_with_a_start(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        start = moved(case.truth, 3.0, 0.01, 0.02)
+        result = align(case.model, View(CAMERA, mask=case.mask), init=start)
+        assert rotation_error(est=result.alignment, gt=case.truth) < 0.3
+        assert stretch_error(case, result.alignment) < 0.01
+
+    def test_a_mask_and_three_keypoints_with_a_start(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        view = View(CAMERA, case.points_2d[:3], ids=case.ids[:3], mask=case.mask)
+        result = align(case.model, view, init=moved(case.truth, 6.0, 0.03, 0.05))
+        assert rotation_error(est=result.alignment, gt=case.truth) < 0.3
+
+    def test_a_start_far_away_is_refused(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        away = Alignment(case.truth.rotation, case.truth.translation + [3, 0, 0], case.truth.scale)
+        with pytest.raises(DegenerateError, match="comes near its contour") as caught:
+            align(case.model, View(CAMERA, mask=case.mask), init=away)
+        assert "views[0].mask" in str(caught.value)
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("mask", "words"),
+        [
+            (np.ones((480, 639), dtype=bool), "639 x 480"),
+            (np.full((480, 640), 1.5), r"\[0, 1\]"),
+            (np.full((480, 640), np.nan), "mask"),
+            (np.zeros((480, 640), dtype=bool), "no pixel"),
+            (np.ones((480, 640), dtype=bool), "covers all"),
+        ],
+    )
+    def test_is_refused_and_named(self, sample_root: Path, mask: np.ndarray, words: str) -> None:
+        case = chair(sample_root)
+        with pytest.raises(InputError, match=words) as caught:
+            align(case.model, case.view(mask=mask))
+        assert "mask" in str(caught.value)
+
+    def test_a_path_that_is_no_image(self, sample_root: Path, tmp_path: Path) -> None:
+        path = tmp_path / "mask.png"
+        path.write_text("no picture")
+        with pytest.raises(DataError, match=r"mask\.png"):
+            chair(sample_root).view(mask=path)
+
+    def test_a_model_without_a_mesh_is_told_what_to_do(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        with pytest.raises(InputError, match="load_mesh"):
+            align(Model(points_3d=case.model.points_3d), case.view(mask=case.mask))

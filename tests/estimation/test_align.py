@@ -1,0 +1,450 @@
+"""`align`: exact, stretched and similar models, several views, depth, gravity, outliers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
+from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.metrics import rotation_error
+from cadalign.shapes.box_margins import BoxMargins
+from cadalign.shapes.inflation import FewKeypoints
+from cadalign.shapes.model import ShapeModel
+
+CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
+LOOK = np.array([[0.8, 0.0, 0.6], [0.36, -0.8, -0.48], [0.48, 0.6, -0.64]])
+
+
+def keypoints(count: int = 10, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3))
+
+
+def truth_of(scale: Any = (1.0, 1.3, 0.8)) -> Alignment:
+    return Alignment(LOOK, [0.1, -0.05, 5.0], scale)
+
+
+def turned(angle_deg: float) -> np.ndarray:
+    """A camera that went around a point 5 before the rig's."""
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    pose[:3, 3] = np.array([0, 0, 5]) - pose[:3, :3] @ [0, 0, 5]
+    return pose
+
+
+def seen(points: np.ndarray, truth: Alignment, motion: np.ndarray, **options: Any) -> View:
+    in_rig = truth.apply(points)
+    in_camera = in_rig @ motion[:3, :3].T + motion[:3, 3]
+    noise = options.pop("noise", np.zeros((len(points), 2)))
+    return View(CAMERA, CAMERA.project(in_camera) + noise, **options)
+
+
+def spreads(deviation: float, count: int = 10, modes: int = 3) -> ShapeModel:
+    rng = np.random.default_rng(3)
+    mean = keypoints(count)
+    directions = rng.normal(size=(modes, count, 3))
+    return ShapeModel.from_basis(mean, directions, np.full(modes, deviation), residual_sigma=0.0)
+
+
+class TestExactModel:
+    def test_equals_fit_bit_for_bit(self) -> None:
+        points, rng = keypoints(), np.random.default_rng(1)
+        view = seen(points, truth_of(), np.eye(4), noise=rng.normal(0, 1, (10, 2)))
+        result = align(Model(points_3d=points), view)
+        expected = fit(points, view.points_2d, CAMERA)
+        assert result.alignment == expected.alignment
+        assert expected.covariance is not None
+        columns = [0, 1, 2, 3, 4, 5, 7, 8]
+        assert (result.covariance[np.ix_(columns, columns)] == expected.covariance).all()
+        assert result.warnings == expected.warnings
+
+    def test_a_shape_without_deviations_equals_the_rigid_fit(self) -> None:
+        rng = np.random.default_rng(1)
+        truth = truth_of((1.0, 1.0, 1.0))
+        view = seen(keypoints(), truth, np.eye(4), noise=rng.normal(0, 1, (10, 2)))
+        result = align(spreads(0.0), view)
+        expected = fit(keypoints(), view.points_2d, CAMERA, stretch="none")
+        assert np.allclose(result.alignment.rotation, expected.alignment.rotation, atol=1e-9)
+        assert np.allclose(result.alignment.translation, expected.alignment.translation, atol=1e-8)
+        assert expected.covariance is not None
+        assert np.allclose(result.covariance[:6, :6], expected.covariance[:6, :6], rtol=1e-5)
+
+    def test_ids_say_which_keypoints_a_view_shows(self) -> None:
+        points = keypoints()
+        names = [f"corner {i}" for i in range(10)]
+        chosen = [7, 2, 9, 4, 0, 5, 1]
+        view = View(
+            CAMERA,
+            CAMERA.project(truth_of().apply(points[chosen])),
+            ids=[names[i] for i in chosen],
+        )
+        result = align(Model(points_3d=points, ids=names), view)
+        assert np.allclose(result.alignment.scale, truth_of().scale, atol=1e-6)
+        assert np.allclose(result.points_3d, points)
+
+
+class TestSimilarModel:
+    def test_shape_errors_widen_the_uncertainty(self) -> None:
+        points, rng = keypoints(14), np.random.default_rng(5)
+        moved = points + rng.normal(0, 0.03, points.shape)
+        view = seen(moved, truth_of(), np.eye(4), noise=rng.normal(0, 1, (14, 2)))
+        naive = align(Model(points_3d=points), view)
+        honest = align(Model(points_3d=points, shape_sigma=0.03), view)
+        assert honest.std.rotation_deg > 3 * naive.std.rotation_deg
+        assert not any("residuals" in text for text in honest.warnings)
+
+    @pytest.mark.long
+    def test_stated_deviations_hold_the_truth(self) -> None:
+        points, inside = keypoints(12), 0
+        for seed in range(100):
+            rng = np.random.default_rng(seed)
+            moved = points + rng.normal(0, 0.02, points.shape)
+            view = seen(moved, truth_of(), np.eye(4), noise=rng.normal(0, 1, (12, 2)))
+            result = align(Model(points_3d=points, shape_sigma=0.02), view)
+            error = np.log(result.stretch[1:] / truth_of().scale[1:])
+            covariance = result.covariance[7:, 7:]
+            # Half of the stretch's ellipses hold the truth: chi-square of two has the median 1.386.
+            inside += bool(error @ np.linalg.solve(covariance, error) < 1.386)
+        assert 35 <= inside <= 65
+
+    def test_inflation_widens_the_deviations_alone(self) -> None:
+        model = spreads(0.05)
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        plain, wide = align(model, view), align(replace(model, inflation=1.5), view)
+        assert np.allclose(wide.alignment.rotation, plain.alignment.rotation, atol=1e-12)
+        assert np.allclose(wide.points_3d, plain.points_3d, atol=1e-12)
+        assert wide.std.rotation_deg > plain.std.rotation_deg
+        growth = np.trace(wide.points_covariance, axis1=1, axis2=2)
+        growth /= np.trace(plain.points_covariance, axis1=1, axis2=2)
+        assert (growth > 1).all()
+        assert (growth < 1.5**2 + 1e-9).all()
+
+    def test_few_keypoints_need_less_inflation(self) -> None:
+        model = replace(spreads(0.05), inflation=1.5)
+        less = replace(model, few_keypoints=FewKeypoints(typical=40.0, share=0.7))
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        for views in (view, [view, view]):  # two without motion take the way of any evidence
+            wide, narrow = align(model, views), align(less, views)
+            assert narrow.std.rotation_deg < wide.std.rotation_deg
+            assert np.allclose(narrow.points_3d, wide.points_3d, atol=1e-12)
+
+    def test_heavy_tails_change_the_regions_and_not_the_estimate(self) -> None:
+        model = spreads(0.05)
+        view = seen(keypoints() + 0.02, truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        plain, tails = align(model, view), align(replace(model, degrees_of_freedom=4.0), view)
+        assert (tails.covariance == plain.covariance).all()
+        assert plain.radius(0.95) == pytest.approx(1.96, abs=1e-3)
+        assert tails.radius(0.999, dimension=3) > plain.radius(0.999, dimension=3)
+        assert tails.radius(0.5) < plain.radius(0.5)
+        read = AlignResult.from_dict(json.loads(json.dumps(tails.to_dict())))
+        assert read.degrees_of_freedom == 4
+        for wrong in (0.0, 1.0, float("nan")):
+            with pytest.raises(InputError, match="probability"):
+                plain.radius(wrong)
+        with pytest.raises(InputError, match="dimension"):
+            plain.radius(0.5, dimension=0)
+
+    def test_the_box_ends_at_keypoints_that_its_faces_are_near(self) -> None:
+        model = spreads(0.05)
+        view = seen(model.components[0].mean[:-2], truth_of((1.0, 1.0, 1.0)), np.eye(4))
+        near = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
+        result = align(replace(model, box_margins=near), view)
+        points = result.points_3d
+        assert np.allclose(result.bounds, [points.min(0) - 0.01, points.max(0) + 0.01])
+        far = BoxMargins(np.full((2, 3), -9.0), np.zeros((2, 3)))
+        assert np.allclose(
+            align(replace(model, box_margins=far), view).bounds, align(model, view).bounds
+        )
+        tall = Size(height=float(np.ptp(points[:, 1])) + 0.2, sigma=0.001)
+        sized = align(replace(model, box_margins=near), view, size=tall)
+        assert np.allclose(sized.bounds, align(model, view, size=tall).bounds)
+
+    def test_a_learned_shape_comes_nearer_than_its_mean(self) -> None:
+        model, rng = spreads(0.05), np.random.default_rng(2)
+        component = model.components[0]
+        truth = truth_of((1.0, 1.0, 1.0))
+        shape = component.mean[:-2] + np.tensordot([1.5, -1.0, 0.5], component.modes, 1)[:-2]
+        view = seen(shape, truth, np.eye(4), noise=rng.normal(0, 0.5, (10, 2)))
+        result = align(model, view)
+        rigid = fit(component.mean[:-2], view.points_2d, CAMERA, stretch="none")
+        assert np.abs(result.points_3d - shape).max() < 0.02
+        error = rotation_error(est=result.alignment, gt=truth)
+        assert error < rotation_error(est=rigid.alignment, gt=truth) / 5
+
+
+class TestSeveralViews:
+    def test_known_motion_determines_all_three_scales(self) -> None:
+        points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
+        poses = [np.eye(4), turned(25)]
+        views = [seen(points, truth, pose, cam_from_rig=pose) for pose in poses]
+        result = align(Model(points_3d=points), views)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-5)
+        assert np.allclose(result.alignment.translation, truth.translation, atol=1e-5)
+
+    def test_a_view_with_two_keypoints_sharpens_the_estimate(self) -> None:
+        points, truth = keypoints(), truth_of((1.0, 1.0, 1.0))
+        first = seen(points, truth, np.eye(4), cam_from_rig=np.eye(4))
+        second = seen(points[:2], truth, turned(40), cam_from_rig=turned(40))
+        two = align(Model(points_3d=points), [first, second])
+        alone = align(Model(points_3d=points), View(CAMERA, first.points_2d))
+        assert two.std.scale[1] < alone.std.scale[1]
+        assert two.std.scale[0] > 0  # metric: the known poses tell the size
+
+    def test_unknown_motion_shares_the_stretch(self) -> None:
+        points, truth = keypoints(), truth_of()
+        rng = np.random.default_rng(4)
+        views = [
+            seen(points, truth, turned(angle), noise=rng.normal(0, 1, (10, 2)))
+            for angle in (0, 30, 60)
+        ]
+        together = align(Model(points_3d=points), views)
+        alone = align(Model(points_3d=points), views[0])
+        assert together.std.scale[1] < 0.8 * alone.std.scale[1]
+        assert len(together.poses) == 3
+        motion = together.poses[1].rotation @ together.poses[0].rotation.T
+        assert np.abs(motion - turned(30)[:3, :3]).max() < 0.02
+
+    @pytest.mark.long
+    def test_errors_are_at_the_bound(self) -> None:
+        points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
+        poses = [np.eye(4), turned(25)]
+        squares = []
+        for seed in range(60):
+            rng = np.random.default_rng(seed)
+            views = [
+                seen(points, truth, pose, cam_from_rig=pose, noise=rng.normal(0, 1, (10, 2)))
+                for pose in poses
+            ]
+            result = align(Model(points_3d=points), views)
+            error = np.log(result.stretch / truth.scale)
+            squares.append(error**2 / result.covariance.diagonal()[6:])
+        assert 0.6 < np.mean(squares) < 1.5
+
+
+class TestOtherEvidence:
+    def test_depth_determines_the_size(self) -> None:
+        points, truth = keypoints(), truth_of((1.4, 0.7, 1.9))
+        depth = truth.apply(points)[:, 2]
+        depth[3] = np.nan
+        view = seen(points, truth, np.eye(4), depth=depth, depth_sigma=0.005)
+        result = align(Model(points_3d=points), view)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+
+    def test_gravity_sharpens_the_rotation(self) -> None:
+        points, truth = keypoints(6), truth_of()
+        rng = np.random.default_rng(0)
+        up = truth.rotation @ [0, 1, 0]
+        noise = rng.normal(0, 2, (6, 2))
+        without = align(Model(points_3d=points), seen(points, truth, np.eye(4), noise=noise))
+        view = seen(points, truth, np.eye(4), noise=noise, up=up, up_sigma_deg=0.3)
+        result = align(Model(points_3d=points), view)
+        assert result.std.rotation_deg < 0.8 * without.std.rotation_deg
+        angle = np.degrees(np.arccos(result.alignment.rotation[:, 1] @ up))
+        assert angle < 1.5
+
+
+class TestOutliers:
+    def test_replaced_keypoints_are_left_out(self) -> None:
+        model = spreads(0.03, count=16)
+        component = model.components[0]
+        shape = component.mean[:-2] + np.tensordot([1.0, -1.0, 0.5], component.modes, 1)[:-2]
+        truth, rng = truth_of((1.0, 1.0, 1.0)), np.random.default_rng(7)
+        view = seen(shape, truth, np.eye(4), noise=rng.normal(0, 1, (16, 2)))
+        pixels = np.array(view.points_2d)
+        pixels[[1, 5, 11, 12]] = rng.uniform(0, 480, (4, 2))
+        result = align(model, View(CAMERA, pixels), ransac=RansacOptions(max_reproj_error=4.0))
+        assert np.flatnonzero(~result.inliers[0]).tolist() == [1, 5, 11, 12]
+        assert rotation_error(est=result.alignment, gt=truth) < 2.0
+
+    def test_inliers_are_in_the_order_of_the_view(self) -> None:
+        model = spreads(0.01, count=16)
+        truth, order = truth_of((1.0, 1.0, 1.0)), np.random.default_rng(0).permutation(16)
+        pixels = CAMERA.project(truth.apply(keypoints(16)[order]))
+        pixels[3] += 150
+        view = View(CAMERA, pixels, ids=order.tolist())
+        result = align(model, view, ransac=RansacOptions())
+        assert np.flatnonzero(~result.inliers[0]).tolist() == [3]
+
+
+def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
+    model = spreads(0.03)
+    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(angle)) for angle in (0, 5, 10)]
+    too_few = View(CAMERA, [[100.0, 100.0]])
+    batch = align_batch(model, [*views, too_few], workers=2)
+    assert isinstance(batch[3], DegenerateError)
+    for view, result in zip(views, batch, strict=False):
+        assert isinstance(result, AlignResult)
+        assert result.alignment == align(model, view).alignment
+
+
+def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
+    model = spreads(0.03)
+    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(angle)) for angle in (0, 5)]
+    size = Size(width=3.0)
+    four, two = (
+        View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:count])))
+        for count in (4, 2)
+    )
+    start = truth_of((1, 1, 1))
+    batch = align_batch(
+        model, [*views, four, two], size=[None, size, None, None], init=[None, None, start, start]
+    )
+    alone = (
+        align(model, views[0]),
+        align(model, views[1], size=size),
+        align(model, four, init=start),
+    )
+    for result, expected in zip(batch, alone, strict=False):
+        assert isinstance(result, AlignResult)
+        assert result.alignment == expected.alignment
+    assert isinstance(batch[3], DegenerateError)  # two keypoints, whatever the start
+    for result in align_batch(model, views, size=size, workers=2):
+        assert isinstance(result, AlignResult)
+        width = result.alignment.scale[0] * np.ptp(result.bounds[:, 0])
+        assert width == pytest.approx(3.0, rel=0.1)
+
+
+def test_a_start_does_not_change_what_the_keypoints_tell() -> None:
+    model, truth = spreads(0.03), truth_of((1, 1, 1))
+    view = seen(keypoints(), truth, np.eye(4))
+    alone, started = align(model, view), align(model, view, init=truth)
+    assert rotation_error(est=started.alignment, gt=alone.alignment) < 1e-3
+
+
+def test_three_keypoints_suffice_with_a_prior() -> None:
+    model = spreads(0.01)
+    view = View(CAMERA, CAMERA.project(truth_of((1, 1, 1)).apply(keypoints()[:3])))
+    result = align(model, view)
+    likely = [result.alignment, *(other.alignment for other in result.alternatives)]
+    truth = truth_of((1, 1, 1))
+    assert min(rotation_error(est=each, gt=truth) for each in likely) < 5
+
+
+def test_residuals_beyond_their_sigma_are_reported() -> None:
+    model, rng = spreads(0.01), np.random.default_rng(0)
+    view = seen(keypoints(), truth_of((1, 1, 1)), np.eye(4), noise=rng.normal(0, 20, (10, 2)))
+    assert any("times as large as sigma" in text for text in align(model, view).warnings)
+
+
+def test_a_result_survives_json() -> None:
+    model, rng = spreads(0.05), np.random.default_rng(0)
+    noise = rng.normal(0, 3, (10, 2))
+    views = [seen(keypoints(), truth_of((1, 1, 1)), turned(a), noise=noise) for a in (0, 20)]
+    result = align(model, views)
+    text = json.dumps(result.to_dict(), allow_nan=False)
+    again = AlignResult.from_dict(json.loads(text))
+    assert json.dumps(again.to_dict()) == text
+    assert str(again) == str(result)
+
+
+def test_a_damaged_result_is_refused_by_field() -> None:
+    data = align(spreads(0.05), seen(keypoints(), truth_of((1, 1, 1)), np.eye(4))).to_dict()
+    for name, value, message in (
+        ("covariance", [[1.0]], "alignment result: covariance: shape (1, 1), expected (9, 9)"),
+        ("views", [], "alignment result: views: there are none"),
+        ("ids", [1], "alignment result: ids: 1 entries, but points_3d has 10"),
+    ):
+        with pytest.raises(InputError) as caught:
+            AlignResult.from_dict({**data, name: value})
+        assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: align(
+                Model(points_3d=keypoints()), View(CAMERA, [[1, 2]] * 4, ids=[0, 1, 2, 77])
+            ),
+            "views[0].ids: the model has no keypoint 77; the model has 0, 1, 2",
+        ),
+        (lambda: align(Model(points_3d=keypoints()), []), "views: none is given"),
+        (
+            lambda: align(Model(points_3d=keypoints()), [keypoints()]),  # type: ignore[list-item]
+            "views[0]: expected a cadalign.View, got ndarray",
+        ),
+        (
+            lambda: align(keypoints(), View(CAMERA, [[1, 2]])),  # type: ignore[arg-type]
+            "model: expected a cadalign.Model or a cadalign.ShapeModel, got ndarray",
+        ),
+        (lambda: View(CAMERA, [[1, 2], [3, 4]], ids=["a", "a"]), "ids: 'a' occurs twice"),
+        (lambda: View(CAMERA, [[1, 2]], ids=["a", "b"]), "ids: 2 ids for 1 keypoints"),
+        (
+            lambda: View(CAMERA, [[1, 2]], cam_from_rig=2 * np.eye(4)),
+            "cam_from_rig: not a rigid motion",
+        ),
+        (lambda: View(CAMERA, [[1, 2]], depth=[-1.0]), "depth: has values that are not positive"),
+        (lambda: View(CAMERA, [[1, 2]], up=[0, 0, 0]), "up: a direction must not be zero"),
+        (
+            lambda: View(Camera.without_focal(640, 480), [[1, 2]]),
+            "camera: its focal length is unknown",
+        ),
+        (
+            lambda: align(
+                Model(points_3d=keypoints()),
+                [View(CAMERA, [[1, 2]], cam_from_rig=np.eye(4)), View(CAMERA, [[1, 2]])],
+            ),
+            "views[1].cam_from_rig: only some views have a known pose",
+        ),
+        (lambda: Model(points_3d=keypoints(), shape_sigma=0.0), "shape_sigma: 0.0 is not positive"),
+        (lambda: Model(points_3d=np.empty((0, 3))), "points_3d: a model needs keypoints"),
+        (
+            lambda: align_batch(Model(points_3d=keypoints()), [], workers=0),
+            "workers: must be >= 1, or -1 for all cores, not 0",
+        ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()), [View(CAMERA, [[1, 2]])], size=[Size(width=1.0)] * 2
+            ),
+            "size: 2 for 1 objects; give one for all, or one or None for each",
+        ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()),
+                [View(CAMERA, [[1, 2]])],
+                init=[4],  # type: ignore[list-item]
+            ),
+            "init[0]: expected a cadalign.Alignment or None, got int",
+        ),
+        (
+            lambda: align_batch(
+                Model(points_3d=keypoints()),
+                [View(CAMERA, [[1, 2]])],
+                size=1.0,  # type: ignore[arg-type]
+            ),
+            "size: expected a cadalign.Size or a sequence of them, got float",
+        ),
+    ],
+)
+def test_bad_input_is_named(call: Any, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        call()
+    assert isinstance(caught.value, CadalignError)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
+    places = [
+        [0, 0.6, 0],
+        [0, -0.3, 0],
+        [0, 0.1, 0.05],
+        [0, 0.1, -0.05],
+        [0, 0, 0.02],
+        [0, 0, -0.02],
+    ]
+    mean = np.array(places, float)
+    model = ShapeModel.from_basis(mean, [mean * [0, 0, 1]], [1.2], residual_sigma=0.001)
+    truth = truth_of((1.0, 1.0, 1.0))
+    result = align(model, seen(mean, truth, np.eye(4)))
+    assert rotation_error(est=result.alignment, gt=truth) < 5
+    behind = Alignment(LOOK @ np.diag([-1.0, 1.0, -1.0]), truth.translation, np.ones(3))
+    assert result.probability < 0.9
+    assert any("another pose, 1" in text for text in result.warnings)
+    others = [each.alignment for each in result.alternatives]
+    assert min(rotation_error(est=each, gt=behind) for each in others) < 5

@@ -1,0 +1,305 @@
+"""Evidence beyond keypoints: sizes, heights, depth images, few keypoints in many views."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from support.scenes import (
+    CAMERA,
+    around,
+    depth_image,
+    in_camera,
+    keypoints,
+    rig,
+    seen,
+    truth_of,
+    turned,
+)
+
+from cadalign import Alignment, Model, ShapeModel, Size, View, align
+from cadalign.errors import InputError
+from cadalign.estimation.align_result import AlignResult
+from cadalign.geometry.gravity import up_from_vertical_edges
+
+
+def box_of(points: np.ndarray, truth: Alignment) -> np.ndarray:
+    """Lengths (3,) of the object's box."""
+    return np.ptp(points, axis=0) * truth.scale
+
+
+def height_of(points: np.ndarray, truth: Alignment) -> float:
+    """Height of the camera above the plane of the object's lowest face."""
+    camera = -truth.rotation.T @ truth.translation
+    return float(camera[1] - truth.scale[1] * points[:, 1].min())
+
+
+def similar(count: int = 12) -> ShapeModel:
+    rng = np.random.default_rng(3)
+    modes = rng.normal(size=(2, count, 3))
+    return ShapeModel.from_basis(
+        keypoints(count), modes, [0.02, 0.02], residual_sigma=1e-3, up_axis="y"
+    )
+
+
+class TestSize:
+    @pytest.mark.parametrize("name", ["width", "height", "length"])
+    def test_one_length_determines_all_scales(self, name: str) -> None:
+        points, truth = keypoints(), truth_of()
+        axis = ("width", "height", "length").index(name)
+        size = Size(**{name: box_of(points, truth)[axis]})
+        result = align(Model(points_3d=points), seen(points, truth, np.eye(4)), size=size)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+        assert np.allclose(result.alignment.translation, truth.translation, rtol=1e-4)
+        assert 0.009 < result.std.scale[axis] < 0.0101
+
+    def test_three_lengths_sharpen_the_rotation(self) -> None:
+        points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
+        view = seen(points, truth, np.eye(4), rng)
+        w, h, d = box_of(points, truth)
+        result = align(Model(points_3d=points), view, size=Size(w, h, d, sigma=0.002))
+        assert result.std.rotation_deg < align(Model(points_3d=points), view).std.rotation_deg
+
+    def test_a_learned_shape_takes_the_size(self) -> None:
+        model, truth = similar(), truth_of((2.0, 2.0, 2.0))
+        points = model.components[0].mean[:-2]
+        box = np.ptp(model.components[0].mean[-2:], axis=0)
+        size = Size(length=2 * box[2], sigma=0.001)
+        result = align(model, seen(points, truth, np.eye(4)), size=size)
+        assert np.allclose(result.alignment.translation, truth.translation, rtol=0.01)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda: Size(), "size: no length is given"),
+            (lambda: Size(width=-1), "width: -1 is not positive"),
+            (lambda: Size(width=1, sigma=0), "sigma: must be positive, one or one per axis"),
+        ],
+    )
+    def test_bad_lengths_are_named(self, call: Any, message: str) -> None:
+        with pytest.raises(InputError) as caught:
+            call()
+        assert str(caught.value).startswith(message)
+
+
+@pytest.mark.long
+def test_deviations_of_a_learned_shape_hold_the_truth() -> None:
+    model, truth = similar(), truth_of((1.5, 1.5, 1.5))
+    component, squares = model.components[0], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        shape = component.mean + np.tensordot(rng.normal(size=2), component.modes, 1)
+        shape = (shape + 1e-3 * rng.normal(size=shape.shape))[:-2]
+        views = rig(shape, truth, [0, 30], rng)
+        depth = in_camera(shape, truth, np.eye(4))[:, 2]
+        noisy = depth * (1 + 0.01 * rng.normal(size=len(depth)))
+        up = turned(truth.rotation[:, 1], abs(rng.normal()), rng)
+        views[0] = View(CAMERA, views[0].points_2d, cam_from_rig=np.eye(4), depth=noisy, up=up)
+        result = align(model, views)
+        errors = result.alignment.apply(result.points_3d) - truth.apply(shape)
+        whitened = np.linalg.solve(result.points_cam_covariance, errors[:, :, None])[:, :, 0]
+        squares.append((errors * whitened).sum(axis=1) / 3)
+        assert not any("contradict" in text for text in result.warnings)
+    assert 0.7 < np.mean(squares) < 1.3
+
+
+class TestCameraHeight:
+    def test_it_determines_the_size(self) -> None:
+        points, truth = keypoints(), truth_of()
+        up = truth.rotation[:, 1]
+        view = seen(points, truth, np.eye(4), up=up, camera_height=height_of(points, truth))
+        result = align(Model(points_3d=points), view)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+        assert 0.01 < result.std.scale[0] < 0.03
+
+    def test_it_works_in_a_view_of_a_rig(self) -> None:
+        points, truth = keypoints(), truth_of()
+        poses = [around(0), around(40)]
+        moved = Alignment(
+            poses[1][:3, :3] @ truth.rotation,
+            poses[1][:3, :3] @ truth.translation + poses[1][:3, 3],
+            truth.scale,
+        )
+        views = rig(points, truth, [0])
+        height = height_of(points, moved)
+        views.append(
+            seen(
+                points,
+                truth,
+                poses[1],
+                cam_from_rig=poses[1],
+                camera_height=height,
+                camera_height_sigma=1e-3,
+            )
+        )
+        result = align(Model(points_3d=points), views)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=1e-4)
+        assert {each.kind for each in result.evidence} == {"keypoints", "camera height"}
+        assert result.warnings == ()
+
+
+class TestDepthImage:
+    def test_an_array_determines_the_size(self) -> None:
+        points, truth = keypoints(), truth_of()
+        view = seen(points, truth, np.eye(4), depth=depth_image(points, truth))
+        result = align(Model(points_3d=points), view)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=0.01)
+        assert [(each.kind, each.count) for each in result.evidence] == [
+            ("keypoints", 10),
+            ("depth", 10),
+        ]
+
+    def test_a_file_has_a_scale(self, tmp_path: Path) -> None:
+        points, truth = keypoints(), truth_of()
+        image = np.round(depth_image(points, truth) * 2000).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "depth.png"), image)
+        path = tmp_path / "depth.png"
+        view = seen(points, truth, np.eye(4), depth=path, depth_scale=1 / 2000)
+        result = align(Model(points_3d=points), view)
+        assert np.allclose(result.alignment.scale, truth.scale, rtol=0.01)
+        in_millimetres = seen(points, truth, np.eye(4), depth=str(path))
+        assert np.isclose(np.nanmax(in_millimetres.depth_image), 18.0)
+
+    def test_what_hides_keypoints_does_not_harm(self) -> None:
+        points, truth, rng = keypoints(12), truth_of(), np.random.default_rng(0)
+        image = depth_image(points, truth)
+        pixels = CAMERA.project(truth.apply(points)).round().astype(int)
+        for x, y in pixels[:2]:
+            image[y - 9 : y + 10, x - 9 : x + 10] = 3.0
+        image[pixels[2, 1] - 9 : pixels[2, 1] + 10] = 0.0
+        view = seen(points, truth, np.eye(4), rng, depth=image, depth_sigma=0.005)
+        result = align(Model(points_3d=points), view)
+        error = np.log(result.stretch / truth.scale)
+        assert (np.abs(error) < 4 * np.array(result.std.scale)).all()
+        assert result.std.scale[0] < 0.02
+
+
+class TestFewKeypoints:
+    @pytest.mark.parametrize("per_view", [1, 2])
+    def test_many_views_of_one_or_two_suffice(self, per_view: int) -> None:
+        points, truth, rng = keypoints(12), truth_of(), np.random.default_rng(1)
+        angles = [-50, -30, -10, 10, 30, 50]
+        views = []
+        for number, angle in enumerate(angles):
+            ids = [(number * per_view + k) % 12 for k in range(per_view)]
+            pose = around(angle)
+            views.append(seen(points[ids], truth, pose, rng, ids=ids, cam_from_rig=pose))
+        result = align(Model(points_3d=points), views)
+        likely = [result.alignment, *(other.alignment for other in result.alternatives)]
+        errors = [np.abs(np.log(each.scale / truth.scale)).max() for each in likely]
+        assert min(errors) < (0.03 if per_view == 2 else 0.2)
+
+    def test_an_initial_alignment_starts_where_keypoints_do_not(self) -> None:
+        points, truth = keypoints(), truth_of((1.0, 1.0, 1.0))
+        model = Model(points_3d=points, stretch="none")
+        view = seen(points[:2], truth, np.eye(4), up=truth.rotation[:, 1], up_sigma_deg=0.5)
+        start = Alignment(truth.rotation, truth.translation + 0.1, np.ones(3))
+        result = align(model, view, init=start)
+        assert result.rms < 1e-3
+        assert np.isclose(result.alignment.rotation[:, 1] @ truth.rotation[:, 1], 1, atol=1e-6)
+
+
+class TestUp:
+    def test_one_vertical_edge_sharpens_the_rotation(self) -> None:
+        points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
+        up = truth.rotation[:, 1]
+        base = np.array([0.3, 0.4, 4.0])
+        edge = CAMERA.project(np.stack([base, base + 0.8 * up]))
+        direction, covariance = up_from_vertical_edges(CAMERA, edge)
+        pixels = seen(points, truth, np.eye(4), rng).points_2d
+        without = align(Model(points_3d=points), View(CAMERA, pixels))
+        view = View(CAMERA, pixels, up=direction, up_sigma_deg=covariance)
+        result = align(Model(points_3d=points), view)
+        assert result.std.rotation_deg < without.std.rotation_deg
+
+    def test_an_isotropic_covariance_equals_the_deviation(self) -> None:
+        points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
+        up = turned(truth.rotation[:, 1], 1.0, rng)
+        across = np.eye(3) - np.outer(up, up)
+        view = seen(points, truth, np.eye(4), rng, up=up, up_sigma_deg=2.0)
+        same = View(CAMERA, view.points_2d, up=up, up_sigma_deg=4.0 * across)
+        first, second = (align(Model(points_3d=points), each) for each in (view, same))
+        assert np.allclose(first.alignment.rotation, second.alignment.rotation, atol=1e-7)
+
+
+def test_contributions_say_what_each_piece_adds() -> None:
+    points, truth, rng = keypoints(6), truth_of(), np.random.default_rng(0)
+    up = truth.rotation[:, 1]
+    depth = in_camera(points, truth, np.eye(4))[:, 2]
+    told = {"up": up, "up_sigma_deg": 0.2, "depth": depth}
+    view = seen(points, truth, np.eye(4), rng, **told)
+    result = align(Model(points_3d=points), view, size=Size(width=box_of(points, truth)[0]))
+    found = {each.name: each.without for each in result.contributions()}
+    assert list(found) == ["views[0].points_2d", "views[0].depth", "views[0].up", "size"]
+    assert all(each.rotation_deg > 0.999 * result.std.rotation_deg for each in found.values())
+    assert found["views[0].up"].rotation_deg > 1.2 * result.std.rotation_deg
+    assert found["size"].scale[0] > 1.05 * result.std.scale[0]
+    plain = View(CAMERA, view.points_2d, up=up, up_sigma_deg=0.2)
+    same = align(Model(points_3d=points), plain, size=Size(width=box_of(points, truth)[0]))
+    assert np.isclose(found["views[0].depth"].rotation_deg, same.std.rotation_deg, rtol=0.05)
+
+
+def test_the_rig_frame_is_that_of_the_cameras() -> None:
+    points, truth = keypoints(), truth_of()
+    world = np.eye(4)
+    world[:3, :3] = around(70)[:3, :3]
+    world[:3, 3] = [3.0, -1.0, 2.0]
+    views = [
+        seen(points, truth, around(a), cam_from_rig=around(a) @ np.linalg.inv(world))
+        for a in (0, 30)
+    ]
+    result = align(Model(points_3d=points), views)
+    expected = truth.apply(points) @ world[:3, :3].T + world[:3, 3]
+    assert result.rig_from_model is not None
+    assert np.allclose(result.rig_from_model.apply(points), expected, atol=1e-5)
+    again = AlignResult.from_dict(json.loads(json.dumps(result.to_dict())))
+    assert again.rig_from_model == result.rig_from_model
+    assert again.evidence == result.evidence
+    with pytest.raises(InputError, match="read from a file"):
+        again.contributions()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: View(CAMERA, [[1, 2]], depth=np.ones((3, 4))),
+            "depth: shape (3, 4), expected (1,) or (480, 640)",
+        ),
+        (
+            lambda: View(CAMERA, depth=np.full((480, 640), 5, dtype=np.uint16)),
+            "depth: whole numbers have no unit",
+        ),
+        (lambda: View(CAMERA, camera_height=0), "camera_height: 0 is not positive"),
+        (
+            lambda: View(CAMERA, mask=np.zeros((4, 5), dtype=bool)),
+            "mask: the mask is 5 x 4, the camera 640 x 480",
+        ),
+        (
+            lambda: View(CAMERA, mask=np.full((480, 640), 255)),
+            "mask: has values outside of [0, 1]",
+        ),
+        (
+            lambda: View(CAMERA, up=[0, 1, 0], up_sigma_deg=np.zeros((3, 3))),
+            "up_sigma_deg: not a covariance of rank 2 or more",
+        ),
+        (
+            lambda: align(
+                Model(points_3d=keypoints()), [*rig(keypoints(), truth_of(), [0]), View(CAMERA)]
+            ),
+            "views[1]: tells nothing about the object",
+        ),
+        (
+            lambda: align(Model(points_3d=keypoints()), View(CAMERA, [[1, 2]]), size=3),  # type: ignore[arg-type]
+            "size: expected a cadalign.Size, got int",
+        ),
+    ],
+)
+def test_bad_input_is_named(call: Any, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        call()
+    assert str(caught.value).startswith(message)

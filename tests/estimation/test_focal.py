@@ -1,0 +1,587 @@
+"""`fit` with an unknown focal length: accuracy, what it says of itself, and what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from support.problems import LENS, assert_same, moved, problem_of, with_outliers
+
+from cadalign import Alignment, Camera, FitResult, FocalPrior, RansacOptions, fit, fit_batch
+from cadalign.datasets import Bundler, Colmap
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.estimation import focal_search
+from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.geometry.metrics import rotation_error
+from cadalign.solvers.focal import linear_focal
+
+UNKNOWN = Camera.without_focal(640, 480)
+LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+
+
+def fit_unknown(problem: Problem, camera: Camera = UNKNOWN, **options: Any) -> FitResult:
+    return fit(problem.points_3d, problem.points_2d, camera, focal="estimate", **options)
+
+
+def whitened(
+    problem: Problem, alignment: Alignment, camera: Camera, step: np.ndarray
+) -> np.ndarray:
+    """Residuals after a step of the 9 unknowns, in the documented order."""
+    seen = camera.with_focal(camera.fx * np.exp(step[8]))
+    return seen.project(moved(alignment, step).apply(problem.points_3d)) - problem.points_2d
+
+
+def spoiled(problem: Problem, share: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Image points of which some were moved by 15 px or more, and which these are."""
+    rng = np.random.default_rng(seed)
+    count = len(problem.points_2d)
+    wrong = rng.permutation(count) < round(share * count)
+    return with_outliers(problem.points_2d, np.flatnonzero(wrong), rng), wrong
+
+
+# --- accuracy ---------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@given(
+    seed=st.integers(0, 10_000),
+    points=st.integers(7, 30),
+    focal=st.floats(120, 3000),
+)
+def test_exact_keypoints_give_back_the_focal_length(seed: int, points: int, focal: float) -> None:
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+    problem = problem_of(
+        seed, points=points, noise_px=0.0, camera=camera, depth=(3 + focal / 200, 4 + focal / 200)
+    )
+    result = fit_unknown(problem)
+    assert result.camera.fx == pytest.approx(focal, rel=1e-5)
+    assert result.camera.fy == result.camera.fx
+    assert_same(result.alignment, problem.alignment, 1e-5)
+
+
+@pytest.mark.long
+def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
+    rng = np.random.default_rng(3)
+    problems = [simulate_problem(rng, points=50, noise_px=1.0) for _ in range(500)]
+    batch = fit_batch(
+        [p.points_3d for p in problems], [p.points_2d for p in problems], UNKNOWN, focal="estimate"
+    )
+    assert batch.solved.all()
+    errors, limits = [], []
+    for b, problem in enumerate(problems):
+        gt = problem.alignment
+        bound = cramer_rao_bound(
+            problem.points_3d, SIMULATION_CAMERA, gt, sigma=1.0, focal="estimate"
+        )
+        limits.append(sample_limit(bound, rng=rng, draws=20))
+        est = batch.alignment(b)
+        errors.append(
+            (
+                rotation_error(est=est, gt=gt),
+                np.linalg.norm(est.translation - gt.translation),
+                *np.abs(est.scale / gt.scale - 1)[1:],
+                abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1),
+            )
+        )
+    names = (
+        "rotation_error_deg",
+        "translation_error",
+        "scale_y_error",
+        "scale_z_error",
+        "focal_error",
+    )
+    medians = [np.median([draws[name] for draws in limits]) for name in names]
+    ratios = np.median(errors, axis=0) / medians
+    assert (ratios < 1.15).all(), ratios
+    assert (ratios > 0.85).all(), ratios
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("points", [5, 6, 8, 50])
+def test_no_better_explanation_is_missed(points: int) -> None:
+    missed = 0
+    for seed in range(60):
+        problem = problem_of(seed, points=points, noise_px=1.0)
+        result = fit_unknown(problem)
+        at_truth = whitened(problem, problem.alignment, SIMULATION_CAMERA, np.zeros(9))
+        missed += (result.residuals**2).sum() > (at_truth**2).sum() * (1 + 1e-9)
+    assert missed == 0
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+@pytest.mark.parametrize("prior", [None, FocalPrior(160.0, 0.02)])
+def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior | None) -> None:
+    problem = problem_of(6, points=15, noise_px=3.0)
+    result = fit_unknown(problem, loss=loss, sigma=2.0, focal_prior=prior)
+
+    def cost(step: np.ndarray) -> float:
+        squares = (whitened(problem, result.alignment, result.camera, step) ** 2).sum(axis=1) / 4
+        lengths = np.sqrt(squares)
+        if loss == "huber":
+            squares = np.where(lengths > 2, 4 * lengths - 4, squares)
+        elif loss == "cauchy":
+            squares = 4 * np.log1p(squares / 4)
+        off = 0.0 if prior is None else np.log(result.camera.fx / prior.focal) + step[8]
+        return float(squares.sum() + (off / (prior.relative_sigma if prior else 1.0)) ** 2)
+
+    assert result.covariance is not None
+    here = cost(np.zeros(9))
+    for k, deviation in enumerate(np.sqrt(result.covariance.diagonal())):
+        for sign in (1e-3, -1e-3):
+            assert cost(sign * deviation * np.eye(9)[k]) >= here - 1e-9
+
+
+@pytest.mark.slow
+def test_lens_distortion_is_honoured() -> None:
+    camera = Camera.without_focal(640, 480, cx=310.0, cy=250.0, distortion=LENS.distortion)
+    square = dataclasses.replace(LENS, fy=LENS.fx)
+    problem = problem_of(1, points=40, noise_px=0.5, camera=square)
+    result = fit_unknown(problem, camera, sigma=0.5)
+    found = least_squares(
+        lambda step: whitened(problem, result.alignment, result.camera, step).ravel() / 0.5,
+        np.zeros(9),
+        x_scale="jac",
+    )
+    assert result.covariance is not None
+    # Through a lens, errors of pixels become errors of rays by the lens's derivative.
+    assert np.abs(found.x / np.sqrt(result.covariance.diagonal())).max() < 0.3
+    assert result.camera.fx == pytest.approx(500, rel=4 * result.std.focal)  # type: ignore[union-attr]
+    assert result.camera.distortion == LENS.distortion
+
+
+def test_shape_of_pixels_and_principal_point_are_the_cameras() -> None:
+    camera = Camera(640, 480, 500.0, 550.0, 280.0, 260.0)
+    problem = problem_of(2, points=30, noise_px=0.0, camera=camera)
+    placeholder = dataclasses.replace(camera, fx=1000.0, fy=1100.0)
+    result = fit_unknown(problem, placeholder)
+    assert result.camera.fx == pytest.approx(500.0, rel=1e-6)
+    assert result.camera.fy == pytest.approx(550.0, rel=1e-6)
+    assert (result.camera.cx, result.camera.cy) == (280.0, 260.0)
+
+
+def test_placeholder_changes_nothing() -> None:
+    problem = problem_of(1)
+    other = fit_unknown(problem, UNKNOWN.with_focal(77.0))
+    result = fit_unknown(problem)
+    assert other.camera.fx == pytest.approx(result.camera.fx, rel=1e-9)
+    assert_same(other.alignment, result.alignment, 1e-8)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("stretch", [None, "none"])
+def test_known_axis_and_stretch_are_honoured(axis: str, stretch: str | None) -> None:
+    problem = problem_of(4, points=20, noise_px=0.0)
+    if stretch == "none":
+        problem = dataclasses.replace(
+            problem, points_3d=problem.points_3d * problem.alignment.scale
+        )
+    result = fit_unknown(problem, known_axis=axis, stretch=stretch)
+    assert result.alignment.scale["xyz".index(axis)] == 1.0
+    assert result.camera.fx == pytest.approx(150.0, rel=1e-5)
+    known = fit(
+        problem.points_3d, problem.points_2d, problem.camera, known_axis=axis, stretch=stretch
+    )
+    assert_same(result.alignment, known.alignment, 1e-5)
+    assert result.covariance is not None
+    assert known.covariance is not None
+    where_known = result.covariance.diagonal()[:8] == 0
+    assert (where_known == (known.covariance.diagonal() == 0)).all()
+
+
+def test_linear_guess_is_exact_without_noise() -> None:
+    for seed in range(20):
+        problem = problem_of(seed, points=12, noise_px=0.0)
+        rays = UNKNOWN.with_focal(400.0).normalize(problem.points_2d)
+        assert 400.0 * linear_focal(problem.points_3d, rays) == pytest.approx(150.0, rel=1e-6)
+
+
+def test_linear_guess_is_nan_where_there_is_none() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (10, 3))
+    flat = points * [1, 1, 0]
+    assert np.isnan(linear_focal(points[:5], points[:5, :2].copy()))
+    assert np.isnan(linear_focal(flat, points[:, :2].copy()))
+
+
+# --- what it says of itself -------------------------------------------------------------------
+
+
+def test_covariance_is_that_of_the_nine_unknowns() -> None:
+    problem = problem_of(3, points=30, noise_px=1.0)
+    result = fit_unknown(problem)
+    found = least_squares(
+        lambda step: whitened(problem, result.alignment, result.camera, step).ravel(),
+        np.zeros(9),
+        max_nfev=1,
+    )
+    assert result.covariance is not None
+    np.testing.assert_allclose(
+        result.covariance, np.linalg.inv(found.jac.T @ found.jac), rtol=2e-3, atol=1e-9
+    )
+    assert result.std is not None
+    assert result.posterior_covariance is not None
+    assert result.std.focal == pytest.approx(np.sqrt(result.posterior_covariance[8, 8]))
+    assert result.std.focal >= np.sqrt(result.covariance[8, 8])
+
+
+def test_known_focal_length_has_eight_unknowns_and_no_deviation() -> None:
+    problem = problem_of(3)
+    result = fit(problem.points_3d, problem.points_2d, problem.camera)
+    assert result.camera == problem.camera
+    assert result.focal == "known"
+    assert result.covariance is not None
+    assert result.covariance.shape == (8, 8)
+    assert result.std is not None
+    assert result.std.focal == 0.0
+
+
+def test_weak_focal_length_is_said_in_words() -> None:
+    problem = problem_of(1, points=40, noise_px=1.0, camera=LONG, depth=(12.0, 14.0))
+    result = fit_unknown(problem)
+    assert result.std is not None
+    assert result.std.focal > 0.02
+    (warning,) = [text for text in result.warnings if "focal" in text and "+-" in text]
+    assert warning.startswith("the focal length is known only to +-")
+    assert warning.endswith(" %: the keypoints differ little in depth for their distance")
+    assert f"  focal length {result.camera.fx:.4g} px +- " in str(result)
+
+
+def test_strong_focal_length_is_not_warned_of() -> None:
+    problem = problem_of(1, points=200, noise_px=0.1)
+    result = fit_unknown(problem, sigma=0.1)
+    assert result.std is not None
+    assert result.std.focal < 0.01
+    assert not any("focal" in text for text in result.warnings)
+
+
+def test_focal_length_that_nothing_determines_is_said_so() -> None:
+    # Seen along its normal, a plane looks the same at any focal length.
+    plane = np.random.default_rng(0).uniform(-1, 1, (20, 3)) * [1, 1, 0]
+    facing = Alignment(np.eye(3), [0.1, 0.0, 5.0], [1, 1, 1])
+    points_2d = LONG.project(facing.apply(plane))
+    result = fit(plane, points_2d, UNKNOWN, focal="estimate", stretch="none", sigma=0.5)
+    assert result.std is not None
+    assert result.std.focal > 1.0
+    assert any(
+        text.startswith("the focal length is known only to +-")
+        and text.endswith("the keypoints lie nearly in one plane")
+        for text in result.warnings
+    )
+
+
+@pytest.mark.long
+def test_end_of_the_searched_range_is_said_so() -> None:
+    problem = problem_of(0, points=12, noise_px=1.0)
+    points = problem.points_3d @ problem.alignment.rotation.T
+    flat = 100 * points[:, :2] + [320, 240]  # seen from infinitely far
+    flat += np.random.default_rng(0).normal(size=flat.shape)
+    seen = [
+        fit(points, flat + shift, UNKNOWN, focal="estimate")
+        for shift in np.random.default_rng(1).normal(size=(8, 12, 2))
+    ]
+    ends = [result for result in seen if result.camera.fx == pytest.approx(50 * 640)]
+    assert ends
+    for result in ends:
+        assert any(
+            text == "the focal length is the end of the searched range (3.2e+04 px): "
+            "the keypoints fit best at one that no camera has"
+            for text in result.warnings
+        )
+
+
+@pytest.mark.long
+def test_other_explanations_have_cameras_of_their_own() -> None:
+    found = []
+    for seed in range(40):
+        problem = problem_of(seed, points=5, noise_px=0.5)
+        for other in fit_unknown(problem).alternatives:
+            projected = other.camera.project(other.alignment.apply(problem.points_3d))
+            found.append(np.abs(projected - problem.points_2d).max())
+    assert len(found) > 5
+    assert max(found) < 20
+
+
+def test_estimated_noise_comes_with_nine_unknowns() -> None:
+    problem = problem_of(3, points=60, noise_px=2.5)
+    result = fit_unknown(problem, sigma=None)
+    assert result.sigma == pytest.approx(np.sqrt((result.residuals**2).sum() / (2 * 60 - 9)))
+    known = fit_unknown(problem, sigma=result.sigma)
+    np.testing.assert_allclose(known.covariance, result.covariance, rtol=1e-4)
+
+
+# --- priors -----------------------------------------------------------------------------------
+
+
+def test_prior_takes_part_by_its_weight() -> None:
+    problem = problem_of(2, points=20, noise_px=1.0)
+    free = fit_unknown(problem)
+    assert free.std is not None
+    tight = fit_unknown(problem, focal_prior=FocalPrior(150.0, 1e-4))
+    assert tight.camera.fx == pytest.approx(150.0, rel=1e-3)
+    known = fit(problem.points_3d, problem.points_2d, problem.camera)
+    assert_same(tight.alignment, known.alignment, 1e-3)
+    assert tight.std is not None
+    assert tight.std.focal == pytest.approx(1e-4, rel=1e-2)
+    loose = fit_unknown(problem, focal_prior=FocalPrior(150.0, 1e3))
+    assert loose.camera.fx == pytest.approx(free.camera.fx, rel=1e-4)
+
+
+def test_prior_makes_four_keypoints_enough() -> None:
+    problem = problem_of(1, points=4, noise_px=0.0)
+    with pytest.raises(DegenerateError, match="4 keypoints are too few for 9 unknowns"):
+        fit_unknown(problem)
+    result = fit_unknown(problem, focal_prior=FocalPrior(150.0, 0.05))
+    explained = [result.alignment, *(other.alignment for other in result.alternatives)]
+    best = min(rotation_error(est=found, gt=problem.alignment) for found in explained)
+    assert best < 0.01
+
+
+def test_prior_that_the_keypoints_contradict_is_said_so() -> None:
+    problem = problem_of(1, points=200, noise_px=0.1)
+    result = fit_unknown(problem, sigma=0.1, focal_prior=FocalPrior(220.0, 0.05))
+    assert any(
+        text.startswith("the keypoints contradict the focal length's prior: 1")
+        and text.endswith(" px instead of 220 px +-5 %")
+        for text in result.warnings
+    )
+
+
+def test_prior_with_estimated_noise_counts_by_its_own_deviation() -> None:
+    problem = problem_of(5, points=30, noise_px=3.0)
+    prior = FocalPrior(150.0, 0.01)
+    result = fit_unknown(problem, sigma=None, focal_prior=prior)
+    assert result.sigma is not None
+    known = fit_unknown(problem, sigma=result.sigma, focal_prior=prior)
+    assert result.camera.fx == pytest.approx(known.camera.fx, rel=1e-4)
+    assert result.std is not None
+    assert result.std.focal < 0.01
+
+
+def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() -> None:
+    problem = problem_of(5, points=30, noise_px=3.0)
+    free = fit_unknown(problem, sigma=None)
+    result = fit_unknown(problem, sigma=None, scale_prior_sigma=0.05)
+    assert np.abs(np.log(result.alignment.scale)).sum() < np.abs(np.log(free.alignment.scale)).sum()
+    known = fit_unknown(problem, sigma=result.sigma, scale_prior_sigma=0.05)
+    np.testing.assert_allclose(result.alignment.scale, known.alignment.scale, rtol=1e-3)
+    np.testing.assert_allclose(result.covariance, known.covariance, rtol=1e-2, atol=1e-8)
+
+
+# --- robust -----------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("points", "share"), [(30, 0.0), (50, 0.3), (50, 0.5), (150, 0.75)])
+@pytest.mark.parametrize("camera", [SIMULATION_CAMERA, LONG], ids=["wide", "long"])
+def test_wrong_keypoints_are_found(camera: Camera, points: int, share: float) -> None:
+    depth = (4.0, 8.0) if camera is SIMULATION_CAMERA else (6.0, 9.0)
+    for seed in range(3):
+        problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
+        points_2d, wrong = spoiled(problem, share)
+        result = fit(
+            problem.points_3d, points_2d, UNKNOWN, focal="estimate", ransac=RansacOptions()
+        )
+        assert not result.inliers[wrong].any()
+        assert result.inliers[~wrong].mean() > 0.9
+        kept = result.inliers
+        alone = fit(problem.points_3d[kept], points_2d[kept], UNKNOWN, focal="estimate")
+        assert result.alignment == alone.alignment
+        assert result.camera == alone.camera
+
+
+def test_robust_search_is_reproducible_and_guided() -> None:
+    problem = problem_of(2, points=100, noise_px=1.0)
+    points_2d, wrong = spoiled(problem, 0.8)
+    few = RansacOptions(min_iterations=1, max_iterations=10)
+    arguments: Any = (problem.points_3d, points_2d, UNKNOWN)
+    options: Any = {"focal": "estimate", "ransac": few}
+    with pytest.raises(NoConsensusError):
+        fit(*arguments, **options)
+    scores = np.where(wrong, 0.1, 0.9)
+    first = fit(*arguments, **options, confidences=scores)
+    second = fit(*arguments, **options, confidences=scores)
+    assert first.alignment == second.alignment
+    assert not first.inliers[wrong].any()
+    assert first.inliers.sum() >= 18
+
+
+@pytest.mark.slow
+def test_noise_without_a_model_has_no_consensus() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        with pytest.raises(NoConsensusError, match="no alignment is supported"):
+            fit(
+                rng.uniform(-1, 1, (40, 3)),
+                rng.uniform(0, 480, (40, 2)),
+                UNKNOWN,
+                focal="estimate",
+                ransac=RansacOptions(max_iterations=500),
+            )
+
+
+def test_best_hypothesis_can_be_had_as_it_is() -> None:
+    problem = problem_of(2, points=30, noise_px=0.2)
+    result = fit_unknown(problem, ransac=RansacOptions(refine=False))
+    assert result.method == "ransac-ap4p"
+    assert result.covariance is None
+    assert result.camera.focal_known
+    assert result.rms < 4.0
+
+
+# --- many at once -----------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("ransac", [None, RansacOptions()], ids=["all", "robust"])
+def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> None:
+    problems = [problem_of(seed, points=8 + seed) for seed in range(5)]
+    short = problem_of(9, points=4)
+    batch = fit_batch(
+        [p.points_3d for p in [*problems, short]],
+        [p.points_2d for p in [*problems, short]],
+        UNKNOWN,
+        focal="estimate",
+        ransac=ransac,
+        workers=2,
+    )
+    for b, problem in enumerate(problems):
+        single = fit_unknown(problem, ransac=ransac)
+        assert batch.alignment(b) == single.alignment
+        assert batch.focal_length[b] == single.camera.fx
+        assert batch.covariance is not None
+        np.testing.assert_array_equal(batch.covariance[b], single.covariance)
+    assert list(batch.errors) == [5]
+    assert np.isnan(batch.focal_length[5])
+
+
+def test_batch_with_known_focal_lengths_names_them() -> None:
+    problem = problem_of(0)
+    batch = fit_batch([problem.points_3d] * 2, [problem.points_2d] * 2, problem.camera)
+    assert batch.focal_length.tolist() == [150.0, 150.0]
+
+
+# --- real photos ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> None:
+    rng = np.random.default_rng(0)
+    strong = weak = 0
+    for image in Colmap(real_data / "sfm" / "maupertuis_colmap"):
+        camera = Camera.without_focal(image.camera.width, image.camera.height)
+        for _ in range(3):
+            scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
+            result = fit(
+                image.points_3d / scale, image.points_2d, camera, focal="estimate", sigma=None
+            )
+            assert result.std is not None
+            off = abs(result.camera.fx / image.camera.fx - 1)
+            if result.std.focal < 0.005:
+                strong += 1
+                assert off < 0.01
+                np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
+            if result.std.focal > 0.02:
+                weak += 1
+                assert any(text.startswith("the focal length is") for text in result.warnings)
+    assert (strong, weak) == (9, 3)
+
+
+@pytest.mark.long
+def test_structure_from_motion_through_lenses(real_data: Path) -> None:
+    rng = np.random.default_rng(0)
+    for image in Bundler(real_data / "sfm" / "balbianello"):
+        c = image.camera
+        camera = Camera.without_focal(c.width, c.height, cx=c.cx, cy=c.cy, distortion=c.distortion)
+        scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
+        result = fit(image.points_3d / scale, image.points_2d, camera, focal="estimate", sigma=None)
+        assert result.camera.fx == pytest.approx(c.fx, rel=0.01)
+        np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"focal": "guess"}, "focal: unknown focal 'guess'; known are known, estimate"),
+        (
+            {"focal": "estimate", "method": "aepnp"},
+            "focal: the method 'aepnp' needs a known focal length; use the method 'optimal'",
+        ),
+        (
+            {"focal_prior": FocalPrior(500.0)},
+            'focal_prior: given for a known focal length; give focal="estimate" with it',
+        ),
+        (
+            {"focal": "estimate", "focal_prior": 500.0},
+            "focal_prior: expected a cadalign.FocalPrior, got float",
+        ),
+        (
+            {},
+            'camera: the focal length is unknown; estimate it with focal="estimate", '
+            "or give it: camera.with_focal(...)",
+        ),
+        (
+            {"ransac": RansacOptions()},
+            'camera: the focal length is unknown; estimate it with focal="estimate", '
+            "or give it: camera.with_focal(...)",
+        ),
+        ({"focal": "estimate", "sigma": -1.0}, "sigma: -1.0 is not a standard deviation; "),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options: dict[str, Any], text: str) -> None:
+    problem = problem_of(0)
+    with pytest.raises(InputError) as caught:
+        fit(problem.points_3d, problem.points_2d, UNKNOWN, **options)
+    assert str(caught.value).startswith(text)
+
+
+def test_too_few_keypoints_are_refused() -> None:
+    problem = problem_of(0, points=4)
+    with pytest.raises(DegenerateError) as caught:
+        fit_unknown(problem)
+    assert str(caught.value) == (
+        "points_3d: 4 keypoints are too few for 9 unknowns; "
+        "give at least 5, fewer unknowns by stretch=, or a prior"
+    )
+
+
+def test_keypoints_in_one_place_are_refused() -> None:
+    with pytest.raises(DegenerateError):
+        fit(np.ones((8, 3)), np.arange(16.0).reshape(8, 2), UNKNOWN, focal="estimate")
+
+
+@pytest.mark.slow
+def test_pixels_that_no_lens_reaches_are_refused() -> None:
+    camera = Camera.without_focal(640, 480, distortion=(-5.0, 0.0, 0.0, 0.0))
+    points_2d = np.array([[1e7, 1e7], [0, 0], [600, 400], [3, 470], [300, 5], [1e6, 3]])
+    with pytest.raises(InputError, match="the lens distortion cannot be undone"):
+        fit(np.random.default_rng(0).uniform(-1, 1, (6, 3)), points_2d, camera, focal="estimate")
+
+
+def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The lens model may fail at the focal length found, where it did not at those tried."""
+    covariance = focal_search._covariance
+    seen = []
+
+    def fails_once(*arguments: Any) -> Any:
+        seen.append(arguments)
+        if len(seen) == 1:
+            raise InputError("the lens distortion cannot be undone", where="points_2d")
+        return covariance(*arguments)
+
+    monkeypatch.setattr(focal_search, "_covariance", fails_once)
+    problem = problem_of(3, points=8, noise_px=0.0)
+    given = [problem.points_3d] * 2, [problem.points_2d] * 2
+    batch = fit_batch(*given, problem.camera, focal="estimate")
+    assert batch.solved.tolist() == [False, True]
+    assert isinstance(batch.errors[0], InputError)

@@ -1,0 +1,44 @@
+"""Options stand in one place: `FitOptions` and `RansacOptions`."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+
+import pytest
+
+from cadalign import fit, fit_batch
+from cadalign.estimation import options
+from cadalign.estimation.options import FitOptions, RansacOptions
+
+NOT_OPTIONS = {"ransac", "confidences", "workers", "symmetry"}
+
+
+@pytest.mark.parametrize("function", [fit, fit_batch])
+def test_keywords_of_the_functions_are_the_fields_of_the_options(
+    function: Callable[..., object],
+) -> None:
+    keywords = {
+        name: parameter.default
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY and name not in NOT_OPTIONS
+    }
+    assert keywords == {field.name: field.default for field in fields(FitOptions)}
+
+
+@pytest.mark.parametrize("kind", [FitOptions, RansacOptions])
+def test_every_option_has_its_help_below_it(kind: type) -> None:
+    lines = "".join(map(inspect.getsource, kind.__mro__[:-1])).splitlines()
+    for field in fields(kind):
+        (place,) = (i for i, line in enumerate(lines) if re.match(rf"    {field.name}: ", line))
+        assert lines[place + 1].startswith('    """'), field.name
+
+
+@pytest.mark.long
+def test_importing_the_options_compiles_nothing() -> None:
+    code = f"import sys, {options.__name__}; assert 'numba' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

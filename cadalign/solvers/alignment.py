@@ -116,9 +116,7 @@ def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
 
 @solve.of(Objective)
 @inlined
-def _solve(
-    objective: Objective, equations: Equations, damping: float, step: FloatArray
-) -> float:
+def _solve(objective: Objective, equations: Equations, damping: float, step: FloatArray) -> float:
     return solve_damped(equations, UNKNOWNS, damping, step)
 
 

@@ -81,9 +81,7 @@ def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
 
 
 @kernel
-def _invert(
-    information: FloatArray, free: FloatArray, least: float, covariance: FloatArray
-) -> int:
+def _invert(information: FloatArray, free: FloatArray, least: float, covariance: FloatArray) -> int:
     """Write the inverse of an information matrix (U, U), whose factor takes its place.
 
     An unknown beyond the first 8 has at least the information ``least`` left by the others.

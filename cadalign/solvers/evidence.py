@@ -144,9 +144,7 @@ def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]
 
 
 @fast_sums
-def add_products(
-    rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray
-) -> None:
+def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
     """Add the rows' inner products to the upper triangle of J' W J and to J' W r."""
     for k in range(UNKNOWNS):
         for m in range(k, UNKNOWNS + 1):

@@ -189,9 +189,7 @@ def _cost_at(system: FocalObjective, state: FloatArray) -> float:
 
 @solve.of(FocalObjective)
 @inlined
-def _solve(
-    system: FocalObjective, equations: Equations, damping: float, step: FloatArray
-) -> float:
+def _solve(system: FocalObjective, equations: Equations, damping: float, step: FloatArray) -> float:
     return solve_damped(equations, UNKNOWNS + 1, damping, step)
 
 

@@ -65,9 +65,7 @@ def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
 
 
 @inlined
-def hold_fixed(
-    free: FloatArray, unknowns: int, hessian: FloatArray, gradient: FloatArray
-) -> None:
+def hold_fixed(free: FloatArray, unknowns: int, hessian: FloatArray, gradient: FloatArray) -> None:
     """Replace the equations of unknowns that are not ``free`` (8,) by unit rows."""
     for k in range(UNKNOWNS):
         if free[k] == 0.0:

@@ -223,9 +223,7 @@ def _accept(evidence: Evidence, row: FloatArray, equations: Equations) -> None:
 
 @solve.of(Evidence)
 @kernel
-def _solve(
-    evidence: Evidence, equations: Equations, damping: float, step: FloatArray
-) -> float:
+def _solve(evidence: Evidence, equations: Equations, damping: float, step: FloatArray) -> float:
     factor = equations.factor
     copy_arrow(equations.current, factor)
     damp(factor, damping)

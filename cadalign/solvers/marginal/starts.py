@@ -6,13 +6,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
+from cadalign.solvers.alignment import Objective, evaluate_cost
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS
 from cadalign.solvers.covariance import center_and_unit
 from cadalign.solvers.evidence import Keypoints, ScalePrior
-from cadalign.solvers.joint.factor import factorize, solve_factor
-from cadalign.solvers.linalg import eigenvectors_4
+from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.problem import Seen, Target
-from cadalign.solvers.alignment import Objective, evaluate_cost
 from cadalign.solvers.refine import refine
 from cadalign.solvers.starts import rotation_starts
 from cadalign.solvers.unknowns import orthonormalize, uncenter

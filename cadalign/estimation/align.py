@@ -14,7 +14,7 @@ from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.assemble import Minimum, assemble
-from cadalign.estimation.joint_robust import Consensus, find_consensus, state_of
+from cadalign.estimation.joint_robust import Consensus, find_consensus
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
@@ -249,22 +249,16 @@ def _one_each(
 
 def _search(evidence: Evidence, init: Start | None) -> tuple[list[Consensus], int, int]:
     """Minima of all sightings together, and the effort they took."""
-    poses, log_scales = starts_of(evidence, init)
-    if not len(poses):
+    starts = starts_of(evidence, init)
+    if not len(starts.poses):
         return [], 0, 0
-    minima, count, iterations = search_joint(evidence, poses, log_scales)
+    minima, iterations = search_joint(evidence, *starts)
     all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
     found = [
-        Consensus(
-            all_of_them,
-            evidence,
-            state_of(minima, k),
-            float(minima.costs[k]),
-            float(minima.scores[k]),
-        )
-        for k in range(count)
+        Consensus(all_of_them, evidence, state, float(cost), float(score))
+        for state, cost, score in zip(*minima, strict=True)
     ]
-    return found, iterations, len(poses)
+    return found, iterations, len(starts.poses)
 
 
 def _thresholds(evidence: Evidence, views: Sequence[View], max_reproj_error: float) -> FloatArray:

@@ -17,6 +17,7 @@ from cadalign.estimation.estimates import (
     is_other,
     moments_of_estimates,
     one_of_equals,
+    pose_and_border,
     pose_and_lengths,
     stretch_of,
     widened,
@@ -150,15 +151,16 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
-    unknowns, of_points, of_seen = joint_covariance(minimum.evidence, minimum.state)
+    found = joint_covariance(minimum.evidence, minimum.state)
+    unknowns = pose_and_border(found, int(minimum.evidence.rig.pose[0]))
     return Estimate(
         stretched / scale,
         scale,
         _poses(minimum, scale),
         stretched[-1] - stretched[-2],
         pose_and_lengths(minimum.evidence, minimum.state, unknowns),
-        of_points[rows],
-        of_seen[rows],
+        found.points[rows],
+        found.seen[rows],
         likelihood,
     )
 

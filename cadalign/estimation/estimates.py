@@ -18,6 +18,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, group_of
 from cadalign.shapes.box_margins import BoxMargins
+from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.moments import Likely, Moments, moments_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
@@ -126,23 +127,37 @@ def _turned_box(corners: FloatArray, best: Equal) -> FloatArray:
     return np.sort(best.relabelled(corners), axis=0)
 
 
-def pose_and_lengths(evidence: Evidence, state: State, unknowns: FloatArray) -> FloatArray:
-    """Covariance (9, 9) of the first camera's pose and the log lengths of the box."""
+def pose_and_border(found: JointCovariance, pose: int) -> FloatArray:
+    """Covariance (6 + b, 6 + b) of one pose and of the unknowns that all views share."""
+    cross = found.cross[pose]
+    return np.block([[found.poses[pose], cross], [cross.T, found.border]])
+
+
+def pose_and_lengths(
+    evidence: Evidence, state: State, unknowns: FloatArray, view: int = 0
+) -> FloatArray:
+    """Covariance (9, 9) of a camera's pose and the log lengths of the box.
+
+    With an estimated focal length (10, 10), its logarithm last. ``unknowns`` is the covariance of
+    the view's pose and the border, see `pose_and_border`.
+    """
     shape, rig = evidence.shape, evidence.rig
-    rotation = rig.cam_from_rig[0][:9].reshape(3, 3)
-    first = 6 * int(rig.pose.max() + 1)
-    rows = np.zeros((9, len(unknowns)))
-    pose = 6 * int(rig.pose[0])
-    rows[:3, pose : pose + 3] = rotation
-    rows[3:6, pose + 3 : pose + 6] = rotation
+    rotation = rig.cam_from_rig[view][:9].reshape(3, 3)
+    group = int(evidence.focals.group[view])
+    first = 6 + len(evidence.focals.low)
+    rows = np.zeros((9 + (group >= 0), len(unknowns)))
+    rows[:3, :3] = rotation
+    rows[3:6, 3:6] = rotation
+    if group >= 0:
+        rows[9, 6 + group] = 1.0
     modes = shape.modes[:, -1] - shape.modes[:, -2]
     extent = shape.mean[-1] - shape.mean[-2] + state.coefficients @ modes
     safe = np.where(extent > 0, extent, np.inf)
-    rows[6:, first : first + 3] = np.eye(3)
-    rows[6:, first + 3 :] = (modes / safe).T
+    rows[6:9, first : first + 3] = np.eye(3)
+    rows[6:9, first + 3 :] = (modes / safe).T
     own = (shape.spread[-2:] ** 2).sum()
     explained = _explained_by_corners(evidence, own)
-    rows[6:] *= 1 - explained[:, None]
+    rows[6:9] *= 1 - explained[:, None]
     covariance = np.asarray(rows @ unknowns @ rows.T)
     covariance[[6, 7, 8], [6, 7, 8]] += own * (1 - explained) / safe**2
     return covariance

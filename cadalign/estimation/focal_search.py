@@ -15,8 +15,9 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior, focal_bounds, focal_grid
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
-from cadalign.estimation.problems import Problems, Solutions, rays_of, whitening_of
+from cadalign.estimation.problems import Problems, Solutions, focal_slopes, rays_of, whitening_of
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import (
     DEGENERATE,
     NOT_FOUND,
@@ -29,7 +30,6 @@ from cadalign.solvers.constants import (
 from cadalign.solvers.covariance import focal_covariance
 from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views, relative_to
 from cadalign.solvers.focal import FocalObjective, linear_focal, refine_focal
-from cadalign.solvers.alignment import Objective
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
 
@@ -314,18 +314,6 @@ def focal_view(
     camera = camera.with_focal(focal)
     rays = rays_of(points_2d, camera)
     return rays, whitening_of(sigma, rays, camera)
-
-
-def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
-    """Derivatives of undistorted pixels, over the focal length, by its logarithm.
-
-    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they are 0.
-    """
-    if not camera.distortion:
-        return np.empty((0, 2))
-    distorted = (points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    inverse = np.linalg.inv(camera.distortion_jacobian(rays))
-    return np.asarray(rays - np.einsum("nij,nj->ni", inverse, distorted))
 
 
 def log_focal_prior(camera: Camera, options: FitOptions) -> LogFocalPrior:

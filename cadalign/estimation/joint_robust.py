@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.starts import Start, in_rig, starts_of
+from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
 from cadalign.solvers.constants import CAUCHY, LINEAR, UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
-from cadalign.solvers.joint.search import Minima, search_joint
+from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
 
@@ -53,7 +53,7 @@ def find_consensus(
         One more start.
     """
     robust = with_loss(evidence, CAUCHY)
-    poses, log_scales = starts_of(robust, init)
+    starts = starts_of(robust, init)
     if evidence.rig.pose.max() == 0:
         samples = np.array(
             [
@@ -62,18 +62,22 @@ def find_consensus(
                 for pose in _hypotheses(evidence, view, seed)
             ]
         ).reshape(-1, 12)
-        poses = np.concatenate([poses, samples[:, None]])
-        log_scales = np.concatenate([log_scales, np.zeros((len(samples), 3))])
-    if not len(poses):
+        count, focals = len(samples), starts.log_focals.shape[1]
+        starts = Starts(
+            np.concatenate([starts.poses, samples[:, None]]),
+            np.concatenate([starts.log_focals, np.zeros((count, focals))]),
+            np.concatenate([starts.log_scales, np.zeros((count, 3))]),
+        )
+    if not len(starts.poses):
         return [], 0, 0
-    minima, count, iterations = search_joint(robust, poses, log_scales)
+    minima, iterations = search_joint(robust, *starts)
     found = []
-    for k in range(min(count, _KEPT)):
-        refined = _settle(evidence, state_of(minima, k), threshold)
+    for state in minima.states[:_KEPT]:
+        refined = _settle(evidence, state, threshold)
         if refined is not None:
             found.append(refined)
     found.sort(key=lambda consensus: consensus.score)
-    return found, iterations, len(poses)
+    return found, iterations, len(starts.poses)
 
 
 def _settle(evidence: Evidence, state: State, threshold: FloatArray) -> Consensus | None:
@@ -84,10 +88,11 @@ def _settle(evidence: Evidence, state: State, threshold: FloatArray) -> Consensu
         if inliers.sum() < _LEAST_INLIERS:
             break
         some = with_sightings(evidence, inliers)
-        minima, count, _ = search_joint(some, state.poses[None], state.log_scales[None])
-        if not count:
+        start = state.poses[None], state.log_focals[None], state.log_scales[None]
+        minima, _ = search_joint(some, *start)
+        if not minima.states:
             break
-        state = state_of(minima, 0)
+        state = minima.states[0]
         left_out = threshold[~inliers] ** 2 + _OUTLIER_COST
         score = float(minima.scores[0]) + float(left_out.sum())
         if best is None or score < best.score:
@@ -108,7 +113,10 @@ def _lengths(evidence: Evidence, state: State) -> FloatArray:
     for motion in (poses, cameras):
         rotation = motion[:, :9].reshape(-1, 3, 3)
         seen = (rotation @ seen[:, :, None])[:, :, 0] + motion[:, 9:]
-    error = seen[:, :2] / seen[:, 2:] - sightings.rays
+    group = evidence.focals.group[sightings.image]
+    log_ratio = np.append(state.log_focals, 0.0)[group][:, None]  # 0 where it is known
+    error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
+    error -= log_ratio * sightings.slopes
     a, b, c = sightings.whitening.T
     lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
     return np.where(seen[:, 2] > 0, lengths, np.inf)
@@ -125,13 +133,6 @@ def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
     columns: list[Any] = [np.ascontiguousarray(each[kept]) for each in evidence.sightings]
     some = Sightings(*columns)
     return evidence._replace(sightings=some)
-
-
-def state_of(minima: Minima, k: int) -> State:
-    """The state at minimum k."""
-    return State(
-        minima.poses[k], minima.log_scales[k], minima.coefficients[k], minima.displacements[k]
-    )
 
 
 def _hypotheses(evidence: Evidence, view: int, seed: int) -> FloatArray:

@@ -14,13 +14,15 @@ from cadalign.errors import InputError
 from cadalign.estimation.model import Size
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import ShapePrior, prior_of, rows_among, scale_priors
-from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.view import View
+from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
+    Focals,
     Heights,
     Lengths,
     Planes,
@@ -45,8 +47,13 @@ def evidence_of(
     *,
     loss: int,
     loss_scale: float,
+    focals: Focals | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> Evidence:
     """All that the views, the size and the first component of the prior tell.
+
+    Focal lengths that are to be estimated are ``focals`` times those of ``cameras``, which are the
+    views' own by default.
 
     Raises
     ------
@@ -62,14 +69,29 @@ def evidence_of(
         _check_view(prior, view, number)
     return Evidence(
         prior.components[0],
-        _sightings(rows, views, loss, loss_scale),
+        _sightings(rows, views, cameras or [view.camera for view in views], loss, loss_scale),
         _rig(views),
+        known_focals(len(views)) if focals is None else focals,
         _directions(prior, views),
         _lengths(prior, size),
         _heights(prior, views),
         sampled_planes(prior.components[0], rows, views),
         scale_priors(prior, is_metric(views, size)),
     )
+
+
+def known_focals(views: int) -> Focals:
+    """No focal length to estimate, of so many views."""
+    none = np.empty(0)
+    return Focals(np.full(views, -1), none, none, none, none)
+
+
+def cameras_at(cameras: Sequence[Camera], focals: Focals, log_focals: FloatArray) -> list[Camera]:
+    """The cameras of all views, with focal lengths that are estimated."""
+    return [
+        camera if group < 0 else camera.with_focal(camera.fx * float(np.exp(log_focals[group])))
+        for camera, group in zip(cameras, focals.group.tolist(), strict=True)
+    ]
 
 
 def is_metric(views: Sequence[View], size: Size | None) -> bool:
@@ -95,18 +117,21 @@ def _check_view(prior: ShapePrior, view: View, number: int) -> None:
 
 
 def _sightings(
-    names: Sequence[list[int]], views: Sequence[View], loss: int, loss_scale: float
+    names: Sequence[list[int]],
+    views: Sequence[View],
+    cameras: Sequence[Camera],
+    loss: int,
+    loss_scale: float,
 ) -> Sightings:
-    points, images, rays, whitenings, depths = [], [], [], [], []
-    for number, (rows, view) in enumerate(zip(names, views, strict=True)):
+    points, images, rays, whitenings, depths, slopes = [], [], [], [], [], []
+    for number, (rows, view, camera) in enumerate(zip(names, views, cameras, strict=True)):
         pixels = cast(FloatArray, view.points_2d)
         points.append(np.array(rows, dtype=np.int64))
         images.append(np.full(len(rows), number))
-        seen = rays_of(np.require(pixels, requirements="W"), view.camera)
+        seen = rays_of(np.require(pixels, requirements="W"), camera)
         rays.append(seen)
-        whitenings.append(
-            np.broadcast_to(whitening_of(view.sigma, seen, view.camera), (len(rows), 3))
-        )
+        whitenings.append(np.broadcast_to(whitening_of(view.sigma, seen, camera), (len(rows), 3)))
+        slopes.append(focal_slopes(pixels, camera, seen) if camera.distortion else 0.0 * seen)
         depths.append(_depths(view, len(rows)))
     point = np.concatenate(points)
     order = np.argsort(point, kind="stable")
@@ -118,6 +143,7 @@ def _sightings(
         np.concatenate(depths)[order],
         np.full(len(point), loss),
         np.full(len(point), float(loss_scale)),
+        np.concatenate(slopes)[order],
     )
 
 
@@ -299,4 +325,4 @@ class SingleBasis:
         coefficients = np.tensordot(shape.modes[:, rows], self.force, 2)
         displacements = np.zeros_like(shape.mean)
         displacements[rows] = shape.spread[rows, None] ** 2 * self.force
-        return State(self.pose[None], np.zeros(3), coefficients, displacements)
+        return State(self.pose[None], np.zeros(0), np.zeros(3), coefficients, displacements)

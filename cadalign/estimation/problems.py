@@ -200,6 +200,18 @@ def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:
     return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
+def focal_slopes(points_2d: FloatArray, camera: Camera, rays: FloatArray) -> FloatArray:
+    """Derivatives of undistorted pixels, over the focal length, by its logarithm.
+
+    (n, 2) float for pixels and rays (n, 2); (0, 2) for a lens without distortion, where they are 0.
+    """
+    if not camera.distortion:
+        return np.empty((0, 2))
+    distorted = (points_2d - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    inverse = np.linalg.inv(camera.distortion_jacobian(rays))
+    return np.asarray(rays - np.einsum("nij,nj->ni", inverse, distorted))
+
+
 def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> FloatArray:
     """Weights (1 or n, 3) that turn errors of the rays (n, 2) into errors of unit covariance.
 

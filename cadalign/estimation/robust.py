@@ -16,10 +16,10 @@ from cadalign.estimation.result import FitResult, FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
+from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import Keypoints, ScalePrior, Views
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.alignment import Objective
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from

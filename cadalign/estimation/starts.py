@@ -22,21 +22,35 @@ from cadalign.solvers.marginal.starts import after_motion, half_turns
 _MOST_STARTS = 24
 _MOST_CARRIED = 3  # stretches of the other view
 
-Starts = list[tuple[FloatArray, FloatArray]]
+ViewStarts = list[tuple[FloatArray, FloatArray]]
 _LEAST_POINTS = 3
 
 
-def starts_of(evidence: Evidence, init: Start | None = None) -> tuple[FloatArray, FloatArray]:
-    """Poses (S, P, 12) and log scales (S, 3); none where every view has too few keypoints.
+class Starts(NamedTuple):
+    """Starts of a search: ``poses`` (S, P, 12), ``log_focals`` (S, F), ``log_scales`` (S, 3)."""
+
+    poses: FloatArray
+    log_focals: FloatArray
+    log_scales: FloatArray
+
+
+def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
+    """Starts at the focal lengths of the rays; none where every view has too few keypoints.
 
     Where every view has a pose of its own, the likeliest ones are taken together, and then one of
     them replaced by the next. The shape's uncertainty, seen from the distance at which the mean has
     the size of its image, widens the keypoints' own. A start that is given comes first, poses half
     a turn away come last.
     """
+    poses, log_scales = _poses_and_scales(evidence, init)
+    return Starts(poses, np.zeros((len(poses), len(evidence.focals.low))), log_scales)
+
+
+def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArray, FloatArray]:
+    """Poses (S, P, 12) and log scales (S, 3)."""
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
-    per_pose: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(poses)]
+    per_pose: list[ViewStarts] = [[] for _ in range(poses)]
     for view in range(len(rig.pose)):
         camera = rig.cam_from_rig[view]
         found, logs = view_starts(evidence, view)
@@ -189,15 +203,15 @@ def weakly_determined(evidence: Evidence) -> list[int]:
     return np.flatnonzero((2 * counts <= unknowns) & ~shared & (len(counts) > 1)).tolist()
 
 
-def carried_starts(evidence: Evidence, view: int, per_pose: Sequence[Starts]) -> Starts:
+def carried_starts(evidence: Evidence, view: int, per_pose: Sequence[ViewStarts]) -> ViewStarts:
     """Poses of a view under the stretches of the view with the most keypoints, and these.
 
     ``per_pose`` are the starts that the views' own keypoints suggest.
     """
     counts = keypoint_counts(evidence)
     others = [v for v in np.argsort(-counts, kind="stable").tolist() if v != view]
-    own: Starts = next((found for v in others if (found := per_pose[evidence.rig.pose[v]])), [])
-    starts: Starts = []
+    own: ViewStarts = next((found for v in others if (found := per_pose[evidence.rig.pose[v]])), [])
+    starts: ViewStarts = []
     for _, logs in own[:_MOST_CARRIED]:
         shape, scales = evidence.shape, evidence.scales
         stretched = evidence._replace(

@@ -19,7 +19,7 @@ from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.evidence import State
-from cadalign.solvers.joint.refine import refine_joint
+from cadalign.solvers.joint.search import refine_joint
 
 _LEAST_POINTS = 3
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
@@ -141,9 +141,10 @@ def _explaining(prior: ShapePrior, view: View, result: AlignResult) -> Alignment
     first = result.alignment
     state = State(
         np.append(first.rotation.ravel(), first.translation)[None],
+        np.zeros(0),
         np.log(scale),
         np.zeros(0),
         np.zeros_like(points),
     )
-    refine_joint(evidence, _ITERATIONS, state)
+    _, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
     return Alignment(state.poses[0, :9].reshape(3, 3), state.poses[0, 9:], scale)

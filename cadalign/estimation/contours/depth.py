@@ -31,9 +31,7 @@ from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence, Planes, points_of
-from cadalign.solvers.joint.refine import refine_joint
-from cadalign.solvers.joint.search import score_of
-from cadalign.solvers.joint.system import empty_system
+from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border
 _LEAST_SPACING = 8  # [px], of samples that count as independent
@@ -119,7 +117,7 @@ def _settled(
     """Rounds from one minimum until the cost changes little."""
     state, last = start.state, np.inf
     result, bare = start, _without_keypoints(start.evidence, samples)
-    own = score_of(start.evidence, start.state, empty_system(start.evidence))
+    own = score_state(start.evidence, start.state)
     extra = start.score - own if np.isfinite(start.score - own) else 0.0
     for _ in range(_ROUNDS):
         posed = surface.at(start.evidence.shape, state)
@@ -130,10 +128,10 @@ def _settled(
         full = _with_rows(bare, keypoints, rows)
         total = sum(len(each.mean) for each in rows)
         room = state_with_points(state, keypoints, total)
-        cost, _, _ = refine_joint(full, _ITERATIONS, room)
+        cost, room, _, _ = refine_joint(full, _ITERATIONS, room)
         if not cost < np.inf:
             return start
-        score = score_of(full, room, empty_system(full))
+        score = score_state(full, room)
         result = start._replace(evidence=full, state=room, cost=cost, score=score + extra)
         state, _ = state_without_points(room, keypoints, total)
         if abs(last - cost) < _SETTLED:

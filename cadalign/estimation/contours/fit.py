@@ -35,7 +35,7 @@ from cadalign.estimation.contours.loop import (
 )
 from cadalign.estimation.contours.rims import extraction_bias, find_rims
 from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
-from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, prior_of
@@ -44,10 +44,9 @@ from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
-from cadalign.solvers.joint.search import score_of
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
+from cadalign.solvers.joint.search import score_state
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
@@ -194,12 +193,11 @@ def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
 
 def _is_determined(minimum: Minimum) -> bool:
     """True if the evidence without masks determines all unknowns."""
-    system = empty_system(minimum.evidence)
-    evaluate_joint(minimum.evidence, minimum.state, system)
-    sizes = np.sqrt(system.hessian.diagonal())
+    _, information = information_of(minimum.evidence, minimum.state)
+    sizes = np.sqrt(information.diagonal())
     if not np.isfinite(sizes).all() or not (sizes > 0).all():
         return False
-    values = np.linalg.eigvalsh(system.hessian / np.outer(sizes, sizes))
+    values = np.linalg.eigvalsh(information / np.outer(sizes, sizes))
     return bool(values[0] > _LEAST_INFORMATION)
 
 
@@ -218,7 +216,7 @@ def _settled(
     """
     found = []
     for start in starts:
-        own = score_of(start.evidence, start.state, empty_system(start.evidence))
+        own = score_state(start.evidence, start.state)
         extra = start.score - own if np.isfinite(start.score - own) else 0.0
         evidence, state = start.evidence, start.state
         if follows_displacements:
@@ -295,7 +293,7 @@ def _tension(candidate: _Candidate) -> str | None:
 
 
 def _cost(evidence: Evidence, state: State) -> float:
-    return float(evaluate_joint(evidence, state, empty_system(evidence)))
+    return float(information_of(evidence, state)[0])
 
 
 def _minimum(candidate: _Candidate) -> Minimum:
@@ -384,9 +382,10 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
     evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
     pose = np.concatenate([gt.rotation.ravel(), gt.translation])[None]
     still = np.zeros_like(evidence.shape.mean)
-    state = State(pose, np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
+    state = State(pose, np.zeros(0), np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
     full, stacked = with_contours(model, [view], evidence, state)
-    return pose_and_lengths(full, stacked, joint_covariance(full, stacked).unknowns)
+    unknowns = pose_and_border(joint_covariance(full, stacked), 0)
+    return pose_and_lengths(full, stacked, unknowns)
 
 
 def with_contours(

@@ -31,10 +31,9 @@ from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State
-from cadalign.solvers.joint.refine import refine_joint
-from cadalign.solvers.joint.search import score_of
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
+from cadalign.solvers.joint.search import refine_joint, score_state
 
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
@@ -192,7 +191,7 @@ def settle(
             offsets = offsets * [b.offset / n.offset for b, n in zip(before, current, strict=True)]
         total = count_of(rows)
         stacked = state_with_points(state, keypoints, total, offsets)
-        cost, _, _ = refine_joint(full, _ITERATIONS, stacked)
+        cost, stacked, _, _ = refine_joint(full, _ITERATIONS, stacked)
         if not cost < np.inf:
             return None
         state, offsets = state_without_points(stacked, keypoints, total, len(rows))
@@ -205,7 +204,7 @@ def settle(
         _cauchy(reach, noise) * int((~each.found).sum())
         for each, noise in zip(rims, current, strict=True)
     )
-    score = score_of(full, stacked, empty_system(full)) + unmatched
+    score = score_state(full, stacked) + unmatched
     fits = tuple(
         ContourFit(each, residual, noise, offset * noise.offset)
         for each, residual, noise, offset in zip(rims, residuals, current, offsets, strict=True)
@@ -285,12 +284,11 @@ def _relearned(
     evidence: Evidence, state: State, noises: list[Noise], offsets: FloatArray
 ) -> tuple[list[Noise], FloatArray]:
     """Deviations of the offsets by their own likelihood, and the offsets in these deviations."""
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    size = len(system.gradient)
+    _, information = information_of(evidence, state)
+    size = len(information)
     own = np.arange(size - len(noises), size)
-    sizes = np.sqrt(np.maximum(system.hessian.diagonal(), 1e-300))
-    scaled = system.hessian / np.outer(sizes, sizes) + _LEAST_INFORMATION * np.eye(size)
+    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    scaled = information / np.outer(sizes, sizes) + _LEAST_INFORMATION * np.eye(size)
     columns = np.linalg.solve(scaled, np.eye(size)[:, own])
     variances = columns[own].diagonal() / sizes[own] ** 2
     learned, coefficients = [], []
@@ -422,6 +420,7 @@ def with_rims(evidence: Evidence, keypoints: int, rims: list[RimRows]) -> Eviden
         np.concatenate([old.depths, np.zeros((total, 2))]),
         np.concatenate([old.loss, *(each.loss for each in rims)]),
         np.concatenate([old.loss_scale, *(each.loss_scale for each in rims)]),
+        np.concatenate([old.slopes, np.zeros((total, 2))]),
     )
     return extended._replace(sightings=sightings)
 
@@ -440,7 +439,7 @@ def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence,
     axes = np.tile(np.arange(3), len(rows) // 3)
     own = np.zeros((len(rows), *shape.mean.shape))
     own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
-    moved = state.displacements[rows, axes] / np.exp(state.log_scales)[axes] / shape.spread[rows]
+    moved = state.displacements[rows, axes] / shape.spread[rows]
     return (
         evidence._replace(
             shape=Shape(shape.mean, np.concatenate([shape.modes, own]), np.zeros_like(shape.spread))
@@ -463,6 +462,7 @@ def state_with_points(
     coefficients = [state.coefficients, np.empty(0) if more is None else more]
     return State(
         state.poses.copy(),
+        state.log_focals.copy(),
         state.log_scales.copy(),
         np.concatenate(coefficients),
         np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),

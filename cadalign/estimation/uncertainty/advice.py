@@ -18,6 +18,7 @@ from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
     is_exact,
+    pose_and_border,
     pose_and_lengths,
     widened,
     with_box,
@@ -316,7 +317,9 @@ class KnownScene:
             from cadalign.estimation.contours.fit import with_contours  # with OpenCV and embree
 
             evidence, state = with_contours(self.model, self.views, evidence, state)
-        covariance = pose_and_lengths(evidence, state, joint_covariance(evidence, state).unknowns)
+        found = joint_covariance(evidence, state)
+        unknowns = pose_and_border(found, int(evidence.rig.pose[0]))
+        covariance = pose_and_lengths(evidence, state, unknowns)
         symmetry = self.model.symmetry if isinstance(self.model, Model) else None
         if symmetry is None and not is_exact(own):
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
@@ -334,7 +337,7 @@ class KnownScene:
         log_scales = np.log(self.poses[0].scale)
         points = np.concatenate([self.points_3d, self.bounds])
         coefficients, rest = _explained(evidence.shape, points)
-        return State(np.array(poses), log_scales, coefficients, rest * self.poses[0].scale)
+        return State(np.array(poses), np.zeros(0), log_scales, coefficients, rest)
 
     def _free_poses(self) -> tuple[Alignment, ...]:
         """One for every view, or one in the frame that the views share."""

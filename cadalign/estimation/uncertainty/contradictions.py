@@ -23,10 +23,10 @@ from cadalign.estimation.uncertainty.evidence import (
     without,
 )
 from cadalign.estimation.uncertainty.summary import name_of
-from cadalign.solvers.joint.evidence import Evidence, State, copy_state
-from cadalign.solvers.joint.reduction import reduce_modes
-from cadalign.solvers.joint.refine import refine_joint
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
+from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
+from cadalign.solvers.joint.search import refine_joint
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
@@ -69,12 +69,12 @@ def contradictions(
     pieces = pieces_of(evidence)
     if len(pieces) < 2:
         return ()
-    evidence, basis = reduce_modes(evidence)
-    state = state._replace(coefficients=state.coefficients @ basis)
+    reduction = reduce_modes(evidence)
+    state = reduced_state(reduction, evidence.shape, state)
+    evidence = reduction.evidence
     if len(evidence.planes.point):
         evidence = _without_hidden(evidence, state)
-        state = copy_state(state)
-        cost, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
+        cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
     level = _FALSE_ALARMS / len(pieces)
     if not _is_suspicious(evidence, state, cost, pieces, level):
         return ()
@@ -105,8 +105,7 @@ def _is_suspicious(
     least = chdtri(1, level)
     for piece in pieces:
         rest, start = without(evidence, state, piece)
-        refitted = copy_state(start)
-        lower, _, _ = refine_joint(rest, _REFITTING, refitted)
+        lower, refitted, _, _ = refine_joint(rest, _REFITTING, start)
         if not cost - lower >= least:  # of one equation; of more, more is likely
             continue
         trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
@@ -165,8 +164,7 @@ def _searched(
 ) -> _Trial | None:
     """The trial of a piece by a search, since the estimate may lie far from that without it."""
     rest, start = without(evidence, state, piece)
-    refitted = copy_state(start)
-    lower, _, _ = refine_joint(rest, 10 * _REFITTING, refitted)
+    lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
     found = search(rest)
     if found is not None and found[1] < lower:
         refitted, lower = found
@@ -195,9 +193,8 @@ def _is_unlikely(trial: _Trial, level: float) -> bool:
 
 def _determined(evidence: Evidence, state: State) -> _Determined:
     """Equations beyond the unknowns that they determine, and the number of these."""
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    rank = _rank(system.hessian)
+    _, information = information_of(evidence, state)
+    rank = _rank(information)
     held = int(3 - evidence.scales.free.sum())
     return _Determined(count_equations(evidence) - (rank - held), rank)
 

@@ -17,8 +17,8 @@ from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
 from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, Planes, Rig, Sightings, State, points_of
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
 
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
 _OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
@@ -302,17 +302,18 @@ def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
 
 
 def _deviations(evidence: Evidence, state: State) -> Uncertainty:
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    sizes = np.sqrt(system.hessian.diagonal())
+    _, information = information_of(evidence, state)
+    sizes = np.sqrt(information.diagonal())
     sizes[~(sizes > 0)] = _WEAKEST  # nothing is known of it
-    scaled = system.hessian / np.outer(sizes, sizes)
+    scaled = information / np.outer(sizes, sizes)
     inverse = np.linalg.inv(scaled + _WEAKEST * np.eye(len(sizes)))
     covariance = inverse / np.outer(sizes, sizes)
     first = len(sizes) - len(evidence.shape.modes) - 3
     held = first + np.flatnonzero(evidence.scales.free == 0)
     covariance[held] = covariance[:, held] = 0.0
-    of_all = pose_and_lengths(evidence, state, covariance)
+    pose, border = 6 * int(evidence.rig.pose[0]), 6 * len(state.poses)
+    shown = [*range(pose, pose + 6), *range(border, len(covariance))]
+    of_all = pose_and_lengths(evidence, state, covariance[np.ix_(shown, shown)])
     deviations = np.sqrt(np.maximum(of_all.diagonal(), 0.0))
     distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.joint_robust import state_of
 from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.contradictions import contradictions, count_equations
 from cadalign.estimation.uncertainty.evidence import depth_factor, pieces_of
@@ -113,14 +112,14 @@ def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
 
 def _searched(evidence: Evidence) -> tuple[State, float] | None:
     """The best estimate of the evidence, and its cost."""
-    poses, log_scales = starts_of(evidence)
-    if not len(poses):
+    starts = starts_of(evidence)
+    if not len(starts.poses):
         return None
-    minima, count, _ = search_joint(evidence, poses, log_scales)
-    if not count:
+    minima, _ = search_joint(evidence, *starts)
+    if not minima.states:
         return None
-    best = int(np.argmin(minima.costs[:count]))
-    return state_of(minima, best), float(minima.costs[best])
+    best = int(np.argmin(minima.costs))
+    return minima.states[best], float(minima.costs[best])
 
 
 def misfits(cost: float, redundancy: int) -> list[str]:

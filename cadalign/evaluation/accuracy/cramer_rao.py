@@ -14,9 +14,9 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.solvers.alignment import keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.covariance import covariance_of, focal_covariance
-from cadalign.solvers.alignment import keypoint_objective
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.align_result import AlignResult
-from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Size
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound
@@ -87,7 +87,8 @@ def bound_of(result: AlignResult, given: Given, scene: ObjectScene) -> FloatArra
     truths = [truth_in(shot, scene.gt) for shot in given.shots[: len(state.poses)]]
     poses = [np.concatenate([each.rotation.ravel(), each.translation]) for each in truths]
     true_state = state._replace(poses=np.array(poses), log_scales=np.log(scene.gt.scale))
-    return pose_and_lengths(evidence, true_state, joint_covariance(evidence, true_state).unknowns)
+    unknowns = pose_and_border(joint_covariance(evidence, true_state), 0)
+    return pose_and_lengths(evidence, true_state, unknowns)
 
 
 def truth_in(shot: Shot, gt: Alignment) -> Alignment:

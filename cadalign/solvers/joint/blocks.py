@@ -1,7 +1,8 @@
 """Blocks of evidence beside sightings: priors, directions, lengths, heights and planes.
 
-Each adds equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by the
-pose, the log focals, the log scales and the coefficients, and a residual. Displacements don't count.
+Each adds equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by
+the pose, the log focals, the log scales and the coefficients, and a residual. Displacements don't
+count.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
 @kernel
 def _add_lengths(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add known lengths along the model's axes."""
-    lengths, shape = evidence.lengths, evidence.shape
+    lengths = evidence.lengths
     row = np.empty(6 + arrow.border.shape[0])
     cost = 0.0
     for j in range(lengths.axis.shape[0]):

@@ -8,67 +8,118 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import fast_sums, kernel
-from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.factor import decide_on_undetermined, factorize, invert_factor
-from cadalign.solvers.joint.reduction import reduce_modes
-from cadalign.solvers.joint.system import System, empty_system, evaluate_joint
+from cadalign.solvers.joint.arrow import (
+    Arrow,
+    decide_on_undetermined,
+    factorize_arrow,
+    invert_arrow,
+)
+from cadalign.solvers.joint.blocks import first_scale
+from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked, unstretched
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
+from cadalign.solvers.joint.rows import count_equations
+from cadalign.solvers.joint.system import Equations, evaluate_joint, joint_room
 
 
 class JointCovariance(NamedTuple):
-    """Covariances: of the ``unknowns`` (U, U), and of every point in two frames.
+    """Covariances of the unknowns, and of every point in two frames.
 
-    ``points`` (m, 3, 3) in the model's frame are those of the shape, scales and displacements
-    included; ``seen`` (m, 3, 3) in the first view's camera include the pose.
+    Those of every pose (P, 6, 6), of poses with the border (P, 6, b) and of the ``border`` (b, b):
+    log focal lengths, log scales, coefficients. ``points`` (m, 3, 3) in the model's frame are those
+    of the shape, scales and displacements included; ``seen`` (m, 3, 3) in the first view's camera
+    include the pose.
     """
 
-    unknowns: FloatArray
+    poses: FloatArray
+    cross: FloatArray
+    border: FloatArray
     points: FloatArray
     seen: FloatArray
 
 
-@kernel
 def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     """The inverse information at a state; zero for log scales that are held."""
-    reduced, basis = reduce_modes(evidence)
-    small = State(state.poses, state.log_scales, state.coefficients @ basis, state.displacements)
-    system = empty_system(reduced)
-    evaluate_joint(reduced, small, system)
-    points, modes = evidence.shape.mean.shape[0], basis.shape[0]
-    unknowns = system.gradient.shape[0]
-    first = unknowns - basis.shape[1] - 3
-    if state.poses.shape[0] > 1:
-        decide_on_undetermined(system.hessian, state.poses.shape[0])
-    if not factorize(system.hessian):
-        size = first + 3 + modes
+    reduction = reduce_modes(evidence)
+    row = packed(reduced_state(reduction, evidence.shape, state))
+    basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
+    return _covariance_of(evidence, reduction.evidence, basis, row)
+
+
+@kernel
+def _covariance_of(
+    evidence: Evidence, reduced: Evidence, basis: FloatArray, row: FloatArray
+) -> JointCovariance:
+    """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
+    equations = joint_room(reduced)
+    evaluate_joint(reduced, row, equations)
+    state = unpacked(reduced, row)
+    arrow = equations.new
+    poses, points = state.poses.shape[0], evidence.shape.mean.shape[0]
+    decide_on_undetermined(arrow, poses)
+    first = first_scale(evidence)
+    if not factorize_arrow(arrow):
+        size = first + 3 + basis.shape[0]
         return JointCovariance(
+            np.full((poses, 6, 6), np.inf),
+            np.full((poses, 6, size), np.inf),
             np.full((size, size), np.inf),
             np.full((points, 3, 3), np.inf),
             np.full((points, 3, 3), np.inf),
         )
-    inverse = invert_factor(system.hessian)
-    covariance = inverse.T @ inverse
+    inverse = invert_arrow(arrow)
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
-            covariance[first + a, first + a] = 0.0
-    by_unknowns, own = _points_by_unknowns(evidence, reduced, small, system)
+            inverse.border[first + a, first + a] = 0.0
+    covariance = pose_and_border(inverse, evidence.rig.pose[0])
+    by_unknowns, own = _points_by_unknowns(evidence, reduced, state, equations)
     of_points = _blocks(by_unknowns, covariance) + own
-    _turn_and_move(reduced, small, by_unknowns)
+    _turn_and_move(reduced, state, by_unknowns)
     of_seen = _blocks(by_unknowns, covariance)
     turn = _cam_from_model(evidence, state)
     for i in range(points):
         of_seen[i] += turn @ own[i] @ turn.T
-    return JointCovariance(_of_all_modes(covariance, basis), of_points, of_seen)
+    return JointCovariance(
+        inverse.blocks,
+        _cross_of_all_modes(inverse.coupling, basis, first + 3),
+        _border_of_all_modes(inverse.border, basis, first + 3),
+        of_points,
+        of_seen,
+    )
 
 
 @kernel
-def _of_all_modes(covariance: FloatArray, basis: FloatArray) -> FloatArray:
-    """Covariance of all unknowns from that with reduced modes: the rest keeps its prior."""
+def pose_and_border(inverse: Arrow, pose: int) -> FloatArray:
+    """Covariance (6 + b, 6 + b) of one pose and the border."""
+    size = 6 + inverse.border.shape[0]
+    found = np.empty((size, size))
+    found[:6, :6] = inverse.blocks[pose]
+    found[:6, 6:] = inverse.coupling[pose]
+    found[6:, :6] = inverse.coupling[pose].T
+    found[6:, 6:] = inverse.border
+    return found
+
+
+@kernel
+def _cross_of_all_modes(coupling: FloatArray, basis: FloatArray, first: int) -> FloatArray:
+    """Covariances (P, 6, b) of poses with the border, of all modes."""
+    whole = np.empty((coupling.shape[0], 6, first + basis.shape[0]))
+    for p in range(coupling.shape[0]):
+        whole[p, :, :first] = coupling[p, :, :first]
+        whole[p, :, first:] = np.ascontiguousarray(coupling[p, :, first:]) @ basis.T
+    return whole
+
+
+@kernel
+def _border_of_all_modes(border: FloatArray, basis: FloatArray, first: int) -> FloatArray:
+    """Covariance of the border with all modes from that with reduced ones.
+
+    The rest of the modes keeps its prior.
+    """
     modes, reduced = basis.shape
-    first = covariance.shape[0] - reduced
-    gain = covariance[first:, first:] - np.eye(reduced)
+    gain = border[first:, first:] - np.eye(reduced)
     whole = np.empty((first + modes, first + modes))
-    whole[:first, :first] = covariance[:first, :first]
-    whole[first:, :first] = basis @ np.ascontiguousarray(covariance[first:, :first])
+    whole[:first, :first] = border[:first, :first]
+    whole[first:, :first] = basis @ np.ascontiguousarray(border[first:, :first])
     whole[:first, first:] = whole[first:, :first].T
     whole[first:, first:] = basis @ gain @ basis.T
     for k in range(first, first + modes):
@@ -78,38 +129,35 @@ def _of_all_modes(covariance: FloatArray, basis: FloatArray) -> FloatArray:
 
 @kernel
 def _points_by_unknowns(
-    evidence: Evidence, reduced: Evidence, state: State, system: System
+    evidence: Evidence, reduced: Evidence, state: State, equations: Equations
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (m, 3, U) of all points by the unknowns, and covariances (m, 3, 3) of the rest.
+    """Derivatives (m, 3, 6 + b) of all points by a pose and the border, covariances of the rest.
 
-    The rest are displacements and the modes that the evidence doesn't tell apart.
+    The rest (m, 3, 3) are displacements and the modes that the evidence doesn't tell apart.
     """
     points, modes = reduced.shape.mean.shape[0], reduced.shape.modes.shape[0]
-    unknowns = system.gradient.shape[0]
-    first = unknowns - modes - 3
+    first = 6 + first_scale(evidence)
+    unknowns = first + 3 + modes
     scale = np.exp(state.log_scales)
-    starts, ends = _equations_of_points(reduced, system, points)
+    starts, ends = _columns_of_points(reduced, equations, points)
     rows = np.zeros((points, 3, unknowns))
     own = np.zeros((points, 3, 3))
-    left_out = evidence.shape.modes.shape[0] > modes
+    left_out = evidence.shape.modes.shape[0] > 0
     for i in range(points):
         for a in range(3):
-            value = reduced.shape.mean[i, a]
             for k in range(modes):
-                mode = reduced.shape.modes[k, i, a]
-                value += state.coefficients[k] * mode
-                rows[i, a, first + 3 + k] = scale[a] * mode
-            rows[i, a, first + a] = scale[a] * value
+                rows[i, a, first + 3 + k] = scale[a] * reduced.shape.modes[k, i, a]
+            rows[i, a, first + a] = scale[a] * unstretched(reduced.shape, state, i, a)
         square = reduced.shape.spread[i] ** 2
         for a in range(3):
-            own[i, a, a] = square
+            own[i, a, a] = scale[a] * scale[a] * square
         for c in range(starts[i], ends[i]):
             for a in range(3):
-                by_own = square * system.rows[unknowns + 1 + a, c]
+                by_own = scale[a] * square * equations.rows[unknowns + 1 + a, c]
                 for b in range(3):
-                    own[i, a, b] -= by_own * square * system.rows[unknowns + 1 + b, c]
+                    own[i, a, b] -= by_own * scale[b] * square * equations.rows[unknowns + 1 + b, c]
                 for k in range(unknowns):
-                    rows[i, a, k] -= by_own * system.rows[k, c]
+                    rows[i, a, k] -= by_own * equations.rows[k, c]
         if left_out and ends[i] == 0:
             _add_rest(evidence.shape.modes, reduced.shape.modes, scale, i, own[i])
     return rows, own
@@ -131,17 +179,26 @@ def _add_rest(
 
 
 @kernel
-def _equations_of_points(
-    evidence: Evidence, system: System, points: int
+def _columns_of_points(
+    evidence: Evidence, equations: Equations, points: int
 ) -> tuple[IntArray, IntArray]:
-    """The first column of each point's equations (m,) and the one after its last (m,)."""
+    """The first column of each point's equations (m,) and the one after its last (m,).
+
+    None where there are several poses, of which no displacement is eliminated.
+    """
     starts = np.zeros(points, dtype=np.int64)
     ends = np.zeros(points, dtype=np.int64)
-    for n in range(evidence.sightings.point.shape[0]):
+    if equations.first.shape[0] > 2:
+        for i in evidence.sightings.point:
+            ends[i] = -1
+        return starts, ends
+    column = 0
+    for n in equations.order:
         i = evidence.sightings.point[n]
         if ends[i] == 0:
-            starts[i] = system.first[n]
-        ends[i] = system.first[n + 1]
+            starts[i] = column
+        column += count_equations(evidence.sightings, n)
+        ends[i] = column
     return starts, ends
 
 
@@ -164,32 +221,27 @@ def _blocks(rows: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @kernel
 def _turn_and_move(evidence: Evidence, state: State, rows: FloatArray) -> None:
-    """Take derivatives (m, 3, U) of points from the model's frame to the first camera's.
+    """Take derivatives (m, 3, 6 + b) of points from the model's frame to the first camera's.
 
     There a point is exp(rotation vector) turned + translation, in the rig's frame.
     """
-    shape = evidence.shape
     pose = state.poses[evidence.rig.pose[0]]
     rotation = pose[:9].copy().reshape((3, 3))
     camera = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
     turn = camera @ rotation
-    first = 6 * evidence.rig.pose[0]
     scale = np.exp(state.log_scales)
     point = np.empty(3)
     for i in range(rows.shape[0]):
         for a in range(3):
-            value = shape.mean[i, a]
-            for k in range(shape.modes.shape[0]):
-                value += state.coefficients[k] * shape.modes[k, i, a]
-            point[a] = scale[a] * value + state.displacements[i, a]
+            point[a] = scale[a] * unstretched(evidence.shape, state, i, a)
         for k in range(rows.shape[2]):
             u, v, w = rows[i, 0, k], rows[i, 1, k], rows[i, 2, k]
             for a in range(3):
                 rows[i, a, k] = turn[a, 0] * u + turn[a, 1] * v + turn[a, 2] * w
         x, y, z = rotation @ point
         across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
-        rows[i, :, first : first + 3] += camera @ across
-        rows[i, :, first + 3 : first + 6] += camera
+        rows[i, :, :3] += camera @ across
+        rows[i, :, 3:6] += camera
 
 
 @kernel
@@ -197,3 +249,20 @@ def _cam_from_model(evidence: Evidence, state: State) -> FloatArray:
     """Rotation (3, 3) of the first camera from the model."""
     camera = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
     return camera @ state.poses[evidence.rig.pose[0], :9].copy().reshape((3, 3))
+
+
+def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
+    """The cost at a state, and the information (U, U) about all unknowns, border last."""
+    equations = joint_room(evidence)
+    cost = evaluate_joint(evidence, packed(state), equations)
+    arrow = equations.new
+    poses, size = len(arrow.blocks), len(arrow.border)
+    first = 6 * poses
+    dense = np.zeros((first + size, first + size))
+    for p in range(poses):
+        own = slice(6 * p, 6 * p + 6)
+        dense[own, own] = arrow.blocks[p]
+        dense[own, first:] = arrow.coupling[p]
+        dense[first:, own] = arrow.coupling[p].T
+    dense[first:, first:] = arrow.border
+    return float(cost), dense

@@ -35,8 +35,8 @@ class Sightings(NamedTuple):
     ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
     ``whitening`` (N, 3) as in `cadalign.solvers.evidence.Keypoints`; ``depths`` (N, 2) holds depths
     and their inverse standard deviations, 0 where there is none. ``loss`` (N,) and ``loss_scale``
-    (N,) say how the length of each residual counts. ``slopes`` (N, 2) are the changes of undistorted
-    pixels, over the focal length, by its logarithm.
+    (N,) say how the length of each residual counts. ``slopes`` (N, 2) are the changes of
+    undistorted pixels, over the focal length, by its logarithm.
     """
 
     point: IntArray
@@ -154,14 +154,6 @@ class State(NamedTuple):
 
 
 @kernel
-def state_size(evidence: Evidence) -> int:
-    """Numbers of a state as a row."""
-    modes, points = evidence.shape.modes.shape[0], evidence.shape.mean.shape[0]
-    poses = count_poses(evidence)
-    return 12 * poses + evidence.focals.low.shape[0] + 3 + modes + 3 * points
-
-
-@inlined
 def unpacked(evidence: Evidence, row: FloatArray) -> State:
     """The parts of a state that is a row of numbers; they share its memory."""
     modes, points = evidence.shape.modes.shape[0], evidence.shape.mean.shape[0]
@@ -175,18 +167,9 @@ def unpacked(evidence: Evidence, row: FloatArray) -> State:
     )
 
 
-@kernel
 def packed(state: State) -> FloatArray:
     """The state as a row of numbers."""
-    return np.concatenate(
-        (
-            state.poses.ravel(),
-            state.log_focals,
-            state.log_scales,
-            state.coefficients,
-            state.displacements.ravel(),
-        )
-    )
+    return np.concatenate([np.ravel(part) for part in state])
 
 
 @kernel
@@ -206,18 +189,6 @@ def unstretched(shape: Shape, state: State, i: int, a: int) -> float:
     for k in range(shape.modes.shape[0]):
         value += state.coefficients[k] * shape.modes[k, i, a]
     return value
-
-
-@kernel
-def copy_state(state: State) -> State:
-    """A copy that shares nothing."""
-    return State(
-        state.poses.copy(),
-        state.log_focals.copy(),
-        state.log_scales.copy(),
-        state.coefficients.copy(),
-        state.displacements.copy(),
-    )
 
 
 @kernel

@@ -73,44 +73,26 @@ def reduce_modes(evidence: Evidence) -> Reduction:
     )
 
 
-@kernel
 def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:
     """A state in reduced coefficients; ``whole`` is the shape that was reduced."""
-    modes = state.coefficients.shape[0]
-    given = np.zeros(reduction.basis.shape[0])
-    given[:modes] = state.coefficients
+    displaced = reduction.displaced
+    moved = state.displacements[displaced] / whole.spread[displaced, None]
     displacements = state.displacements.copy()
-    for j in range(reduction.displaced.shape[0]):
-        i = reduction.displaced[j]
-        for a in range(3):
-            given[modes + 3 * j + a] = state.displacements[i, a] / whole.spread[i]
-            displacements[i, a] = 0.0
-    return State(
-        state.poses.copy(),
-        state.log_focals.copy(),
-        state.log_scales.copy(),
-        given @ reduction.basis,
-        displacements,
+    displacements[displaced] = 0.0
+    given = np.concatenate([state.coefficients, moved.ravel()])
+    return state._replace(
+        coefficients=given @ reduction.basis,
+        displacements=displacements,
     )
 
 
-@kernel
 def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
     """The state in the coefficients and displacements of the shape that was reduced."""
-    modes = whole.modes.shape[0]
+    modes, displaced = len(whole.modes), reduction.displaced
     given = reduction.basis @ state.coefficients
     displacements = state.displacements.copy()
-    for j in range(reduction.displaced.shape[0]):
-        i = reduction.displaced[j]
-        for a in range(3):
-            displacements[i, a] = given[modes + 3 * j + a] * whole.spread[i]
-    return State(
-        state.poses.copy(),
-        state.log_focals.copy(),
-        state.log_scales.copy(),
-        given[:modes].copy(),
-        displacements,
-    )
+    displacements[displaced] = given[modes:].reshape(-1, 3) * whole.spread[displaced, None]
+    return state._replace(coefficients=given[:modes], displacements=displacements)
 
 
 @kernel

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import kernel
-from cadalign.solvers.joint.evidence import Evidence, State, packed, state_size, unpacked
+from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.system import joint_score
 from cadalign.solvers.refine import refine
@@ -27,7 +26,6 @@ class JointMinima(NamedTuple):
     scores: FloatArray
 
 
-@kernel
 def search_joint(
     evidence: Evidence, poses: FloatArray, log_focals: FloatArray, log_scales: FloatArray
 ) -> tuple[JointMinima, int]:
@@ -36,28 +34,21 @@ def search_joint(
     Returns them and the number of iterations.
     """
     reduction = reduce_modes(evidence)
-    reduced = reduction.evidence
-    count = poses.shape[0]
-    starts = np.zeros((count, state_size(reduced)))
-    for s in range(count):
-        start = unpacked(reduced, starts[s])
-        start.poses[:] = poses[s]
-        start.log_focals[:] = log_focals[s]
-        start.log_scales[:] = log_scales[s]
+    reduced, count = reduction.evidence, len(poses)
+    unmoved = np.zeros((count, len(reduced.shape.modes) + reduced.shape.mean.size))
+    starts = np.concatenate([poses.reshape(count, -1), log_focals, log_scales, unmoved], axis=1)
     minima = room_for_minima(max(count, 1), starts.shape[1])
     effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
     search(reduced, starts, effort, 0, 0.0, minima)
-    found = minima.counts[0]
+    found = int(minima.counts[0])
     states = [
-        whole_state(reduction, evidence.shape, unpacked(reduced, minima.states[k]))
-        for k in range(found)
+        whole_state(reduction, evidence.shape, unpacked(reduced, row))
+        for row in minima.states[:found]
     ]
-    return JointMinima(states, minima.costs[:found].copy(), minima.scores[:found].copy()), (
-        minima.counts[1]
-    )
+    costs, scores = minima.costs[:found], minima.scores[:found]
+    return JointMinima(states, costs, scores), int(minima.counts[1])
 
 
-@kernel
 def refine_joint(
     evidence: Evidence, max_iterations: int, state: State
 ) -> tuple[float, State, int, bool]:
@@ -72,9 +63,8 @@ def refine_joint(
     return cost, found, iterations, converged
 
 
-@kernel
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     reduction = reduce_modes(evidence)
     row = packed(reduced_state(reduction, evidence.shape, state))
-    return joint_score(reduction.evidence, row, 0.0)
+    return float(joint_score(reduction.evidence, row, 0.0))

@@ -2,9 +2,10 @@
 
 Of one pose, the displacement d of a point, with the prior N(0, spread^2 I), is eliminated: its
 equations ``r + J dx + D (e - d)``, with e the displacement to find, have the covariance
-I + spread^2 D D' about ``r - D d + J dx``. Whitening them by its Cholesky factor leaves least squares
-in x alone, and ``e = -spread^2 D' L^-T (whitened residual)`` follows. Of several poses, displacements
-are modes (see `cadalign.solvers.joint.reduction`), so that poses have no products with each other.
+I + spread^2 D D' about ``r - D d + J dx``. Whitening them by its Cholesky factor leaves least
+squares in x alone, and ``e = -spread^2 D' L^-T (whitened residual)`` follows. Of several poses,
+displacements are modes (see `cadalign.solvers.joint.reduction`), so that poses have no products
+with each other.
 """
 
 from __future__ import annotations

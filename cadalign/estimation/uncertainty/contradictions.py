@@ -18,15 +18,17 @@ from cadalign.estimation.uncertainty.evidence import (
     Piece,
     depth_factor,
     kept_rows,
+    keypoints_in,
     pieces_of,
     plane_distances,
     without,
 )
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, State
+from cadalign.solvers.joint.evidence import Evidence, State, packed
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
 from cadalign.solvers.joint.search import refine_joint
+from cadalign.solvers.joint.system import joint_cost
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
@@ -34,6 +36,7 @@ _LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown o
 _HIDDEN = 6.0  # [sigma], of a depth from most others of its image
 _WRONG_UNIT = 100.0  # factor between measured and expected depths
 _PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
+_MOST_TESTED = 40  # pieces
 _AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
 
 Search = Callable[[Evidence], tuple[State, float] | None]
@@ -66,8 +69,9 @@ def contradictions(
     search
         Finds the best estimate of other evidence.
     """
-    pieces = pieces_of(evidence)
-    if len(pieces) < 2:
+    every = pieces_of(evidence)
+    pieces = [each for each in every if not _determines_its_pose(evidence, each)]
+    if len(every) < 2 or not pieces:
         return ()
     reduction = reduce_modes(evidence)
     state = reduced_state(reduction, evidence.shape, state)
@@ -75,7 +79,8 @@ def contradictions(
     if len(evidence.planes.point):
         evidence = _without_hidden(evidence, state)
         cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
-    level = _FALSE_ALARMS / len(pieces)
+    pieces = _worst(evidence, state, pieces)
+    level = _FALSE_ALARMS / len(every)
     if not _is_suspicious(evidence, state, cost, pieces, level):
         return ()
     whole = _determined(evidence, state)
@@ -94,6 +99,25 @@ def contradictions(
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
     return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+
+
+def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
+    """True for keypoints without which the pose of their view would be open: they test nothing."""
+    if piece.kind != "keypoints" or piece.view is None:
+        return False
+    rig, keypoints = evidence.rig, keypoints_in(evidence, piece.view)
+    contours = (evidence.sightings.image == piece.view).sum() > keypoints.sum()
+    depths = (evidence.planes.image == piece.view).any()
+    return (rig.pose == rig.pose[piece.view]).sum() == 1 and not contours and not depths
+
+
+def _worst(evidence: Evidence, state: State, pieces: list[Piece]) -> list[Piece]:
+    """The pieces of the largest own cost, as many as are tested."""
+    if len(pieces) <= _MOST_TESTED:
+        return pieces
+    trials = [without(evidence, state, piece) for piece in pieces]
+    rests = [joint_cost(rest, packed(start)) for rest, start in trials]
+    return [pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())]
 
 
 def _is_suspicious(

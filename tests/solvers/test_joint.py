@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
+    Focals,
     Heights,
     Lengths,
     Planes,
@@ -21,16 +22,20 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     Sightings,
     State,
-    copy_state,
+    packed,
     points_of,
+    unpacked,
 )
-from cadalign.solvers.joint.refine import move_state, refine_joint
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
+from cadalign.solvers.joint.search import refine_joint
+from cadalign.solvers.joint.system import joint_cost, joint_room
+from cadalign.solvers.system import accept, evaluate, move
 
 POINTS, MODES, VIEWS = 7, 3, 2
 
 
-def evidence_of(seed: int, *, spread: float, poses: tuple[int, int], loss: int) -> Evidence:
+def evidence_of(
+    seed: int, *, spread: float, poses: tuple[int, int], loss: int, focals: int = 0
+) -> Evidence:
     rng = np.random.default_rng(seed)
     shape = Shape(
         rng.normal(size=(POINTS, 3)),
@@ -48,6 +53,7 @@ def evidence_of(seed: int, *, spread: float, poses: tuple[int, int], loss: int) 
         depths,
         np.full(count, loss),
         np.full(count, 2.0),
+        0.05 * rng.normal(size=(count, 2)),
     )
     rotations = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.3, 0]]).as_matrix().reshape(VIEWS, 9)
     cameras = np.concatenate([rotations, 0.1 * rng.normal(size=(VIEWS, 3))], axis=1)
@@ -74,16 +80,38 @@ def evidence_of(seed: int, *, spread: float, poses: tuple[int, int], loss: int) 
     )
     precision = rng.normal(size=(3, 3))
     scales = ScalePriors(np.ones(3), precision @ precision.T)
-    return Evidence(
-        shape, sightings, Rig(cameras, np.array(poses)), up, lengths, heights, planes, scales
+    lenses = Focals(
+        np.minimum(np.arange(VIEWS), focals - 1),
+        np.full(focals, -2.0),
+        np.full(focals, 2.0),
+        0.1 * rng.normal(size=focals),
+        np.full(focals, 30.0),
     )
+    rig = Rig(cameras, np.array(poses))
+    return Evidence(shape, sightings, rig, lenses, up, lengths, heights, planes, scales)
 
 
-def state_of(seed: int, poses: int) -> State:
+def gradient_of(evidence: Evidence, state: State) -> np.ndarray:
+    room = joint_room(evidence)
+    assert evaluate(evidence, packed(state), room) < np.inf
+    return room.new.gradient
+
+
+def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
+    row, room = packed(state), joint_room(evidence)
+    evaluate(evidence, row, room)
+    accept(evidence, row, room)
+    there = row.copy()
+    move(evidence, row, room, 0.0, step, there)
+    return unpacked(evidence, there)
+
+
+def state_of(seed: int, poses: int, focals: int = 0) -> State:
     rng = np.random.default_rng(seed + 1)
     rotations = Rotation.random(poses, random_state=seed).as_matrix().reshape(poses, 9)
     return State(
         np.concatenate([rotations, np.tile([0.1, 0.2, 6.0], (poses, 1))], axis=1),
+        0.2 * rng.normal(size=focals),
         0.1 * rng.normal(size=3),
         0.5 * rng.normal(size=MODES),
         0.02 * rng.normal(size=(POINTS, 3)),
@@ -108,42 +136,54 @@ def seen_from(evidence: Evidence, state: State) -> Evidence:
 @given(
     seed=st.integers(0, 10_000),
     poses=st.sampled_from([(0, 0), (0, 1)]),
+    focals=st.sampled_from([0, 1, 2]),
     loss=st.sampled_from([LINEAR, HUBER, CAUCHY]),
 )
-def test_the_gradient_is_that_of_the_cost(seed: int, poses: tuple[int, int], loss: int) -> None:
-    evidence = evidence_of(seed, spread=0.0, poses=poses, loss=loss)
-    state = state_of(seed, max(poses) + 1)
-    system = empty_system(evidence)
-    assert evaluate_joint(evidence, state, system) < np.inf
-    moved, trial = copy_state(state), empty_system(evidence)
-    slopes = np.empty(len(system.gradient))
+def test_the_gradient_is_that_of_the_cost(
+    seed: int, poses: tuple[int, int], focals: int, loss: int
+) -> None:
+    evidence = evidence_of(seed, spread=0.0, poses=poses, loss=loss, focals=focals)
+    state = state_of(seed, max(poses) + 1, focals)
+    gradient = gradient_of(evidence, state)
+    slopes = np.empty(len(gradient))
     for k in range(len(slopes)):
-        costs = []
-        for size in (1e-6, -1e-6):
-            step = np.zeros(len(slopes))
-            step[k] = size
-            move_state(evidence, state, system, step, moved)
-            costs.append(evaluate_joint(evidence, moved, trial))
+        step = 1e-6 * np.eye(len(slopes))[k]
+        costs = [joint_cost(evidence, packed(moved(evidence, state, s))) for s in (step, -step)]
         slopes[k] = (costs[0] - costs[1]) / 4e-6  # the cost has no factor 1/2
-    assert np.allclose(slopes, system.gradient, rtol=1e-5, atol=1e-7 * np.abs(slopes).max())
+    assert np.allclose(slopes, gradient, rtol=1e-5, atol=1e-7 * np.abs(slopes).max())
 
 
 @pytest.mark.parametrize("poses", [(0, 0), (0, 1)])
 def test_the_minimum_has_no_slope_in_displacements_either(poses: tuple[int, int]) -> None:
     evidence = evidence_of(3, spread=0.05, poses=poses, loss=LINEAR)
-    state = state_of(3, max(poses) + 1)
-    evidence = seen_from(evidence, state)
-    cost, _, converged = refine_joint(evidence, 300, state)
+    evidence = seen_from(evidence, state_of(3, max(poses) + 1))
+    cost, state, _, converged = refine_joint(evidence, 300, state_of(3, max(poses) + 1))
     assert converged
     assert cost < np.inf
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    size = np.sqrt(cost * system.hessian.diagonal())
-    assert np.abs(system.gradient / size).max() < 1e-4
-    # A displacement that is at its best stays where it is.
-    moved = copy_state(state)
-    move_state(evidence, state, system, np.zeros(len(system.gradient)), moved)
-    assert np.abs(moved.displacements - state.displacements).max() < 1e-5
+    for i in range(POINTS):
+        for a in range(3):
+            state.displacements[i, a] += 1e-5
+            higher = displaced_cost(evidence, state)
+            state.displacements[i, a] -= 2e-5
+            lower = displaced_cost(evidence, state)
+            state.displacements[i, a] += 1e-5
+            assert abs(higher - lower) < 1e-4 * cost
+
+
+def displaced_cost(evidence: Evidence, state: State) -> float:
+    """The cost at a state, displacements taken as they are."""
+    shape = evidence.shape
+    still = evidence._replace(
+        shape=shape._replace(mean=shape.mean + state.displacements, spread=np.zeros(POINTS))
+    )
+    prior = float((state.displacements / shape.spread[:, None]).ravel() ** 2 @ np.ones(3 * POINTS))
+    rest = state._replace(displacements=np.zeros((POINTS, 3)))
+    others = evidence._replace(sightings=Sightings(*(c[:0] for c in evidence.sightings)))
+    named = joint_cost(others, packed(rest))
+    seen = joint_cost(still, packed(rest)) - joint_cost(
+        others._replace(shape=still.shape), packed(rest)
+    )
+    return named + seen + prior
 
 
 def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
@@ -151,9 +191,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     evidence = evidence_of(5, spread=spread, poses=(0, 0), loss=LINEAR)
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = seen_from(evidence, state_of(5, 1))
-    free = evidence.scales._replace(free=np.zeros(3))
     evidence = evidence._replace(
-        scales=free,
         lengths=Lengths(*(column[:0] for column in evidence.lengths)),
         heights=Heights(*(column[:0] for column in evidence.heights)),
         planes=Planes(*(column[:0] for column in evidence.planes)),
@@ -167,24 +205,30 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     )
     state = state_of(5, 1)
     state.displacements[:] = 0
-    state.log_scales[:] = 0
-    other = State(
-        state.poses.copy(),
-        state.log_scales.copy(),
-        np.concatenate([state.coefficients, np.zeros(3 * POINTS)]),
-        state.displacements.copy(),
-    )
-    first, _, _ = refine_joint(evidence, 300, state)
-    second, _, _ = refine_joint(as_modes, 300, other)
+    more = np.concatenate([state.coefficients, np.zeros(3 * POINTS)])
+    first, one, _, _ = refine_joint(evidence, 300, state)
+    second, other, _, _ = refine_joint(as_modes, 300, state._replace(coefficients=more))
     assert np.isclose(first, second, rtol=1e-8)
-    assert np.allclose(state.poses, other.poses, atol=1e-5)
-    found = points_of(evidence.shape, state), points_of(as_modes.shape, other)
+    assert np.allclose(one.poses, other.poses, atol=1e-5)
+    found = points_of(evidence.shape, one), points_of(as_modes.shape, other)
     assert np.allclose(*found, atol=1e-5)
-    unknowns, points, seen = joint_covariance(evidence, state)
-    all_of_them, of_modes, seen_of_modes = joint_covariance(as_modes, other)
-    assert np.allclose(unknowns[:6, :6], all_of_them[:6, :6], rtol=1e-3, atol=1e-9)
-    assert np.allclose(points, of_modes, rtol=1e-3, atol=1e-8)
-    assert np.allclose(seen, seen_of_modes, rtol=1e-3, atol=1e-8)
+    eliminated, of_modes = joint_covariance(evidence, one), joint_covariance(as_modes, other)
+    assert np.allclose(eliminated.poses, of_modes.poses, rtol=1e-3, atol=1e-9)
+    assert np.allclose(eliminated.points, of_modes.points, rtol=1e-3, atol=1e-8)
+    assert np.allclose(eliminated.seen, of_modes.seen, rtol=1e-3, atol=1e-8)
+
+
+def test_the_arrow_is_the_dense_matrix() -> None:
+    evidence = evidence_of(6, spread=0.0, poses=(0, 1), loss=LINEAR, focals=1)
+    state = state_of(6, 2, 1)
+    _, information = information_of(evidence, state)
+    found, inverse = joint_covariance(evidence, state), np.linalg.inv(information)
+    size = np.abs(inverse).max()
+    for p in range(2):
+        own = slice(6 * p, 6 * p + 6)
+        assert np.allclose(found.poses[p], inverse[own, own], atol=1e-9 * size)
+        assert np.allclose(found.cross[p], inverse[own, 12:], atol=1e-9 * size)
+    assert np.allclose(found.border, inverse[12:, 12:], atol=1e-9 * size)
 
 
 @pytest.mark.parametrize("poses", [(0, 0), (0, 1)])
@@ -192,18 +236,18 @@ def test_covariances_of_points_are_propagated_from_the_unknowns(poses: tuple[int
     evidence = evidence_of(4, spread=0.0, poses=poses, loss=LINEAR)
     state = state_of(4, max(poses) + 1)
     found = joint_covariance(evidence, state)
-    system, moved = empty_system(evidence), copy_state(state)
+    covariance = np.linalg.inv(information_of(evidence, state)[1])
 
     def in_model_and_camera(step: np.ndarray) -> np.ndarray:
-        move_state(evidence, state, system, step, moved)
-        places = [points_of(evidence.shape, moved)]
-        for motion in (moved.poses[poses[0]], evidence.rig.cam_from_rig[0]):
+        there = moved(evidence, state, step)
+        places = [points_of(evidence.shape, there)]
+        for motion in (there.poses[poses[0]], evidence.rig.cam_from_rig[0]):
             places.append(places[-1] @ motion[:9].reshape(3, 3).T + motion[9:])
         return np.stack([places[0], places[2]])
 
-    steps = 1e-6 * np.eye(len(found.unknowns))
+    steps = 1e-6 * np.eye(len(covariance))
     ends = [in_model_and_camera(step) - in_model_and_camera(-step) for step in steps]
     slopes = np.moveaxis(np.array(ends) / 2e-6, 0, -1)
-    expected = slopes @ found.unknowns @ slopes.swapaxes(-1, -2)
+    expected = slopes @ covariance @ slopes.swapaxes(-1, -2)
     size = np.abs(expected).max()
     assert np.allclose(expected, [found.points, found.seen], rtol=1e-5, atol=1e-7 * size)

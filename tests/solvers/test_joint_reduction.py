@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign.solvers.joint.covariance import joint_covariance
+from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
+    Focals,
     Heights,
     Lengths,
     Planes,
@@ -18,11 +19,13 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     Sightings,
     State,
+    packed,
     points_of,
 )
 from cadalign.solvers.joint.reduction import reduce_modes, used_points
 from cadalign.solvers.joint.search import search_joint
-from cadalign.solvers.joint.system import empty_system, evaluate_joint
+from cadalign.solvers.joint.system import joint_room
+from cadalign.solvers.system import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
 NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)
@@ -47,6 +50,7 @@ def evidence(rank: int) -> Evidence:
         np.concatenate([Rotation.random(random_state=rank).as_matrix().ravel(), [0.1, 0.2, 6.0]])[
             None
         ],
+        np.zeros(0),
         np.zeros(3),
         rng.normal(size=MODES),
         np.zeros((POINTS, 3)),
@@ -62,11 +66,13 @@ def evidence(rank: int) -> Evidence:
         np.zeros((SEEN, 2)),
         np.zeros(SEEN, dtype=np.int64),
         np.ones(SEEN),
+        np.zeros((SEEN, 2)),
     )
     return Evidence(
         shape,
         sightings,
         Rig(np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None], np.zeros(1, dtype=np.int64)),
+        Focals(np.full(1, -1), NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE),
         Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
         Lengths(np.empty((0, 2), dtype=np.int64), NONE, NO_VALUE, NO_VALUE),
         Heights(NONE, NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
@@ -78,16 +84,13 @@ def evidence(rank: int) -> Evidence:
 def best_of(evidence: Evidence, rank: int) -> tuple[State, float]:
     rotation = Rotation.random(random_state=rank) * Rotation.from_rotvec([0.1, 0.0, 0.1])
     start = np.concatenate([rotation.as_matrix().ravel(), [0.0, 0.0, 5.5]])[None, None]
-    minima, count, _ = search_joint(evidence, start, np.zeros((1, 3)))
-    assert count == 1
-    state = State(
-        minima.poses[0], minima.log_scales[0], minima.coefficients[0], minima.displacements[0]
-    )
+    minima, _ = search_joint(evidence, start, np.zeros((1, 0)), np.zeros((1, 3)))
+    (state,) = minima.states
     return state, float(minima.scores[0])
 
 
 def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: int) -> None:
-    reduced, basis = reduce_modes(evidence)
+    reduced, basis, _ = reduce_modes(evidence)
     assert basis.shape == (MODES, min(rank, 3 * SEEN))
     assert np.allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
     seen = evidence.shape.modes[:, :SEEN].reshape(MODES, -1)
@@ -97,20 +100,20 @@ def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: in
 
 def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
-    system = empty_system(evidence)
-    cost = evaluate_joint(evidence, state, system)
-    slope = np.linalg.solve(system.hessian, system.gradient)
-    assert system.gradient @ slope < 1e-9 * max(cost, 1.0)
-    assert score == pytest.approx(cost + np.linalg.slogdet(system.hessian)[1], rel=1e-9)
+    cost, information = information_of(evidence, state)
+    room = joint_room(evidence)
+    evaluate(evidence, packed(state), room)
+    slope = np.linalg.solve(information, room.new.gradient)
+    assert room.new.gradient @ slope < 1e-9 * max(cost, 1.0)
+    assert score == pytest.approx(cost + np.linalg.slogdet(information)[1], rel=1e-9)
 
 
 def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, _ = best_of(evidence, rank)
-    system = empty_system(evidence)
-    evaluate_joint(evidence, state, system)
-    inverse = np.linalg.inv(system.hessian)
+    inverse = np.linalg.inv(information_of(evidence, state)[1])
     inverse[6:9] = inverse[:, 6:9] = 0.0
-    unknowns, points, seen = joint_covariance(evidence, state)
+    poses, cross, border, points, seen = joint_covariance(evidence, state)
+    unknowns = np.block([[poses[0], cross[0]], [cross[0].T, border]])
     assert np.allclose(unknowns, inverse, atol=1e-9 * np.abs(inverse).max())
     by_modes = np.moveaxis(evidence.shape.modes, 0, 2)
     expected = by_modes @ inverse[9:, 9:] @ by_modes.swapaxes(1, 2)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cadalign.estimation.align_result import AlignResult
 
 from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.metrics import rotation_error
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from cadalign.estimation.align_result import AlignResult
 from support.scenes import CAMERA, around
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.estimation.align_result import AlignResult
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.shapes.examples import examples_of

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from cadalign.estimation.align_result import AlignResult
 from support.scenes import (
     CAMERA,
     around,
@@ -23,7 +24,6 @@ from support.scenes import (
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.geometry.gravity import up_from_vertical_edges
 
 

@@ -7,11 +7,11 @@ import warnings
 from collections.abc import Sequence
 
 import numpy as np
+from cadalign.estimation.batch import BatchResult
 from fuzz.fit_cases import Case
 from fuzz.hostile import Call, made
 
 from cadalign import Alignment, CadalignError, Camera, FitResult, fit, fit_batch
-from cadalign.estimation.batch import BatchResult
 from cadalign.metrics import rotation_error
 
 ROTATION_TOLERANCE = 1e-9

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from cadalign.estimation.align_result import AlignResult
 
 from cadalign import Alignment
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.solvers.joint.covariance import joint_covariance

@@ -295,7 +295,7 @@ def full_covariances(of_solver: FloatArray, known_axis: str) -> FloatArray:
     """
     count, size = len(of_solver), of_solver.shape[-1] + 1
     full = np.zeros((count, size * size))
-    full[:, _places(size, known_axis)] = of_solver.reshape(count, -1)
+    full[:, _places(size, known_axis)] = of_solver.reshape(count, (size - 1) ** 2)
     return full.reshape(count, size, size)
 
 

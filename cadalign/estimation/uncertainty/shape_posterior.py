@@ -108,7 +108,7 @@ def _linearised(
     result: Result, view: View, loss: int, loss_scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Whitened and weighted: derivatives by shape (2 n, d) and pose (2 n, 6), residuals (2 n,)."""
-    kept = result.inliers[0]
+    kept = result.inliers
     ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
     names = prior_of(result.model).rows_of(ids, "view.ids")
     pixels = np.require(cast(FloatArray, view.points_2d), requirements="W")

@@ -8,15 +8,13 @@ if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
-    from cadalign.estimation.align_result import AlignResult
-    from cadalign.estimation.batch import BatchResult
     from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
-    from cadalign.estimation.frames import to_dataframe
     from cadalign.estimation.model import Model, Size
     from cadalign.estimation.observed import views_from
     from cadalign.estimation.options import RansacOptions
-    from cadalign.estimation.result import FitResult
+    from cadalign.estimation.result import AlignResult, FitResult, Result
+    from cadalign.estimation.results import BatchResult, Results, to_dataframe
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
@@ -50,6 +48,8 @@ __all__ = [
     "Model",
     "Observation",
     "RansacOptions",
+    "Result",
+    "Results",
     "ShapeModel",
     "Size",
     "Symmetry",

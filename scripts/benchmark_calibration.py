@@ -18,7 +18,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from cadalign import Alignment, FitResult, RansacOptions, fit
+from cadalign import Alignment, RansacOptions, Result, fit
 from cadalign.errors import CadalignError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 
@@ -58,7 +58,7 @@ def _coverage(arguments: Arguments, console: Console) -> list[dict[str, Any]]:
                     [_holds(result, problem.alignment, covariance) for covariance in stated]
                     + [not result.alternatives]
                     for problem, result in _fits(arguments, draw, sigma=sigma, loss=loss)
-                    if (stated := (result.covariance, result.posterior_covariance))
+                    if (stated := (result.fisher_covariance, result.covariance))
                 ],
                 axis=0,
             )
@@ -131,7 +131,7 @@ def _shuffle(rng: np.random.Generator, points_2d: np.ndarray) -> None:
     rng.shuffle(points_2d)
 
 
-def _fits(arguments: Arguments, draw: Draw, **options: Any) -> list[tuple[Problem, FitResult]]:
+def _fits(arguments: Arguments, draw: Draw, **options: Any) -> list[tuple[Problem, Result]]:
     """Problems with their fits; those that are refused are left out."""
     fits = []
     for number in range(arguments.problems):
@@ -149,14 +149,16 @@ def _is_large(est: Alignment, gt: Alignment) -> bool:
     return bool(angle > LARGE_ROTATION_DEG or np.abs(est.scale / gt.scale - 1).max() > LARGE_SCALE)
 
 
-def _holds(result: FitResult, gt: Alignment, covariance: np.ndarray | None) -> bool:
+def _holds(result: Result, gt: Alignment, covariance: np.ndarray | None) -> bool:
     """True if the truth lies within the 95 % ellipsoid."""
     assert covariance is not None
     est = result.alignment
     vector = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
     shift, log_ratio = gt.translation - est.translation, np.log(gt.scale / est.scale)
-    error = np.concatenate([vector, shift, log_ratio[1:]])
-    return bool(error @ np.linalg.solve(covariance, error) < chdtri(len(error), 1 - COVERED))
+    free = np.flatnonzero(covariance.diagonal())
+    error = np.concatenate([vector, shift, log_ratio])[free]
+    square = error @ np.linalg.solve(covariance[np.ix_(free, free)], error)
+    return bool(square < chdtri(len(error), 1 - COVERED))
 
 
 if __name__ == "__main__":

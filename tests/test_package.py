@@ -164,7 +164,7 @@ def test_first_fit_of_a_new_process_is_quick_once_kernels_are_compiled(tmp_path:
 def test_everything_that_is_promised_is_there() -> None:
     code = "import cadalign; print([hasattr(cadalign, name) for name in cadalign.__all__])"
     assert "False" not in python(code)
-    code = "from cadalign import *; print(fit, fit_batch, Camera, Alignment, Box, FitResult)"
+    code = "from cadalign import *; print(fit, fit_batch, Camera, Alignment, Box, Result)"
     assert "function fit" in python(code)
 
 

@@ -11,7 +11,7 @@ from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import Problem
@@ -34,7 +34,7 @@ class Marked:
 
 
 def rank(
-    model: CadModel, marked: Marked, result: FitResult, suggestion: Suggestion | None
+    model: CadModel, marked: Marked, result: Result, suggestion: Suggestion | None
 ) -> tuple[Advice, ...]:
     """Rank the suggested keypoint, a mask, another photo and lengths; empty if nothing is known.
 
@@ -84,16 +84,16 @@ def _reduced_pixels(pixels: FloatArray, times: float) -> FloatArray:
     return np.asarray((pixels + 0.5) / times - 0.5)
 
 
-def _widening(result: FitResult) -> float:
+def _widening(result: Result) -> float:
     """Mean ratio of the deviations to those of the linearised problem."""
-    linear, calibrated = result.covariance, result.posterior_covariance
+    linear, calibrated = result.fisher_covariance, result.covariance
     if linear is None or calibrated is None:
         return 1.0
     known = linear.diagonal() > 0
     return float(np.sqrt(np.mean(calibrated.diagonal()[known] / linear.diagonal()[known])))
 
 
-def present(result: FitResult) -> Advice | None:
+def present(result: Result) -> Advice | None:
     """The deviations as they are, without any addition."""
     std = result.std
     if std is None:

@@ -11,11 +11,11 @@ import numpy as np
 
 from cadalign.annotate.document import FocalChoice, Priors
 from cadalign.annotate.photos import Intrinsics
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
 from cadalign.geometry.camera import Camera
 
@@ -29,6 +29,7 @@ _EXPECTED_NOISE = 0.005
 _NOISE_EQUATIONS = 4
 _FIRST_NOISE = 4.0  # over the expected one
 _NOISE_ROUNDS = 12
+_UNKNOWNS = 8  # of pose and stretch
 _NOISE_TOLERANCE = 0.02
 LIKELY_STRETCH = 0.25
 """Standard deviation of the logarithm of each scale about 1, until another one is chosen."""
@@ -42,8 +43,8 @@ class LiveAlignment:
     It is provisional if the pairs alone did not suffice: stretch or focal length were assumed.
     """
 
-    result: FitResult | None  # at the given sigma; None without enough pairs, or degenerate ones
-    cautious: FitResult | None  # as shown and saved: at a sigma that explains the residuals
+    result: Result | None  # at the given sigma; None without enough pairs, or degenerate ones
+    cautious: Result | None  # as shown and saved: at a sigma that explains the residuals
     message: str  # reason for a missing result, or an assumption that was made
     outliers: dict[int, float]  # see `find_outliers`
     sigma: float  # of the pairs [px], larger if the residuals are
@@ -51,9 +52,14 @@ class LiveAlignment:
     fit_options: Mapping[str, Any]  # with which, and the priors, `cadalign fit` finds ``cautious``
 
     @property
-    def shown(self) -> FitResult | None:
+    def shown(self) -> Result | None:
         """The result that is shown and saved."""
         return self.cautious
+
+    @property
+    def counts(self) -> BoolArray:
+        """Marks the pairs (n,), all of which count."""
+        return np.ones(len(self.residuals), dtype=bool)
 
     @property
     def also_used(self) -> tuple[str, ...]:
@@ -110,7 +116,7 @@ def align(
             return LiveAlignment.missing(f"No alignment yet: {error.what}.")
     except CadalignError as error:
         return LiveAlignment.missing(f"No alignment: {error}.")
-    unknowns = 8 if result.covariance is None else len(result.covariance)
+    unknowns = _UNKNOWNS + (result.focal == "estimate")
     estimated = _estimate_sigma(result, sigma, redundancy=2 * count - unknowns)
     cautious, options = result, dict[str, Any]()
     if estimated > LEAST_SIGMA:
@@ -144,7 +150,7 @@ def _align_with_prior(fitter: _Fitter, sigma: FloatArray | None) -> LiveAlignmen
             continue
         except CadalignError as error:
             return LiveAlignment.missing(f"No alignment: {error}.")
-        unknowns = 8 if result.covariance is None else len(result.covariance)
+        unknowns = _UNKNOWNS + (result.focal == "estimate")
         given = fitter.points_3d, fitter.points_2d
         return LiveAlignment(
             result=result,
@@ -158,7 +164,7 @@ def _align_with_prior(fitter: _Fitter, sigma: FloatArray | None) -> LiveAlignmen
     return LiveAlignment.missing(f"No alignment yet: {reason}.")
 
 
-def _settle(fitter: _Fitter, weights: FloatArray) -> tuple[FitResult, float]:
+def _settle(fitter: _Fitter, weights: FloatArray) -> tuple[Result, float]:
     """Fit at the factor of the weights (n,) [px] that explains the residuals; and that factor.
 
     It is the fixed point of its estimate, reached from above, so that residuals first count as
@@ -198,7 +204,7 @@ class ExpectedNoise:
         return math.sqrt((squares + expected) / (redundancy + _NOISE_EQUATIONS))
 
 
-def _estimate_sigma(result: FitResult, sigma: FloatArray | None, *, redundancy: int) -> float:
+def _estimate_sigma(result: Result, sigma: FloatArray | None, *, redundancy: int) -> float:
     """Estimate the common factor of the sigmas, by default 1 px, from the residuals."""
     if redundancy <= 0:
         return 0.0
@@ -233,11 +239,11 @@ class _Fitter:
         """The same at a known focal length."""
         return replace(self, choice=FocalChoice(known=True, pixels=pixels), focal_prior=None)
 
-    def fit(self, sigma: float | FloatArray | None) -> FitResult:
+    def fit(self, sigma: float | FloatArray | None) -> Result:
         """Fit all pairs as `cadalign fit` does, with one sigma or (n,) [px], or to be estimated."""
         return self._fit(np.arange(len(self.points_3d)), sigma, "linear")
 
-    def fit_rows(self, rows: Rows, robust: bool) -> FitResult:
+    def fit_rows(self, rows: Rows, robust: bool) -> Result:
         """Fit some pairs; see `cadalign.estimation.uncertainty.misfit.FitRows`."""
         result = self._fit(rows, LEAST_SIGMA, "linear")
         if robust:
@@ -248,7 +254,7 @@ class _Fitter:
                 result = self._fit(rows, sigma, "cauchy")
         return result
 
-    def _fit(self, rows: Rows, sigma: float | FloatArray | None, loss: str) -> FitResult:
+    def _fit(self, rows: Rows, sigma: float | FloatArray | None, loss: str) -> Result:
         return fit(
             self.points_3d[rows],
             self.points_2d[rows],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,12 +12,12 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.arrays import FloatArray
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.geometry.projection import projected_covariances
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 
 
-def drawing_of_fit(result: FitResult, wireframe: Wireframe) -> dict[str, Any]:
+def drawing_of_fit(result: Result, wireframe: Wireframe) -> dict[str, Any]:
     """Box and edges of the stretched model."""
     camera, alignment = result.camera, result.alignment
     return {
@@ -63,9 +63,8 @@ def drawing_of_shape(
     ahead = in_camera[:, 2] > 0
     pixels = camera.project(in_camera[ahead])
     on_model = np.array([label in names for label in result.ids])[ahead]
-    covariances = projected_covariances(
-        in_camera[ahead], result.points_cam_covariance[ahead], camera
-    )
+    of_points = cast(FloatArray, result.points_cam_covariance)
+    covariances = projected_covariances(in_camera[ahead], of_points[ahead], camera)
     for row, uv in zip(np.flatnonzero(ahead), pixels.tolist(), strict=True):
         label = result.ids[row]
         fallback = label if isinstance(label, str) else f"keypoint {label}"

@@ -16,9 +16,8 @@ from cadalign.annotate.objects.models import AnnotatedModel
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.errors import InputError
-from cadalign.estimation.exporting import object_of_align, object_of_fit
+from cadalign.estimation.exporting import object_of
 from cadalign.estimation.observed import own_ids, shape_ids
-from cadalign.estimation.view import View
 from cadalign.export import AlignedObject, export_object
 from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
 from cadalign.io.files import write_text
@@ -167,15 +166,11 @@ def _aligned_object(session: Session, state: PhotoState) -> AlignedObject | None
     name = state.files.model.stem
     if not isinstance(live, LiveShape):
         mesh = state.model.cad.scene.mesh
-        return object_of_fit(live.shown, mesh=mesh, image=state.photo.path, name=name)
+        return object_of(live.shown, mesh=mesh, image=state.photo.path, name=name)
     warped = live.warped.wireframe.scene.mesh if live.warped and session.shape else None
-    views = [
-        View(view.camera, view.points_2d, ids=ids)
-        for view, ids in zip(observation.views, _ids(session, observation), strict=True)
-    ]
     images = [view.image for view in observation.views]
     mesh = warped or state.model.cad.scene.mesh
-    return object_of_align(live.shown, views, mesh=mesh, images=images, name=name)
+    return object_of(live.shown, mesh=mesh, images=images, name=name)
 
 
 def _named(session: Session, state: PhotoState, exported: AlignedObject) -> AlignedObject:

@@ -36,9 +36,8 @@ from cadalign.annotate.objects.unfinished import (
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
     in_file,
@@ -242,7 +241,7 @@ class AnnotationFiles:
         with suppress(OSError):  # something else is in it
             self.fit.parent.rmdir()
 
-    def write_fit(self, result: FitResult | AlignResult | None) -> None:
+    def write_fit(self, result: Result | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
         with writing(self.fit):
             if result is None:

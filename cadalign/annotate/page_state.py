@@ -20,6 +20,7 @@ from cadalign.annotate.objects.page import objects_state, with_photo_names
 from cadalign.annotate.result_text import (
     evidence_text,
     facts_of,
+    facts_of_shape,
     how_text,
     left_text,
     next_best_text,
@@ -27,7 +28,6 @@ from cadalign.annotate.result_text import (
 )
 from cadalign.annotate.session import Live, PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
-from cadalign.annotate.shape_text import facts_of_shape, notes_of_shape
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
@@ -286,7 +286,7 @@ def _alignment(session: Session, state: PhotoState, live: Live) -> dict[str, Any
         assert live.camera is not None
         camera, alignment = live.camera, live.alignment
         facts = facts_of_shape(live, session.shape)
-        texts = notes_of_shape(live, session.shape)
+        texts = notes_of(live, session.shape)
         notes = [with_photo_names(session, state, text) for text in texts]
         used = state.document.keypoints
         drawing = drawing_of_shape(live, session.shape, state.model.registry, used)

@@ -255,10 +255,11 @@ class Session:
         if self.shape is not None:
             return suggest_of_shape(live, self.shape, registry, used)
         result, camera = live.shown, live.camera
-        if result is None or camera is None or live.place or result.covariance[6, 6] > 0:
+        if result is None or camera is None or live.place or result.covariance is None:
+            return None
+        if "x" in result.stretched_axes:
             return None  # of a size that is estimated, too, nothing is predicted
-        covariance = np.delete(np.delete(result.covariance, 6, axis=0), 6, axis=1)
-        estimate = Estimate(camera, live.alignment, covariance, live.sigma)
+        estimate = Estimate(camera, live.alignment, result.covariance, live.sigma)
         return suggest(state.model.cad, registry, used, estimate)
 
     def further(self, state: PhotoState, *, to_write: bool = False) -> FurtherEvidence:

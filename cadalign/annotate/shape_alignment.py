@@ -16,10 +16,10 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.observed import model_of, size_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -30,6 +30,7 @@ from cadalign.shapes.model import ShapeModel
 LEAST_SHAPE_PAIRS = 3
 _LEAST_JUDGED = 6  # pairs from which on one can contradict the others
 _NOISE_ROUNDS = 4
+_UNKNOWNS = 9  # of pose and lengths
 _NOISE_TOLERANCE = 0.1
 _CONTRADICTS = 5.0  # distance from the others' prediction [sigmas]; hands click to about 2 px
 
@@ -54,7 +55,7 @@ class LiveShape:
     photo is the view of number ``place``.
     """
 
-    shown: AlignResult | None
+    shown: Result | None
     message: str = ""
     provisional: bool = False
     camera: Camera | None = None
@@ -146,7 +147,7 @@ class JointEstimate:
 
     model: Model | ShapeModel
     views: tuple[View, ...]
-    result: AlignResult
+    result: Result
     sigma: float | None
 
     @classmethod
@@ -176,8 +177,8 @@ def _explaining_sigma(model: Model | ShapeModel, views: Sequence[View], size: Si
             result = align(model, used, size=size)
         except CadalignError:  # it takes the masks
             break
-        residuals = np.concatenate(result.residuals)
-        redundancy = max(0, residuals.size - len(result.covariance))
+        residuals = result.residuals
+        redundancy = max(0, residuals.size - _UNKNOWNS)
         before = sigma
         sigma = noise.with_residuals(float((residuals**2).sum()), redundancy=redundancy)
         if abs(sigma / before - 1) < _NOISE_TOLERANCE:
@@ -224,7 +225,7 @@ def align_shape(
     warped = _warp(wireframe, result, model, known, free)
     photo = observation.views[further.place]
     residuals = np.empty((len(points), 2))
-    residuals[counts] = result.residuals[further.place]
+    residuals[counts] = result.views[further.place].residuals
     seen = photo.camera.project(result.poses[further.place].apply(warped.carried))
     residuals[~counts] = seen - uv[~counts]
     rows = np.flatnonzero(counts)
@@ -270,7 +271,7 @@ def _missing(missing: int, shape: ObjectShape | None, *, all_count: bool) -> str
 
 def _warp(
     wireframe: Wireframe,
-    result: AlignResult,
+    result: Result,
     model: Model | ShapeModel,
     known: Known,
     free: FloatArray,
@@ -296,6 +297,5 @@ def _contradicting(model: Model | ShapeModel, view: View) -> dict[int, float]:
         robust = align(model, pairs, ransac=RansacOptions(max_reproj_error=_CONTRADICTS))
     except CadalignError:
         return {}
-    (residuals,), (inliers,) = robust.residuals, robust.inliers
-    lengths = np.linalg.norm(residuals, axis=1)
-    return {int(row): float(lengths[row]) for row in np.flatnonzero(~inliers)}
+    lengths = np.linalg.norm(robust.residuals, axis=1)
+    return {int(row): float(lengths[row]) for row in np.flatnonzero(~robust.inliers)}

@@ -32,7 +32,7 @@ class NextBest:
     """
 
     row: int
-    unknown: int  # its index in `FitResult.covariance`
+    unknown: int  # its index in `Result.covariance`
     before: float  # standard deviation without the measurement
     after: float
 
@@ -46,7 +46,7 @@ class Unmarked:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """An estimate as far as a suggestion follows from it, its covariance as `FitResult` has it."""
+    """An estimate as far as a suggestion follows from it, its covariance as of `Result`."""
 
     camera: Camera
     alignment: Alignment
@@ -57,7 +57,7 @@ class Estimate:
     def of(cls, live: LiveAlignment) -> Estimate | None:
         """That of the pairs; None without one."""
         result = live.cautious
-        covariance = None if result is None else result.posterior_covariance
+        covariance = None if result is None else result.covariance
         if result is None or covariance is None:
             return None
         return cls(result.camera, result.alignment, covariance, live.sigma)
@@ -107,6 +107,9 @@ def suggest_of_shape(
     result, camera, warped = live.shown, live.camera, live.warped
     if result is None or camera is None or warped is None or live.place:
         return None
+    of_points = result.points_cam_covariance
+    if of_points is None:
+        return None
     own = {
         shape.id_of(point): point
         for number, point in registry
@@ -121,7 +124,7 @@ def suggest_of_shape(
     if not len(rows):
         return None
     in_camera = result.alignment.apply(result.points_3d[rows])
-    covariances = projected_covariances(in_camera, result.points_cam_covariance[rows], camera)
+    covariances = projected_covariances(in_camera, of_points[rows], camera)
     gain = np.linalg.slogdet(np.eye(2) + covariances / live.sigma**2)[1]
     best = int(np.argmax(np.round(gain, 9)))
     ((u, v),) = camera.project(in_camera[best : best + 1]).tolist()
@@ -167,9 +170,7 @@ def updated_variances(
     A measurement with the derivatives J turns the covariance C into
     C - C J' (J C J' + sigma^2)^-1 J C.
     """
-    jacobian = projection_jacobian(
-        points_3d, camera, alignment, known_axis="x", unknowns=len(covariance)
-    )
+    jacobian = projection_jacobian(points_3d, camera, alignment)[:, :, : len(covariance)]
     innovation = predicted_covariances(jacobian, covariance) + sigma**2 * np.eye(2)
     gain = covariance @ jacobian.transpose(0, 2, 1)
     shrunk = np.einsum("nka,nab,nkb->nk", gain, np.linalg.inv(innovation), gain)

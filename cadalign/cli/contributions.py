@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from cadalign.estimation.align_result import AlignResult
+    from cadalign.estimation.result import Result
     from cadalign.estimation.uncertainty.summary import Contribution
     from cadalign.estimation.uncertainty.weakness import Uncertainty
 
 _HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
 
 
-def tabulate_contributions(result: AlignResult) -> str:
+def tabulate_contributions(result: Result) -> str:
     """Table of standard deviations with all evidence and without each piece; empty for one piece.
 
     Rotation [degrees], position [units of the translation] and lengths along x, y, z [%].
     """
     pieces = result.contributions()
-    if len(pieces) < 2:
+    if len(pieces) < 2 or result.std is None:
         return ""
     rows = [_HEADS, ("with all evidence", *_cells(result.std))]
-    several = len(result.poses) > 1
+    several = len(result.views) > 1
     rows += [(f"without {_label(piece, several)}", *_cells(piece.without)) for piece in pieces]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
     lines = [
@@ -37,7 +37,7 @@ def tabulate_contributions(result: AlignResult) -> str:
     return "\n" + "\n".join(f"  {line}" for line in lines)
 
 
-def list_contributions(result: AlignResult) -> dict[str, Any]:
+def list_contributions(result: Result) -> dict[str, Any]:
     """The same for JSON, as ``contributions``; null for what is not determined."""
     pieces = result.contributions()
     if len(pieces) < 2:

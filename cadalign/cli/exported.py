@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,15 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.align_result import AlignResult
-from cadalign.estimation.exporting import object_of_align, object_of_fit
+from cadalign.estimation.exporting import object_of
 from cadalign.estimation.observed import model_of, own_ids, shape_ids
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import FitResult
-from cadalign.estimation.view import View
+from cadalign.estimation.result import Result
 from cadalign.export import AlignedObject
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.align_overlay import mesh_of
+from cadalign.render.drawing.result_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
 _FOLDER_ENDING = "_fit"
@@ -66,21 +64,20 @@ def read_exported(
         "metres": metres,
         "name": "model" if seen.model is None else seen.model.stem,
     }
-    if data.get("method") != "align":
-        with in_file(fit):
-            result = FitResult.from_dict(data)
-        _require_same(len(result.points_3d), len(seen.points_3d), path, "keypoints")
-        mesh = None if seen.model is None else load_mesh(seen.model)
-        return object_of_fit(result, mesh=mesh, image=seen.image, **known)
     with in_file(fit):
-        aligned = AlignResult.from_dict(data)
-    _require_same(len(aligned.poses), len(seen.views), path, "views")
-    opened = _shape(aligned, seen, shape)
-    with in_file(path):
-        views = _views(seen, opened)
-    mesh = _warped(aligned, seen, views, opened, path)
+        result = Result.from_dict(data)
+    _require_same(len(result.views), len(seen.views), path, "views")
+    for view, image in zip(result.views, seen.views, strict=True):
+        _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     images = [view.image for view in seen.views]
-    return object_of_align(aligned, views, mesh=mesh, images=images, **known)
+    if result.method != "align":
+        mesh = None if seen.model is None else load_mesh(seen.model)
+        return object_of(result, mesh=mesh, images=images, **known)
+    opened = _shape(result, seen, shape)
+    with in_file(path):
+        result = _with_ids(result, seen, opened)
+    mesh = _warped(result, seen, opened, path)
+    return object_of(result, mesh=mesh, images=images, **known)
 
 
 def _observation_of(fit: Path) -> Path:
@@ -97,7 +94,7 @@ def _observation_of(fit: Path) -> Path:
     )
 
 
-def _shape(aligned: AlignResult, seen: Observation, shape: Path | None) -> ShapeModel | None:
+def _shape(aligned: Result, seen: Observation, shape: Path | None) -> ShapeModel | None:
     """The learned shape that was fitted, None where the model's own keypoints were."""
     path = shape or seen.shape
     if path is None:
@@ -111,23 +108,20 @@ def _shape(aligned: AlignResult, seen: Observation, shape: Path | None) -> Shape
     return opened
 
 
-def _views(seen: Observation, shape: ShapeModel | None) -> list[View]:
-    own = own_ids(seen.views)
-    return [
-        View(image.camera, image.points_2d, ids=names if shape is None else shape_ids(image, shape))
-        for image, names in zip(seen.views, own, strict=True)
-    ]
+def _with_ids(result: Result, seen: Observation, shape: ShapeModel | None) -> Result:
+    """The result with the ids of every view's keypoints, which older files lack."""
+    ids: Sequence[Sequence[Hashable]] = own_ids(seen.views)
+    if shape is not None:
+        ids = [shape_ids(image, shape) for image in seen.views]
+    views = zip(result.views, ids, strict=True)
+    return replace(result, views=tuple(replace(view, ids=own) for view, own in views))
 
 
 def _warped(
-    aligned: AlignResult,
-    seen: Observation,
-    views: list[View],
-    shape: ShapeModel | None,
-    path: Path,
+    aligned: Result, seen: Observation, shape: ShapeModel | None, path: Path
 ) -> Mesh | None:
     if shape is not None:
-        return mesh_of(seen, views, replace(aligned, model=shape))
+        return mesh_of(seen, replace(aligned, model=shape))
     if seen.model is None:
         return None
     mesh = load_mesh(seen.model)

@@ -20,8 +20,7 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 
 if TYPE_CHECKING:
-    from cadalign.estimation.align_result import AlignResult
-    from cadalign.estimation.result import FitResult
+    from cadalign.estimation.result import Result
     from cadalign.io.observation import Observation
     from cadalign.render.drawing.color import ByteImage
 
@@ -35,7 +34,7 @@ class FittedFile:
     ``overlays`` are those of the model that were asked for.
     """
 
-    result: FitResult | AlignResult
+    result: Result
     data: dict[str, Any]
     table: str
     pictures: tuple[ByteImage, ...]
@@ -181,7 +180,6 @@ class Fit(ObservationCommand, CameraOptions, EvidenceOptions):
 
     def fit_file(self, status: AbstractContextManager[Any]) -> FittedFile:
         """Fit what the first file holds; ``status`` is entered while a joint fit is computed."""
-        result: FitResult | AlignResult
         observation = self._load()
         command = self._with_stored_sigma(observation)
         learned = command.shape_of(observation)
@@ -244,15 +242,20 @@ class Fit(ObservationCommand, CameraOptions, EvidenceOptions):
             )
         return changed
 
-    def _pictures(self, observation: Observation, result: FitResult) -> tuple[ByteImage, ...]:
+    def _pictures(self, observation: Observation, result: Result) -> tuple[ByteImage, ...]:
         """The result over the photo, unless --no-picture is given."""
         if not self.picture:
             return ()
-        from cadalign.render.drawing.fit_overlay import draw_observation
+        from cadalign.render.drawing.result_overlay import draw_result
 
-        return (draw_observation(observation, result),)
+        bounds = None
+        if observation.model is not None:
+            from cadalign.io.meshes.load import load_mesh
 
-    def _fit(self, observation: Observation) -> FitResult:
+            bounds = load_mesh(observation.model).bounds
+        return (draw_result(observation.views[0], result, bounds=bounds),)
+
+    def _fit(self, observation: Observation) -> Result:
         """Fit the stretched model."""
         from cadalign.estimation.fit import fit
 

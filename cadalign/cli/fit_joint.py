@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import InputError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, size_of, views_of
 from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result import Result
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.align_overlay import draw_aligned, mesh_of
 from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.result_overlay import draw_result, mesh_of
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a
 
 def fit_joint(
     command: Fit, observation: Observation, status: AbstractContextManager[Any]
-) -> tuple[AlignResult, list[ByteImage], Mesh | None]:
+) -> tuple[Result, list[ByteImage], Mesh | None]:
     """Align to all evidence; returns the result, a picture of every view and the object's mesh.
 
     ``status`` is entered while the alignment is computed.
@@ -60,10 +60,10 @@ def fit_joint(
             loss_scale=options.loss_scale,
             ransac=command.ransac if command.robust else None,
         )
-    mesh = mesh_of(observation, views, result)
+    mesh = mesh_of(observation, result)
     drawn = zip(observation.views, views, strict=True) if command.picture else ()
     pictures = [
-        draw_aligned(image, view, result, mesh=mesh, number=number)
+        draw_result(image, result, mesh=mesh, mask=view.mask_image, number=number)
         for number, (image, view) in enumerate(drawn)
     ]
     return result, pictures, mesh

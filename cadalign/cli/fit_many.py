@@ -118,12 +118,11 @@ def _fit_one(command: Fit, name: str, out: Path) -> _Row:
 def _values(file: str, fitted: FittedFile) -> dict[str, Any]:
     """Values of a table's row."""
     result = fitted.result
-    inliers = result.inliers if isinstance(result.inliers, tuple) else (result.inliers,)
     std = result.std
     scale = [float(value) for value in result.alignment.scale]
     values = (
         file,
-        sum(int(each.sum()) for each in inliers),
+        int(result.inliers.sum()),
         result.rms,
         None if std is None else std.rotation_deg,
         *scale,

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
-from cadalign.estimation.align_result import AlignResult
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.drawing.fit_overlay import photo_of
+from cadalign.render.drawing.result_overlay import photo_of
 
 if TYPE_CHECKING:
     from cadalign.cli.fit import Fit
@@ -41,7 +40,7 @@ def overlay_style(command: Fit, observation: Observation, *, is_learned: bool) -
 
 def draw_overlays(
     observation: Observation,
-    result: FitResult | AlignResult,
+    result: Result,
     mesh: Mesh | None,
     style: OverlayStyle,
 ) -> tuple[ByteImage, ...]:
@@ -59,10 +58,8 @@ def draw_overlays(
             raise InputError("no mesh of the object is known", where="--overlay")
         mesh = load_mesh(observation.model)
     scene = Scene(mesh)
-    poses = result.poses if isinstance(result, AlignResult) else (result.alignment,)
     pictures = []
-    for image, pose in zip(observation.views, poses, strict=True):
-        camera = result.camera if isinstance(result, FitResult) else image.camera
-        photo = photo_of(image, camera)
-        pictures.append(overlay_model(photo, camera, scene, pose, style=style))
+    for image, view in zip(observation.views, result.views, strict=True):
+        photo = photo_of(image, view.camera)
+        pictures.append(overlay_model(photo, view.camera, scene, view.alignment, style=style))
     return tuple(pictures)

@@ -12,14 +12,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.assemble import Minimum, assemble
 from cadalign.estimation.joint_robust import Consensus, find_consensus
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.result import FitStats
+from cadalign.estimation.result import FitStats, Result
+from cadalign.estimation.results import Results
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.starts import Start, starts_of
 from cadalign.estimation.view import View
@@ -47,7 +47,7 @@ def align(
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
-) -> AlignResult:
+) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
     Parameters
@@ -72,7 +72,7 @@ def align(
 
     Returns
     -------
-    AlignResult
+    Result
 
     Raises
     ------
@@ -166,7 +166,7 @@ def align_batch(
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
     workers: int = 1,
-) -> list[AlignResult | CadalignError]:
+) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.
 
     Parameters
@@ -182,9 +182,9 @@ def align_batch(
 
     Returns
     -------
-    list of AlignResult or CadalignError
-        The error takes the place of the result where an object has none. `cadalign.to_dataframe`
-        makes a table of them.
+    Results
+        A `Result` for each object; the error takes its place where an object has none. Its
+        ``to_dataframe`` makes a table of them.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def align_batch(
 
     def one(
         views: View | Sequence[View], size: Size | None, init: Alignment | None
-    ) -> AlignResult | CadalignError:
+    ) -> Result | CadalignError:
         try:
             return align(
                 model,
@@ -223,9 +223,9 @@ def align_batch(
             return error
 
     if threads == 1:
-        return [one(*each) for each in zip(objects, sizes, starts, strict=True)]
+        return Results.of([one(*each) for each in zip(objects, sizes, starts, strict=True)])
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(one, objects, sizes, starts))
+        return Results.of(list(pool.map(one, objects, sizes, starts)))
 
 
 def _one_each(

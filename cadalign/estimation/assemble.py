@@ -9,7 +9,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.align_result import AlignAlternative, AlignResult
 from cadalign.estimation.estimates import (
     Estimate,
     curvature_of_rotations,
@@ -25,10 +24,11 @@ from cadalign.estimation.estimates import (
 )
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.result import FitStats
+from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import equal_text
+from cadalign.estimation.symmetry import stretched_axes
 from cadalign.estimation.uncertainty.evidence import Basis, summaries_of
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.warnings import another_pose, warnings_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -56,7 +56,7 @@ def assemble(
     views: Sequence[View],
     minima: Sequence[Minimum],
     stats: FitStats,
-) -> AlignResult:
+) -> Result:
     """The result of minima, the likeliest first.
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
@@ -84,51 +84,66 @@ def assemble(
     minimum = minima[0]
     symmetry = model.symmetry if isinstance(model, Model) else None
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
-    likely = one_of_equals(likely, symmetry, (x, y, z))
+    held = x, y, z
+    likely = one_of_equals(likely, symmetry, held)
     best = likely[0]
     moments = moments_of_estimates(likely)
+    covariances = [moments.covariance]
+    covariances += [
+        moments_of_estimates(likely, view).covariance for view in range(1, len(best.poses))
+    ]
     if symmetry is None and not is_exact(minimum.evidence):
-        turns = moments.covariance[:3, :3]
-        turns += curvature_of_rotations(turns)
+        for covariance in covariances:
+            covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
+    camera = views[0].camera
     alternatives = tuple(
-        AlignAlternative(each.poses[0], each.points[:-2], each.points[-2:], each.likelihood)
+        Alternative(each.poses[0], each.likelihood, camera, each.points[:-2], each.points[-2:])
         for k, each in enumerate(likely)
         if is_other(moments, k)
     )
-    residuals = []
-    for view, pose in zip(views, best.poses, strict=True):
-        rows = prior.rows_of(view.keypoint_ids, "ids")
-        seen = view.camera.project(pose.apply(best.points[rows]))
-        residuals.append(seen - cast(FloatArray, view.points_2d))
-    return AlignResult(
-        alignment=best.poses[0],
-        ids=prior.ids,
-        points_3d=best.points[:-2],
-        bounds=best.points[-2:],
-        poses=best.poses,
-        residuals=tuple(residuals),
-        inliers=_inliers(prior, views, minimum),
-        covariance=moments.covariance,
-        points_covariance=moments.of_points[:-2],
-        points_cam_covariance=moments.of_seen[:-2],
-        stretch=stretch_of(best.lengths, prior.lengths),
-        component=minimum.component,
-        model=model,
-        alternatives=alternatives,
+    statistics = Stated(
+        covariances[0],
+        best.covariance,
+        moments.of_points[:-2],
+        moments.of_seen[:-2],
         warnings=(
             *warnings_of(
                 minimum.evidence, minimum.state, minimum.cost, best.poses, moments.covariance
             ),
             *another_pose(best.poses[0], alternatives),
         ),
-        stats=stats,
         evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
-        rig_from_model=_in_rig(views, minimum, best),
-        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
-        equal_under_symmetry=equal_text(best.poses[0], symmetry, held=(x, y, z)),
-        cameras=tuple(view.camera for view in views),
-        observed=tuple(cast(FloatArray, view.points_2d) for view in views),
         degrees_of_freedom=prior.degrees_of_freedom,
+        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
+    )
+    of_views: list[ViewResult] = []
+    kept = zip(views, best.poses, covariances, _inliers(prior, views, minimum), strict=True)
+    for view, pose, covariance, inliers in kept:
+        rows = prior.rows_of(view.keypoint_ids, "ids")
+        observed = cast(FloatArray, view.points_2d)
+        residuals = view.camera.project(pose.apply(best.points[rows])) - observed
+        stated = Stated(covariance) if of_views else statistics
+        of_views.append(
+            ViewResult(view.camera, pose, view.keypoint_ids, observed, residuals, inliers, stated)
+        )
+    known_axis = getattr(model, "known_axis", None)
+    return Result(
+        views=tuple(of_views),
+        ids=prior.ids,
+        points_3d=best.points[:-2],
+        method="align",
+        statistics=statistics,
+        known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
+        stretched_axes=stretched_axes(held),
+        cost=minimum.cost,
+        alternatives=alternatives,
+        stats=stats,
+        symmetry=symmetry,
+        model=model,
+        component=minimum.component,
+        rig_from_model=_in_rig(views, minimum, best),
+        own_bounds=best.points[-2:],
+        own_stretch=stretch_of(best.lengths, prior.lengths),
     )
 
 
@@ -152,13 +167,17 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
     found = joint_covariance(minimum.evidence, minimum.state)
-    unknowns = pose_and_border(found, int(minimum.evidence.rig.pose[0]))
     return Estimate(
         stretched / scale,
         scale,
         _poses(minimum, scale),
         stretched[-1] - stretched[-2],
-        pose_and_lengths(minimum.evidence, minimum.state, unknowns),
+        tuple(
+            pose_and_lengths(
+                minimum.evidence, minimum.state, pose_and_border(found, int(pose)), view
+            )
+            for view, pose in enumerate(minimum.evidence.rig.pose)
+        ),
         found.points[rows],
         found.seen[rows],
         likelihood,

@@ -1,20 +1,24 @@
-"""The JSON form of a fit's result, as `fit.json` holds it."""
+"""The JSON form of a result, as `fit.json` holds it; `older_documents` reads that of 0.1.0."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from cadalign.arrays import as_floats
+from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pixel_information
-from cadalign.estimation.result import Alternative, FitResult, FitStats
+from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
+from cadalign.estimation.uncertainty.misfit import Misfit
+from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.uncertainty.summary import EvidenceSummary
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -28,16 +32,21 @@ from cadalign.io.documents import (
     within,
 )
 
+VERSION = 2
+Matrix = list[list[Finite]]
 _BEHIND = (math.inf, math.inf)
+_UNKNOWN = (math.nan, math.nan)
 
 
 class _Alternative(ForeignDocument):
     alignment: Any  # in the form of `Alignment.from_dict`
     relative_likelihood: NotNegative
     camera: Any  # in the form of `Camera.from_dict`
+    points_3d: list[Point3]
+    bounds: Matrix | None = None
 
 
-class _Options(ForeignDocument):
+class ReadOptions(ForeignDocument):
     """The fields of `FitOptions`."""
 
     method: str
@@ -51,39 +60,181 @@ class _Options(ForeignDocument):
     focal_prior: FocalPrior | None
 
 
-class _Result(ForeignDocument):
-    """The fields of `FitResult`; ``rms``, ``std``, ``misfit`` and ``warnings`` follow from them."""
-
-    alignment: Any
+class _View(ForeignDocument):
     camera: Any
-    points_3d: list[Point3]
+    alignment: Any
+    ids: list[int | str]
+    points_2d: list[tuple[Finite, Finite] | None]
     residuals: list[tuple[float, float] | None]
     inliers: list[bool]
-    method: str
-    sigma: NotNegative | None
-    covariance: list[list[Finite]] | None
-    known_axis: Literal["x", "y", "z"]
-    stretched_axes: str
-    focal: Literal["known", "estimate"]
-    focal_prior: FocalPrior | None
-    alternatives: list[_Alternative]
-    stats: FitStats
-    options: _Options | None = None  # not in files of earlier versions
-    symmetry: Any = None  # in the form of `Symmetry.from_dict`
+    covariance: Matrix | None
 
     def __post_init__(self) -> None:
-        for name in ("residuals", "inliers"):
-            count = len(getattr(self, name))
-            if count != len(self.points_3d):
-                what = f"{count} entries, but points_3d has {len(self.points_3d)}"
-                raise InputError(what, where=name)
-        for row, (residual, kept) in enumerate(zip(self.residuals, self.inliers, strict=True)):
-            if kept and not (residual and math.isfinite(sum(residual))):
-                raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
+        check_view(self.residuals, self.inliers, {"ids": self.ids, "points_2d": self.points_2d})
 
 
-def read_result(data: Mapping[str, Any]) -> FitResult:
-    """Read the parsed form of a result; see `FitResult.to_dict`.
+class ReadSummary(ForeignDocument):
+    """The fields of `EvidenceSummary`."""
+
+    kind: str
+    view: int | None
+    count: int
+    rms_sigmas: NotNegative
+    rms: NotNegative
+    unit: str
+
+
+class _Outlier(ForeignDocument):
+    row: int
+    distance_px: NotNegative
+
+
+class _Misfit(ForeignDocument):
+    chi_square: float
+    redundancy: int
+    free_scale: Point3 | None
+    outliers: list[_Outlier]
+
+
+class _Result(ForeignDocument):
+    """The fields of `cadalign.Result`; ``rms``, ``std`` and ``box`` follow from them."""
+
+    version: Literal[2]
+    method: str
+    ids: list[int | str]
+    points_3d: list[Point3]
+    views: list[_View]
+    fisher_covariance: Matrix | None
+    known_axis: Literal["x", "y", "z"] | None
+    stretched_axes: str
+    focal: Literal["known", "estimate"]
+    stats: FitStats
+    warnings: list[str]
+    bounds: Matrix | None = None
+    stretch: Point3 | None = None
+    points_covariance: list[Matrix] | None = None
+    points_cam_covariance: list[Matrix] | None = None
+    degrees_of_freedom: Positive | None = None
+    component: int = 0
+    sigma: NotNegative | None = None
+    cost: float | None = None
+    alternatives: tuple[_Alternative, ...] = ()
+    evidence: tuple[ReadSummary, ...] = ()
+    misfit: _Misfit | None = None
+    options: ReadOptions | None = None
+    focal_prior: FocalPrior | None = None
+    symmetry: Any = None  # in the form of `Symmetry.from_dict`
+    equal_under_symmetry: str = ""
+    rig_from_model: Any = None
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise InputError("there are none", where="views")
+        for name in ("ids", "points_covariance", "points_cam_covariance"):
+            check_count(getattr(self, name), name, self.points_3d)
+
+
+def check_count(entries: Sequence[object] | None, name: str, points: Sequence[object]) -> None:
+    """Refuse a field that has not an entry for each keypoint."""
+    if entries is not None and len(entries) != len(points):
+        what = f"{len(entries)} entries, but points_3d has {len(points)}"
+        raise InputError(what, where=name)
+
+
+def check_view(
+    residuals: Sequence[tuple[float, float] | None],
+    inliers: Sequence[bool],
+    others: Mapping[str, Sequence[object]],
+) -> None:
+    """Refuse fields of a view of different lengths, and inliers behind the camera."""
+    for name, entries in {"inliers": inliers, **others}.items():
+        if len(entries) != len(residuals):
+            what = f"{len(entries)} entries for {len(residuals)} residuals"
+            raise InputError(what, where=name)
+    for row, (residual, kept) in enumerate(zip(residuals, inliers, strict=True)):
+        if kept and not (residual and math.isfinite(sum(residual))):
+            raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
+
+
+def write_result(result: Result) -> dict[str, Any]:
+    """A result as plain lists and numbers; its model is not part of it."""
+    std, misfit, statistics = result.std, result.misfit, result.statistics
+    return {
+        "version": VERSION,
+        "method": result.method,
+        "alignment": result.alignment.to_dict(),
+        "camera": result.camera.to_dict(),
+        "rms": result.rms,
+        "stretch": result.stretch.tolist(),
+        "std": None if std is None else asdict(std),
+        "warnings": list(result.warnings),
+        "ids": list(result.ids),
+        "points_3d": result.points_3d.tolist(),
+        "bounds": _plain(result.own_bounds),
+        "views": [_written_view(view) for view in result.views],
+        "covariance": _plain(result.covariance),
+        "fisher_covariance": _plain(result.fisher_covariance),
+        "points_covariance": _plain(statistics.points_covariance),
+        "points_cam_covariance": _plain(statistics.points_cam_covariance),
+        "degrees_of_freedom": result.degrees_of_freedom,
+        "component": result.component,
+        "sigma": result.sigma,
+        "cost": result.cost,
+        "known_axis": result.known_axis,
+        "stretched_axes": result.stretched_axes,
+        "focal": result.focal,
+        "focal_prior": None if result.focal_prior is None else asdict(result.focal_prior),
+        "alternatives": [
+            {
+                "alignment": other.alignment.to_dict(),
+                "relative_likelihood": other.relative_likelihood,
+                "camera": other.camera.to_dict(),
+                "points_3d": other.points_3d.tolist(),
+                "bounds": _plain(other.own_bounds),
+            }
+            for other in result.alternatives
+        ],
+        "evidence": [asdict(summary) for summary in result.evidence],
+        "misfit": None if misfit is None else misfit.to_dict(),
+        "options": None if result.options is None else _plain_options(result.options),
+        "symmetry": None if result.symmetry is None else result.symmetry.to_dict(),
+        "equal_under_symmetry": result.equal_under_symmetry,
+        "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
+        "stats": asdict(result.stats),
+    }
+
+
+def _written_view(view: ViewResult) -> dict[str, Any]:
+    return {
+        "camera": view.camera.to_dict(),
+        "alignment": view.alignment.to_dict(),
+        "ids": list(view.ids),
+        "points_2d": _finite_rows(view.points_2d),
+        "residuals": _finite_rows(view.residuals),
+        "inliers": view.inliers.tolist(),
+        "covariance": _plain(view.covariance),
+    }
+
+
+def _finite_rows(rows: FloatArray) -> list[list[float] | None]:
+    return [row if math.isfinite(row[0] + row[1]) else None for row in rows.tolist()]
+
+
+def _plain(array: FloatArray | None) -> Any:
+    return None if array is None else array.tolist()
+
+
+def _plain_options(options: FitOptions) -> dict[str, Any]:
+    return {**asdict(replace(options, sigma=None)), "sigma": plain_sigma(options.sigma)}
+
+
+def plain_sigma(sigma: Any) -> Any:
+    """A deviation, one for each keypoint, or covariances, as numbers and lists."""
+    return sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
+
+
+def read_result(data: Mapping[str, Any]) -> Result:
+    """Read the parsed form of a result; see `cadalign.Result.from_dict`.
 
     Raises
     ------
@@ -92,42 +243,97 @@ def read_result(data: Mapping[str, Any]) -> FitResult:
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
+            if isinstance(data, Mapping) and "version" not in data:
+                from cadalign.estimation.older_documents import read_older
+
+                return read_older(data)
             return _result(convert(data, _Result))
     except CadalignError as error:
-        place = f"fit result: {error.where}" if error.where else "fit result"
+        place = f"result: {error.where}" if error.where else "result"
         raise InputError(error.what, where=place, fix=error.fix) from None
 
 
-def _result(read: _Result) -> FitResult:
-    unknowns = 8 if read.focal == "known" else 9
-    covariance = None
-    if read.covariance is not None:
-        shape = (unknowns, unknowns)
-        covariance = as_floats(read.covariance, name="covariance", shape=shape)
-    return FitResult(
-        alignment=Alignment.from_dict(read.alignment),
+def _result(read: _Result) -> Result:
+    unknowns = 10 if read.focal == "estimate" else 9
+    views = []
+    for row, view in enumerate(read.views):
+        with within(f"views[{row}]"):
+            views.append(_view(view, unknowns))
+    statistics = Stated(
+        views[0].covariance,
+        fisher_covariance=read_array(read.fisher_covariance, "fisher_covariance", unknowns),
+        points_covariance=read_points(read.points_covariance, "points_covariance"),
+        points_cam_covariance=read_points(read.points_cam_covariance, "points_cam_covariance"),
+        warnings=tuple(read.warnings),
+        misfit=None if read.misfit is None else _misfit(read.misfit),
+        evidence=tuple(summary_of(each) for each in read.evidence),
+        degrees_of_freedom=read.degrees_of_freedom,
+    )
+    views[0] = replace(views[0], statistics=statistics)
+    count = len(views[0].residuals)
+    return Result(
+        views=tuple(views),
+        ids=tuple(read.ids),
         points_3d=np.array(read.points_3d).reshape(-1, 3),
-        residuals=np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
-        inliers=np.array(read.inliers, dtype=bool),
         method=read.method,
-        camera=Camera.from_dict(read.camera),
-        sigma=read.sigma,
-        covariance=covariance,
+        statistics=statistics,
         known_axis=read.known_axis,
         stretched_axes=read.stretched_axes,
         focal=read.focal,
         focal_prior=read.focal_prior,
+        sigma=read.sigma,
+        cost=read.cost,
         alternatives=tuple(
             _alternative(entry, f"alternatives[{row}]")
             for row, entry in enumerate(read.alternatives)
         ),
         stats=read.stats,
-        options=None if read.options is None else _options(read.options, len(read.points_3d)),
+        options=None if read.options is None else read_options(read.options, count),
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
+        component=read.component,
+        rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
+        own_bounds=read_bounds(read.bounds),
+        own_stretch=None if read.stretch is None else np.array(read.stretch),
+        own_equal=read.equal_under_symmetry,
     )
 
 
-def _options(read: _Options, count: int) -> FitOptions:
+def _view(read: _View, unknowns: int) -> ViewResult:
+    return ViewResult(
+        Camera.from_dict(read.camera),
+        Alignment.from_dict(read.alignment),
+        tuple(read.ids),
+        np.array([row or _UNKNOWN for row in read.points_2d]).reshape(-1, 2),
+        read_residuals(read.residuals),
+        np.array(read.inliers, dtype=bool),
+        Stated(read_array(read.covariance, "covariance", unknowns)),
+    )
+
+
+def read_residuals(rows: Sequence[tuple[float, float] | None]) -> FloatArray:
+    """Residuals (n, 2) [px]; infinite behind the camera."""
+    return np.array([row or _BEHIND for row in rows]).reshape(-1, 2)
+
+
+def read_array(value: Matrix | None, name: str, size: int) -> FloatArray | None:
+    """A covariance (size, size), if there is one."""
+    return None if value is None else as_floats(value, name=name, shape=(size, size))
+
+
+def read_bounds(value: Matrix | None) -> FloatArray | None:
+    """A box (2, 3), if there is one."""
+    return None if value is None else as_floats(value, name="bounds", shape=(2, 3))
+
+
+def read_points(value: list[Matrix] | None, name: str) -> FloatArray | None:
+    """Covariances (m, 3, 3) of keypoints, if there are any."""
+    if value is None or not value:
+        return None if value is None else np.empty((0, 3, 3))
+    return as_floats(value, name=name, shape=(None, 3, 3))
+
+
+def read_options(read: ReadOptions, count: int) -> FitOptions:
+    """The options of a fit of so many keypoints."""
     with within("options"):
         sigma: Any = read.sigma
         if isinstance(sigma, list):
@@ -141,10 +347,22 @@ def _options(read: _Options, count: int) -> FitOptions:
         return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
 
 
+def summary_of(read: ReadSummary) -> EvidenceSummary:
+    """The summary of a piece of evidence."""
+    return EvidenceSummary(**msgspec.structs.asdict(read))
+
+
+def _misfit(read: _Misfit) -> Misfit:
+    outliers = {each.row: each.distance_px for each in read.outliers}
+    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers)
+
+
 def _alternative(entry: _Alternative, where: str) -> Alternative:
     with within(where):
         return Alternative(
             Alignment.from_dict(entry.alignment),
             entry.relative_likelihood,
             Camera.from_dict(entry.camera),
+            np.array(entry.points_3d).reshape(-1, 3),
+            read_bounds(entry.bounds),
         )

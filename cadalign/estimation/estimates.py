@@ -8,12 +8,13 @@ of the shape becomes that of the keypoint, shifted by the margin.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.symmetry import SAME_SQUARES, is_same, step_to, without_free_turns
+from cadalign.estimation.symmetry import SAME_SQUARES, carried, is_same, without_free_turns
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, group_of
@@ -29,16 +30,24 @@ _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes ax
 
 
 class Estimate(NamedTuple):
-    """An estimate: points, the box's corners last, ``lengths`` of the box, covariances."""
+    """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
+
+    Poses and covariances (9, 9) are those in every view.
+    """
 
     points: FloatArray
     scale: FloatArray
     poses: tuple[Alignment, ...]
     lengths: FloatArray
-    covariance: FloatArray
+    covariances: tuple[FloatArray, ...]
     of_points: FloatArray
     of_seen: FloatArray
     likelihood: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """In the first view."""
+        return self.covariances[0]
 
 
 def stretch_of(lengths: FloatArray, of_mean: FloatArray) -> FloatArray:
@@ -47,10 +56,10 @@ def stretch_of(lengths: FloatArray, of_mean: FloatArray) -> FloatArray:
     return np.where(has_length, lengths / np.where(has_length, of_mean, 1.0), 1.0)
 
 
-def moments_of_estimates(estimates: Sequence[Estimate]) -> Moments:
-    """Second moments of estimates about the first."""
+def moments_of_estimates(estimates: Sequence[Estimate], view: int = 0) -> Moments:
+    """Second moments of estimates about the first, in a view's camera; of points in the first."""
     poses = [
-        np.concatenate([each.poses[0].rotation.ravel(), each.poses[0].translation])
+        np.concatenate([each.poses[view].rotation.ravel(), each.poses[view].translation])
         for each in estimates
     ]
     return moments_of(
@@ -58,7 +67,7 @@ def moments_of_estimates(estimates: Sequence[Estimate]) -> Moments:
             np.array(poses),
             np.array([each.points * each.scale for each in estimates]),
             np.array([each.lengths for each in estimates]),
-            np.array([each.covariance for each in estimates]),
+            np.array([each.covariances[view] for each in estimates]),
             np.array([each.of_points for each in estimates]),
             np.array([each.of_seen for each in estimates]),
             np.array([each.likelihood for each in estimates]),
@@ -92,25 +101,23 @@ def one_of_equals(
 
 def canonical(estimate: Estimate, symmetry: Symmetry, held: Held) -> Estimate:
     """The canonical one of all equal estimates, without deviations that mean nothing."""
-    given = estimate.poses[0]
-    best = group_of(symmetry).canonical(given, held=held)
+    best = group_of(symmetry).canonical(estimate.poses[0], held=held)
     turn = best.motion[:3, :3]
-    covariance = without_free_turns(_carried(estimate.covariance, given, best), best)
+    poses = (best.alignment, *(_turned(pose, best) for pose in estimate.poses[1:]))
+    covariances = []
+    for given, pose, covariance in zip(estimate.poses, poses, estimate.covariances, strict=True):
+        equal = replace(best, alignment=pose)
+        covariances.append(without_free_turns(carried(covariance, given, equal), equal))
     points = best.relabelled(estimate.points)
     points[-2:] = _turned_box(estimate.points[-2:], best)
     return estimate._replace(
         points=points,
         scale=best.alignment.scale,
-        poses=(best.alignment, *(_turned(pose, best) for pose in estimate.poses[1:])),
+        poses=poses,
         lengths=(points[-1] - points[-2]) * best.alignment.scale,
-        covariance=covariance,
+        covariances=tuple(covariances),
         of_points=turn.T @ estimate.of_points @ turn,
     )
-
-
-def _carried(covariance: FloatArray, given: Alignment, best: Equal) -> FloatArray:
-    step = step_to(best, given)
-    return np.asarray(step @ covariance @ step.T)
 
 
 def _turned(pose: Alignment, best: Equal) -> Alignment:

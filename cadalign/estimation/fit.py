@@ -15,14 +15,14 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.batch import BatchResult
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.keypoint_result import result_of_solution, with_keypoints
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
-from cadalign.estimation.result import FitResult, FitStats
-from cadalign.estimation.solve import alternatives_of, camera_of, solve
-from cadalign.estimation.symmetry import canonical_batch, canonical_fit, checked_symmetry
-from cadalign.geometry.alignment import Alignment
+from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results, SolvedTable
+from cadalign.estimation.solve import solve
+from cadalign.estimation.symmetry import canonical_result, checked_symmetry
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
@@ -47,7 +47,7 @@ def fit(
     ransac: RansacOptions | None = None,
     confidences: npt.ArrayLike | None = None,
     symmetry: Symmetry | None = None,
-) -> FitResult:
+) -> Result:
     """Estimate rotation, translation and stretch of a model from its keypoints in one image.
 
     Parameters
@@ -102,7 +102,7 @@ def fit(
 
     Returns
     -------
-    FitResult
+    Result
 
     Raises
     ------
@@ -147,7 +147,7 @@ def fit(
         result = _fit_all(problems, options, start)
     else:
         result = _fit_robustly(problems, options, ransac, confidences, start)
-    return result if symmetry is None else canonical_fit(result, symmetry).result
+    return result if symmetry is None else canonical_result(result, symmetry)
 
 
 @np.errstate(all="ignore")
@@ -169,7 +169,7 @@ def fit_batch(
     confidences: Sequence[npt.ArrayLike] | None = None,
     symmetry: Symmetry | None = None,
     workers: int = 1,
-) -> BatchResult:
+) -> Results:
     """Solve many independent problems in one call; each as `fit` does, bit for bit.
 
     Parameters
@@ -193,9 +193,9 @@ def fit_batch(
 
     Returns
     -------
-    BatchResult
-        Arrays over the problems; a problem without solution has its error there, and does not stop
-        the others.
+    Results
+        Arrays over the problems, and a sequence of their `Result`; a problem without solution has
+        its error there, and does not stop the others.
 
     Raises
     ------
@@ -238,23 +238,26 @@ def fit_batch(
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
     @np.errstate(all="ignore")  # holds for one thread only
-    def run(part: tuple[int, int]) -> BatchResult:
+    def run(part: tuple[int, int]) -> Results:
         some = problems.part(*part)
         own = None if sigmas is None else sigmas[part[0] : part[1]]
         if ransac is None and not options.estimates_in_rounds:
-            return BatchResult.of_solutions(some, solve(some, options, own))
+            start = time.perf_counter()
+            solutions = solve(some, options, own)
+            seconds = (time.perf_counter() - start) / max(len(some), 1)
+            return SolvedTable(some, solutions, options, own, symmetry, seconds).results
         trusted = None if confidences is None else confidences[part[0] : part[1]]
-        fits = _fits(some, options, ransac, own, trusted)
-        return BatchResult.of_fits(some, fits, focal=options.focal)
+        fits = _fits(some, options, ransac, own, trusted, symmetry)
+        return Results.of(
+            fits, counts=some.counts, unknowns=10 if options.focal == "estimate" else 9
+        )
 
     if len(parts) < 2:
-        batch = run((0, len(problems)))
-    else:
-        from concurrent.futures import ThreadPoolExecutor
+        return run((0, len(problems)))
+    from concurrent.futures import ThreadPoolExecutor
 
-        with ThreadPoolExecutor(len(parts)) as pool:
-            batch = BatchResult.joined(list(pool.map(run, parts)))
-    return batch if symmetry is None else canonical_batch(batch, symmetry, options)
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return Results.joined(list(pool.map(run, parts)))
 
 
 def _copied(sigma: Any) -> Any:
@@ -283,9 +286,10 @@ def _fits(
     ransac: RansacOptions | None,
     sigmas: Sequence[Sigma] | None,
     confidences: Sequence[npt.ArrayLike] | None,
-) -> list[FitResult | CadalignError]:
+    symmetry: Symmetry | None,
+) -> list[Result | CadalignError]:
     """Fits of all problems, one by one; an error takes the place of a result."""
-    fits: list[FitResult | CadalignError] = []
+    fits: list[Result | CadalignError] = []
     for b in range(len(problems)):
         own = options if sigmas is None else replace(options, sigma=sigmas[b])
         trusted = None if confidences is None else confidences[b]
@@ -293,9 +297,10 @@ def _fits(
         one = problems.part(b, b + 1)
         try:
             if ransac is None:
-                fits.append(_fit_all(one, own, start))
+                result = _fit_all(one, own, start)
             else:
-                fits.append(_fit_robustly(one, own, ransac, trusted, start))
+                result = _fit_robustly(one, own, ransac, trusted, start)
+            fits.append(result if symmetry is None else canonical_result(result, symmetry))
         except CadalignError as error:
             fits.append(error)
     return fits
@@ -307,7 +312,7 @@ def _fit_robustly(
     ransac: RansacOptions,
     confidences: npt.ArrayLike | None,
     start: float,
-) -> FitResult:
+) -> Result:
     """Fit the only problem to the keypoints that support its best alignment."""
     # Only here: most programs never search for outliers, and its kernels take time to import.
     from cadalign.estimation.robust import find_consensus, residuals_of
@@ -322,9 +327,7 @@ def _fit_robustly(
     consensus = find_consensus(problems, options, ransac, confidences)
     if not ransac.refine:
         return replace(
-            consensus,
-            points_3d=problems.points_3d.copy(),
-            stats=replace(consensus.stats, seconds=time.perf_counter() - start),
+            consensus, stats=replace(consensus.stats, seconds=time.perf_counter() - start)
         )
     inliers = consensus.inliers
     result = _fit_inliers(problems, options, inliers, start)
@@ -335,24 +338,15 @@ def _fit_robustly(
             break
         inliers = kept
         result = _fit_inliers(problems, options, inliers, start)
-    return replace(
-        result,
-        points_3d=problems.points_3d.copy(),
-        residuals=residuals_of(problems, result.alignment, result.camera),
-        inliers=inliers,
-        options=options,
-        method="ransac-optimal",
-        stats=replace(
-            consensus.stats,
-            seconds=time.perf_counter() - start,
-            inlier_ratio=float(inliers.mean()),
-        ),
-    )
+    residuals = residuals_of(problems, result.alignment, result.camera)
+    seconds, ratio = time.perf_counter() - start, float(inliers.mean())
+    stats = replace(consensus.stats, seconds=seconds, inlier_ratio=ratio)
+    return with_keypoints(result, problems, options, residuals, inliers, stats)
 
 
 def _fit_inliers(
     problems: Problems, options: FitOptions, inliers: BoolArray, start: float
-) -> FitResult:
+) -> Result:
     """The optimum for some of the only problem's keypoints."""
     sigma = options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
@@ -371,34 +365,9 @@ def _fit_inliers(
 _checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
 
 
-def _fit_all(problems: Problems, options: FitOptions, start: float) -> FitResult:
+def _fit_all(problems: Problems, options: FitOptions, start: float) -> Result:
     """Fit the only problem to all its keypoints."""
     solutions = solve(problems, options)
     if solutions.errors:
         raise solutions.errors[0]
-    alignment = Alignment.from_packed(solutions.poses[0, 0])
-    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    sigma = None
-    if solutions.sigmas is not None:
-        sigma = float(solutions.sigmas[0])
-    elif options.method == "optimal" and isinstance(options.sigma, int | float):
-        sigma = float(options.sigma)
-    inliers = np.empty(len(problems.points_3d), dtype=bool)
-    inliers.fill(True)
-    return FitResult(
-        alignment=alignment,
-        points_3d=problems.points_3d.copy(),  # the caller may go on to change theirs
-        residuals=solutions.residuals,
-        inliers=inliers,
-        method=options.method,
-        camera=camera_of(problems, solutions, 0),
-        sigma=sigma,
-        covariance=None if solutions.covariances is None else solutions.covariances[0],
-        known_axis=options.known_axis,
-        stretched_axes=options.stretched_axes,
-        focal=options.focal,
-        focal_prior=options.focal_prior,
-        alternatives=alternatives_of(problems, solutions, minima, options) if minima > 1 else (),
-        stats=FitStats(iterations, hypotheses, time.perf_counter() - start),
-        options=options,
-    )
+    return result_of_solution(problems, solutions, options, time.perf_counter() - start)

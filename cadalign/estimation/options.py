@@ -178,10 +178,9 @@ class FitOptions(AlignmentOptions):
 
         Scales come in cyclic order from the known axis, so that names of axes change no result.
         """
-        scales = "xyz".replace(self.known_axis, "")
-        cyclic = ["xyz"[axis] for axis in self.axis_order[1:]]
-        stretched = [6 + scales.index(axis) for axis in cyclic if axis in self.stretched_axes]
-        return np.array([*range(6), *stretched, *[8][: self.focal == "estimate"]])
+        cyclic = self.axis_order[1:]
+        stretched = [6 + axis for axis in cyclic if "xyz"[axis] in self.stretched_axes]
+        return np.array([*range(6), *stretched, *[9][: self.focal == "estimate"]])
 
     @property
     def min_points(self) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -298,3 +298,29 @@ class Solutions(NamedTuple):
     sigmas: FloatArray | None = None
     residuals: FloatArray = _NO_RESIDUALS
     errors: Mapping[int, CadalignError] = _NO_ERRORS
+
+
+def full_covariances(of_solver: FloatArray, known_axis: str) -> FloatArray:
+    """Covariances (B, 9, 9) or (B, 10, 10) of results from solvers' (8, 8) or (9, 9).
+
+    Solvers leave out the scale that is known, whose rows are zero in a result.
+    """
+    count, size = len(of_solver), of_solver.shape[-1] + 1
+    full = np.zeros((count, size * size))
+    full[:, _places(size, known_axis)] = of_solver.reshape(count, (size - 1) ** 2)
+    return full.reshape(count, size, size)
+
+
+def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
+    """The covariance of one result; takes less time than `full_covariances` of one."""
+    size = len(of_solver) + 1
+    full = np.zeros(size * size)
+    full[_places(size, known_axis)] = of_solver.ravel()
+    return full.reshape(size, size)
+
+
+@lru_cache(maxsize=6)
+def _places(size: int, known_axis: str) -> IntArray:
+    """Entries of a flattened covariance that belong to unknowns of the solvers."""
+    rows = np.delete(np.arange(size), 6 + "xyz".index(known_axis))
+    return (size * rows[:, None] + rows).ravel()

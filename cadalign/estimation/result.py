@@ -1,59 +1,86 @@
-"""The result of a fit."""
+"""The result of every estimate: alignment, residuals of every view, uncertainty, alternatives."""
 
 from __future__ import annotations
 
 import json
-import math
 import os
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior, focal_doubt
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.symmetry import equal_text, held_axes, without_free_turns
-from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of, warnings_of
+from cadalign.estimation.symmetry import equal_text, held_axes
+from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
+from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from cadalign.estimation.model import Model
     from cadalign.estimation.uncertainty.misfit import Misfit
+    from cadalign.estimation.uncertainty.summary import (
+        Contribution,
+        EvidenceSummary,
+        MaskResiduals,
+    )
     from cadalign.export import ExportOptions
     from cadalign.geometry.mesh import Mesh
+    from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import NearestShape
+
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another alignment that the keypoints cannot tell from the best one.
+    """Another estimate that the evidence cannot tell from the best one.
 
     Parameters
     ----------
     alignment : Alignment
+        In the first view's camera.
     relative_likelihood : float
-        Its likelihood over that of the best alignment, 1 for an equally good one.
+        Its likelihood over that of the best one, 1 for an equally good one.
     camera : Camera
-        The camera that goes with it; the best alignment's, unless the focal length was estimated.
+        The camera that goes with it; the best one's, unless the focal length was estimated.
+    points_3d : (m, 3) float
+        Its keypoints in the model's frame.
+    own_bounds : (2, 3) float, optional
+        Its box in the model's frame; None for that of the keypoints.
     """
 
     alignment: Alignment
     relative_likelihood: float
     camera: Camera
+    points_3d: FloatArray
+    own_bounds: FloatArray | None = field(default=None, repr=False)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Its box (2, 3) in the model's frame."""
+        return _extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def box(self) -> Box:
+        """Its box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
 
 
 @dataclass(frozen=True)
 class FitStats:
-    """Effort of a fit.
+    """Effort of an estimate.
 
     Parameters
     ----------
@@ -76,204 +103,407 @@ class FitStats:
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult:
-    """An alignment with its residuals and its uncertainty.
+class ViewResult:
+    """Estimate of one view.
 
     Parameters
     ----------
+    camera : Camera
+        Its camera; with the estimated focal length, where that was unknown.
     alignment : Alignment
-        Pose and stretch.
-    points_3d : (n, 3) float
-        The model's keypoints, as given; with a symmetry, turned by the one that leads to this
-        alignment.
+        Pose in that camera, and scale.
+    ids : sequence of int or str
+        Ids of its keypoints.
+    points_2d : (n, 2) float
+        Observed keypoints [px].
     residuals : (n, 2) float
-        Projected minus observed keypoint [px]; infinite, and null in JSON, for one that was
+        Projected minus observed keypoints [px]; infinite, and null in JSON, for one that was
         rejected and lies behind the camera.
     inliers : (n,) bool
-        The keypoints that the alignment was fitted to.
-    method : str
-        The method that found it.
-    camera : Camera
-        The camera it was fitted with; with the estimated focal length, where that was unknown.
-    sigma : float, optional
-        Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
-        its own.
-    covariance : (8, 8) or (9, 9) float, optional
-        Of the rotation vector in the camera frame [rad], the translation [model units], the
-        logarithms of the two unknown scales, in the order of the axes, and, where it was
-        estimated, the logarithm of the focal length; zero for what was held fixed. The inverse of
-        the Fisher information at the optimum, which is the Cramer-Rao bound there: with few
-        keypoints errors are larger, see `posterior_covariance`. None for the methods that are not
-        statistical.
-    known_axis : {"x", "y", "z"}
-        The model's axis whose scale was taken as 1.
-    stretched_axes : str
-        The axes whose scale was estimated.
-    focal : {"known", "estimate"}
-        The camera's focal length was taken as right, or estimated.
-    focal_prior : FocalPrior, optional
-        Prior on the estimated focal length.
-    alternatives : tuple of Alternative
-        Other alignments that explain the keypoints as well: with 4 points all other exact
-        solutions, otherwise minima whose likelihood is at least 1/1000 of the best one's.
-    stats : FitStats
-    options : FitOptions, optional
-        Those of the fit; None in files of earlier versions.
-    symmetry : Symmetry, optional
-        The model's, as given: of all equal alignments this is the canonical one.
+        The keypoints that the estimate rests on.
+    statistics : Statistics
+        States the ``covariance``.
     """
 
-    alignment: Alignment
-    points_3d: FloatArray
-    residuals: FloatArray
-    inliers: npt.NDArray[np.bool_]
-    method: str
     camera: Camera
-    sigma: float | None
-    covariance: FloatArray | None
-    known_axis: str
-    stretched_axes: str
-    focal: str
-    focal_prior: FocalPrior | None
-    alternatives: tuple[Alternative, ...] = ()
-    stats: FitStats = FitStats(0, 0, 0.0)
-    options: FitOptions | None = None
-    symmetry: Symmetry | None = None
+    alignment: Alignment
+    ids: Sequence[Hashable]
+    points_2d: FloatArray
+    residuals: FloatArray
+    inliers: BoolArray
+    statistics: Statistics = field(repr=False)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance in this camera's frame; see `Result.covariance`."""
+        return self.statistics.covariance
+
+    @property
+    def std(self) -> Uncertainty | None:
+        """Standard deviations from ``covariance``; None for methods that have none."""
+        return None if self.covariance is None else uncertainty_of(self.covariance)
 
     @property
     def rms(self) -> float:
         """Root mean square length of the inliers' residuals [px]."""
-        kept = self.residuals[self.inliers]
-        return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
+        return rms_of(self.residuals, self.inliers)
 
-    @cached_property
-    def posterior_covariance(self) -> FloatArray | None:
-        """Covariance of the errors, calibrated for few keypoints, in the form of `covariance`.
 
-        The second moments of the posterior about the alignment, from some thousand draws (always
-        the same), scaled such that the 95 % ellipsoid holds what the likelihood ratio does not
-        reject at 5 %. Where sigma was estimated, it is widened for the few degrees of freedom of
-        that estimate. It does not reach to the ``alternatives``. Beyond 100 keypoints it is
-        ``covariance`` but for that widening; for results without ``options`` it is ``covariance``.
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Pose, stretch and shape of an object, with their uncertainty.
+
+    What `cadalign.fit`, `cadalign.align`, batches, retrieval and the annotator return.
+
+    Parameters
+    ----------
+    views : tuple of ViewResult
+        Camera, pose, residuals and inliers of every view.
+    ids : tuple of int or str
+        Ids or names of the m keypoints; of `cadalign.fit`, their rows.
+    points_3d : (m, 3) float
+        All keypoints of the model as they are on the object, also those that no view shows, in the
+        model's frame and before its stretch: of an exact model, as given; with a symmetry, turned
+        by the one that leads to this alignment.
+    method : str
+        The method that found it: that of `cadalign.fit`, "align" where all evidence was estimated
+        together.
+    statistics : Statistics
+        What is stated of the uncertainty.
+    known_axis : {"x", "y", "z"}, optional
+        The model's axis whose scale was taken as 1; None where all of them are estimated, or none.
+    stretched_axes : str
+        The axes whose scale was estimated.
+    focal : {"known", "estimate"}
+        The cameras' focal length was taken as right, or estimated.
+    focal_prior : FocalPrior, optional
+        Prior on the estimated focal length.
+    sigma : float, optional
+        Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
+        its own.
+    cost : float, optional
+        -2 log likelihood of the evidence, with its priors, but for constants: the sum of whitened
+        squares, or of losses. None for methods that are not statistical.
+    alternatives : tuple of Alternative
+        Other estimates that explain the evidence as well: with 4 points all other exact solutions,
+        otherwise minima whose likelihood is at least 1/1000 of the best one's.
+    stats : FitStats
+    options : FitOptions, optional
+        Those of `cadalign.fit`.
+    symmetry : Symmetry, optional
+        The model's, as given: of all equal alignments this is the canonical one.
+    model : Model or ShapeModel, optional
+        The model of `cadalign.align`; None for a result that was read from a file.
+    component : int
+        Number of the mixture's component that the object belongs to.
+    rig_from_model : Alignment, optional
+        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
+    mask_residuals : tuple of MaskResiduals or None
+        Agreement of the contour of every view's mask with the estimate; empty without masks.
+    own_bounds, own_stretch, own_equal : optional
+        ``bounds``, ``stretch`` and ``equal_under_symmetry`` where they do not follow.
+    """
+
+    views: tuple[ViewResult, ...]
+    ids: tuple[Hashable, ...]
+    points_3d: FloatArray
+    method: str
+    statistics: Statistics = field(repr=False)
+    known_axis: str | None = "x"
+    stretched_axes: str = "yz"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
+    sigma: float | None = None
+    cost: float | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stats: FitStats = FitStats(0, 0, 0.0)
+    options: FitOptions | None = None
+    symmetry: Symmetry | None = None
+    model: Model | ShapeModel | None = None
+    component: int = 0
+    rig_from_model: Alignment | None = None
+    mask_residuals: tuple[MaskResiduals | None, ...] = ()
+    own_bounds: FloatArray | None = None
+    own_stretch: FloatArray | None = None
+    own_equal: str | None = None
+
+    @property
+    def alignment(self) -> Alignment:
+        """Pose in the first view's camera, and scale.
+
+        ``alignment.apply(points_3d)`` are the object's keypoints in that camera's frame.
         """
-        if self.covariance is None or self.options is None:
-            return self.covariance
-        from cadalign.estimation.uncertainty.posterior import (
-            posterior_covariance,  # loads the compiler
-        )
+        return self.views[0].alignment
 
-        return posterior_covariance(self, self.options)
+    @property
+    def camera(self) -> Camera:
+        """The first view's camera; with the estimated focal length, where that was unknown."""
+        return self.views[0].camera
+
+    @property
+    def poses(self) -> tuple[Alignment, ...]:
+        """The alignment in every view's camera."""
+        return tuple(view.alignment for view in self.views)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of every view."""
+        return tuple(view.camera for view in self.views)
+
+    @property
+    def observed(self) -> tuple[FloatArray, ...]:
+        """Observed keypoints (n_v, 2) of every view [px]."""
+        return tuple(view.points_2d for view in self.views)
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Projected minus observed keypoints (n, 2) of all views, one after the other [px].
+
+        Infinite for keypoints that were rejected and lie behind the camera.
+        """
+        if len(self.views) == 1:
+            return self.views[0].residuals
+        return np.concatenate([view.residuals for view in self.views])
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Marks the keypoints (n,) of all views that the estimate rests on."""
+        if len(self.views) == 1:
+            return self.views[0].inliers
+        return np.concatenate([view.inliers for view in self.views])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the inliers' residuals [px]."""
+        return rms_of(self.residuals, self.inliers)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance (9, 9) or (10, 10) of the errors, calibrated.
+
+        Of the rotation vector in the first camera's frame [rad], the translation [model units], the
+        logarithms of the object's lengths along x, y, z and, where it was estimated, of the focal
+        length; zero for what is held. None for methods that are not statistical.
+
+        Of the keypoints of an exact model in one view it is the second moments of the posterior
+        about the alignment, from some thousand draws (always the same), scaled such that the 95 %
+        ellipsoid holds what the likelihood ratio does not reject at 5 %. Where sigma was estimated,
+        it is widened for the few degrees of freedom of that estimate. It does not reach to the
+        ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance`` but for that widening.
+
+        Of other evidence it is the inverse information of all evidence and priors, calibrated for
+        learned shapes, and where other estimates are likely too, it holds their distance.
+
+        With a symmetry, rotations about its axes count nothing.
+        """
+        return self.statistics.covariance
+
+    @property
+    def fisher_covariance(self) -> FloatArray | None:
+        """Inverse of the Fisher information at the optimum, in the form of ``covariance``.
+
+        The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
+        not statistical, and where a file does not tell it.
+        """
+        return self.statistics.fisher_covariance
 
     @property
     def std(self) -> Uncertainty | None:
-        """Standard deviations from `posterior_covariance`; None for methods that have none.
+        """Standard deviations from ``covariance``; None for methods that have none."""
+        return None if self.covariance is None else uncertainty_of(self.covariance)
 
-        Without that of rotations about an axis of the model's symmetry.
+    @property
+    def degrees_of_freedom(self) -> float | None:
+        """Of the t distribution of the errors, whose covariance the stated ones are.
+
+        None if they are Gaussian. `radius` depends on it.
         """
-        covariance = self.posterior_covariance
-        if covariance is None:
-            return None
-        if self.symmetry is not None:
-            held = held_axes(self.stretched_axes)
-            best = group_of(self.symmetry).canonical(self.alignment, held=held)
-            covariance = without_free_turns(covariance, best)
-        return uncertainty_of(covariance, self.known_axis)
+        return self.statistics.degrees_of_freedom
 
     @cached_property
+    def _of_points(self) -> tuple[FloatArray, FloatArray] | None:
+        if self.covariance is None:
+            return None
+        return points_covariances(self.points_3d, self.alignment, self.covariance)
+
+    @property
+    def points_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the model's frame, with its stretch."""
+        stated = self.statistics.points_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[0]
+
+    @property
+    def points_cam_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
+        stated = self.statistics.points_cam_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[1]
+
+    @property
     def misfit(self) -> Misfit | None:
         """Result of a chi-square test of residuals that the given sigma does not explain.
 
-        None if they pass (of right data, 99.5 % or more do), for an estimated sigma, for methods
-        that are not statistical, and for results without ``options``.
+        None if they pass (of right data, 99.5 % or more do), for an estimated sigma, and for
+        methods that are not statistical. Of several pieces of evidence, ``warnings`` tell it.
         """
-        if self.covariance is None or self.options is None:
-            return None
-        from cadalign.estimation.uncertainty.misfit import find_misfit
+        return self.statistics.misfit
 
-        return find_misfit(self, self.options)
-
-    @cached_property
+    @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about a misfit, and about what the keypoints do not determine."""
-        std = self.std
-        if std is None:
-            return ()
-        kept = self.points_3d[self.inliers]
-        unknowns = 6 + len(self.stretched_axes) + (self.focal == "estimate")
-        return self._contradictions() + warnings_of(
-            kept,
-            self.alignment,
-            std,
-            redundancy=2 * len(kept) - unknowns,
-            doubt=focal_doubt(self.camera, self.focal_prior) if self.focal == "estimate" else None,
-        )
+        """Warnings about what the evidence leaves undetermined, and what contradicts the rest."""
+        return self.statistics.warnings
 
-    def _contradictions(self) -> tuple[str, ...]:
-        """Warnings about a misfit, or about a constraint that cannot be tested."""
-        if self.misfit is not None:
-            return (str(self.misfit),)
-        if self.options is None:
-            return ()
-        from cadalign.estimation.uncertainty.misfit import unverified_stretch
+    @property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of every piece of evidence with the estimate."""
+        return self.statistics.evidence
 
-        doubt = unverified_stretch(self, self.options)
-        return () if doubt is None else (doubt,)
+    @property
+    def bounds(self) -> FloatArray:
+        """Least and greatest coordinates (2, 3) of the object in the model's frame.
+
+        Those of the keypoints where the model has no others.
+        """
+        return _extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def box(self) -> Box:
+        """The object's box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+    @property
+    def stretch(self) -> FloatArray:
+        """Lengths (3,) of the object over the model's or, for a learned shape, the mean's."""
+        return self.alignment.scale if self.own_stretch is None else self.own_stretch
+
+    @property
+    def equal_under_symmetry(self) -> str:
+        """Clause about the alignments that are equal under the model's symmetry; empty without."""
+        if self.own_equal is not None:
+            return self.own_equal
+        return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
+
+    @property
+    def probability(self) -> float:
+        """Probability of the estimate itself rather than of one of its alternatives."""
+        return 1 / (1 + sum(other.relative_likelihood for other in self.alternatives))
+
+    def radius(self, probability: float, *, dimension: int = 1) -> float:
+        """Radius, in stated deviations, of the region that holds the truth with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        dimension : int
+            Number of coordinates that the region has: 1 for an interval, 3 for a rotation or a
+            keypoint, whose regions are ellipsoids.
+
+        Raises
+        ------
+        InputError
+            If the probability is not between 0 and 1, or the dimension is not positive.
+        """
+        from cadalign.shapes.tails import radius_of
+
+        if not 0 < probability < 1:
+            raise InputError(f"{probability!r} is not between 0 and 1", where="probability")
+        if dimension < 1:
+            raise InputError(f"{dimension!r} is not a positive number", where="dimension")
+        return radius_of(probability, dimension, self.degrees_of_freedom)
+
+    def mesh(self, mesh: Mesh | None = None) -> Mesh:
+        """A model's mesh, warped so that its keypoints are the object's.
+
+        Parameters
+        ----------
+        mesh : Mesh, optional
+            By default that of the `Model`. For a learned shape, that of `nearest`. Where the model
+            is not known, it is taken for the object's own.
+
+        Returns
+        -------
+        Mesh
+            In the model's frame, before the stretch; ``alignment`` places it.
+
+        Raises
+        ------
+        InputError
+            If there is no mesh to warp.
+        """
+        from cadalign.estimation.meshing import warped_mesh
+
+        return warped_mesh(self, mesh)
+
+    @property
+    def nearest(self) -> NearestShape:
+        """The training model of a learned shape whose keypoints are nearest to the object's.
+
+        Raises
+        ------
+        InputError
+            If the model is not learned, or its training models are not known.
+        """
+        from cadalign.estimation.meshing import nearest_shape
+
+        return nearest_shape(self)
+
+    def contributions(self) -> tuple[Contribution, ...]:
+        """Standard deviations without each piece of evidence; compare them with ``std``.
+
+        They are linearised at the estimate, infinite for what nothing else determines. Without the
+        known motion of its camera, a view has a pose of its own. Empty for the keypoints of one
+        view of an exact model, which nothing can be left out of.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file, which does not hold the evidence.
+
+        Examples
+        --------
+        >>> from cadalign import Alignment, Camera, Model, Size, View, align
+        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+        >>> truth = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3, 0.2, 6.0], [1.2, 1.1, 0.9])
+        >>> view = View(camera, camera.project(truth.apply(corners)))
+        >>> result = align(Model(points_3d=corners), view, size=Size(width=1.2))
+        >>> [(each.name, round(each.without.scale[0], 3)) for each in result.contributions()]
+        [('views[0].points_2d', 0.01), ('size', inf)]
+        """
+        if self.statistics.basis is None:
+            if self.method != "align":
+                return ()
+            what = "the result holds no evidence: it was read from a file"
+            raise InputError(what, where="contributions", fix="align again")
+        from cadalign.estimation.uncertainty.evidence import contributions_of
+
+        return contributions_of(self.statistics.basis)
 
     def __str__(self) -> str:
-        count = int(self.inliers.sum())
-        of = "" if count == len(self.inliers) else f" of {len(self.inliers)}"
-        lines = [f"{self.method}: {count}{of} keypoints, rms {self.rms:.3g} px"]
-        std = self.std
-        angle = np.degrees(np.arccos(np.clip((np.trace(self.alignment.rotation) - 1) / 2, -1, 1)))
-        translation = ", ".join(f"{value:.4g}" for value in self.alignment.translation)
-        scale = [f"{value:.4g}" for value in self.alignment.scale]
-        if std is None:
-            lines.append(f"  rotation     {angle:.4g} deg from the camera's axes")
-            lines.append(f"  translation  ({translation})")
-        else:
-            shift = ", ".join(f"{value:.2g}" for value in std.translation)
-            lines.append(
-                f"  rotation     {angle:.4g} deg from the camera's axes, "
-                f"+- {std.rotation_deg:.2g} deg"
-            )
-            lines.append(f"  translation  ({translation}) +- ({shift})")
-            scale = [
-                text if deviation == 0 else f"{text} +- {100 * deviation:.2g} %"
-                for text, deviation in zip(scale, std.scale, strict=True)
-            ]
-        lines.append(f"  scale        ({', '.join(scale)})")
-        equal = equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
-        if equal:
-            lines.append(f"  symmetry     {equal}")
-        if self.focal == "estimate":
-            known_to = "" if std is None else f" +- {100 * std.focal:.2g} %"
-            lines.append(f"  focal length {self.camera.fx:.4g} px{known_to}")
-        lines.extend(
-            f"  also likely  ({other.relative_likelihood:.2g} x): scale "
-            f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"
-            for other in self.alternatives
-        )
-        lines.extend(f"  warning      {text}" for text in self.warnings)
-        return "\n".join(lines)
+        from cadalign.estimation.text import text_of
+
+        return text_of(self)
 
     def __repr__(self) -> str:
-        scale = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
-        count = f"{int(self.inliers.sum())}/{len(self.inliers)}"
+        stretch = ", ".join(f"{value:.3g}" for value in self.stretch)
+        views = "" if len(self.views) == 1 else f"views={len(self.views)}, "
         return (
-            f"FitResult({self.method!r}, keypoints={count}, rms={self.rms:.3g} px, "
-            f"scale=({scale}), warnings={len(self.warnings)})"
+            f"Result({self.method!r}, {views}keypoints={int(self.inliers.sum())}/"
+            f"{len(self.inliers)}, rms={self.rms:.3g} px, stretch=({stretch}), "
+            f"warnings={len(self.warnings)})"
         )
 
     def _repr_html_(self) -> str:
-        from cadalign.estimation.drawing import fit_html
+        from cadalign.estimation.drawing import result_html
 
-        return fit_html(self)
+        return result_html(self)
 
     def plot(
         self,
         image: npt.ArrayLike | str | os.PathLike[str] | None = None,
         mesh: Mesh | None = None,
         *,
+        view: int = 0,
         axes: Axes | None = None,
     ) -> Axes:
         """Draw photo, model, box, and keypoints with their residuals on matplotlib axes.
@@ -283,7 +513,10 @@ class FitResult:
         image : (h, w, 3) uint8 or path, optional
             The photo; grey by default.
         mesh : Mesh, optional
-            The model's, drawn shaded with its outline. Without it the box is the keypoints'.
+            As for `mesh`, drawn shaded with its outline; by default that of the model, if it has
+            one. Without any the box is the object's, or the keypoints'.
+        view : int
+            Number of the view to draw.
         axes : matplotlib.axes.Axes, optional
             The axes to draw on; those of a new figure by default.
 
@@ -295,7 +528,7 @@ class FitResult:
         Raises
         ------
         InputError
-            If the photo is not of the camera's size.
+            If there is no such view, or the photo is not of its camera's size.
 
         Examples
         --------
@@ -308,84 +541,9 @@ class FitResult:
         >>> [float(y) for y in axes.get_ylim()]
         [479.5, -0.5]
         """
-        from cadalign.estimation.drawing import plot_fit
+        from cadalign.estimation.drawing import plot_result
 
-        return plot_fit(self, image, mesh, axes=axes)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as JSON, as `cadalign fit` does.
-
-        Raises
-        ------
-        DataError
-            If the file cannot be written.
-        """
-        from cadalign.io.files import write_json
-
-        write_json(Path(path), self.to_dict())
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> FitResult:
-        """Read what `save` or `cadalign fit` wrote.
-
-        Raises
-        ------
-        DataError
-            If the file cannot be read, or a field is missing or invalid; the message names both.
-        """
-        from cadalign.io.documents import in_file, read_json
-
-        data = read_json(Path(path))
-        with in_file(Path(path)):
-            return cls.from_dict(data)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Write the result as plain lists and numbers, for JSON."""
-        std = self.std
-        return {
-            "method": self.method,
-            "camera": self.camera.to_dict(),
-            "alignment": self.alignment.to_dict(),
-            "rms": self.rms,
-            "points_3d": self.points_3d.tolist(),
-            "residuals": [
-                row if math.isfinite(row[0] + row[1]) else None for row in self.residuals.tolist()
-            ],
-            "inliers": self.inliers.tolist(),
-            "sigma": self.sigma,
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "std": None if std is None else asdict(std),
-            "options": None if self.options is None else _plain_options(self.options),
-            "misfit": None if self.misfit is None else self.misfit.to_dict(),
-            "known_axis": self.known_axis,
-            "stretched_axes": self.stretched_axes,
-            "focal": self.focal,
-            "focal_prior": None if self.focal_prior is None else asdict(self.focal_prior),
-            "alternatives": [
-                {
-                    "alignment": other.alignment.to_dict(),
-                    "relative_likelihood": other.relative_likelihood,
-                    "camera": other.camera.to_dict(),
-                }
-                for other in self.alternatives
-            ],
-            "warnings": list(self.warnings),
-            "stats": asdict(self.stats),
-            "symmetry": None if self.symmetry is None else self.symmetry.to_dict(),
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> FitResult:
-        """Read what `to_dict` wrote.
-
-        Raises
-        ------
-        InputError
-            If a field is missing or invalid.
-        """
-        from cadalign.estimation.document import read_result  # takes the validation library with it
-
-        return read_result(data)
+        return plot_result(self, image, mesh, view=view, axes=axes)
 
     def export(
         self,
@@ -404,25 +562,71 @@ class FitResult:
         format, options
             As for `cadalign.export.export_object`.
         **of_the_object
-            ``mesh``, ``image``, ``world_from_cam``, ``name`` and ``metres`` of
-            `cadalign.estimation.exporting.object_of_fit`.
+            ``mesh``, ``image`` or ``images``, ``world_from_cam``, ``name`` and ``metres`` of
+            `cadalign.estimation.exporting.object_of`.
 
         Examples
         --------
         >>> result.export("chair.glb", mesh=mesh, image="chair.jpg")  # doctest: +SKIP
         """
-        from cadalign.estimation.exporting import object_of_fit
+        from cadalign.estimation.exporting import object_of
         from cadalign.export import export_object
 
-        exported = object_of_fit(self, **of_the_object)
+        exported = object_of(self, **of_the_object)
         return export_object(path, exported, format=format, options=options)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as JSON, as `cadalign fit` does.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be written.
+        """
+        from cadalign.io.files import write_json
+
+        write_json(Path(path), self.to_dict())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Result:
+        """Read what `save` or `cadalign fit` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file cannot be read, or a field is missing or invalid; the message names both.
+        """
+        from cadalign.io.documents import in_file, read_json
+
+        data = read_json(Path(path))
+        with in_file(Path(path)):
+            return cls.from_dict(data)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Write the result as plain lists and numbers, for JSON; its model is not part of it."""
+        from cadalign.estimation.document import write_result  # takes the validation library along
+
+        return write_result(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Result:
+        """Read what `to_dict` wrote, in this version or in 0.1.0.
+
+        Raises
+        ------
+        InputError
+            If a field is missing or invalid.
+        """
+        from cadalign.estimation.document import read_result
+
+        return read_result(data)
 
     def to_json(self) -> str:
         """The result as JSON text; see `to_dict`."""
         return json.dumps(self.to_dict())
 
     @classmethod
-    def from_json(cls, text: str) -> FitResult:
+    def from_json(cls, text: str) -> Result:
         """Read what `to_json` wrote.
 
         Raises
@@ -434,12 +638,29 @@ class FitResult:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
             what = f"not valid JSON: {str(error)[:200]}"
-            raise InputError(what, where="fit result") from None
+            raise InputError(what, where="result") from None
         return cls.from_dict(data)
 
 
-def _plain_options(options: FitOptions) -> dict[str, Any]:
-    """Options as plain lists and numbers."""
-    sigma = options.sigma
-    plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
-    return {**asdict(replace(options, sigma=None)), "sigma": plain}
+FitResult = AlignResult = Result
+"""Names of earlier versions."""
+
+
+def quickly(kind: type[T], fields: dict[str, Any]) -> T:
+    """A frozen dataclass with these fields, unchecked; those left out have their defaults.
+
+    Setting them one by one takes longer than solving a small problem linearly.
+    """
+    made = object.__new__(kind)
+    made.__dict__.update(fields)
+    return made
+
+
+def rms_of(residuals: FloatArray, inliers: BoolArray) -> float:
+    """Root mean square length of residuals (n, 2), of the inliers (n,) alone."""
+    kept = residuals[inliers]
+    return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
+
+
+def _extent(points: FloatArray) -> FloatArray:
+    return np.array([points.min(axis=0), points.max(axis=0)])

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.focal_search import focal_views, log_focal_prior
+from cadalign.estimation.keypoint_result import result_of_keypoints
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
-from cadalign.estimation.result import FitResult, FitStats
+from cadalign.estimation.result import FitStats, Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
@@ -33,7 +34,7 @@ def find_consensus(
     options: FitOptions,
     ransac: RansacOptions,
     confidences: npt.ArrayLike | None,
-) -> FitResult:
+) -> Result:
     """The best hypothesis of LO-RANSAC for the only problem, with its inliers.
 
     Raises
@@ -118,21 +119,16 @@ def find_consensus(
             score=float(score),
             inliers=support,
         )
-    return FitResult(
+    stats = FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score))
+    return result_of_keypoints(
+        problems,
+        options,
         alignment=alignment,
-        points_3d=problems.points_3d,
+        camera=camera,
         residuals=residuals,
         inliers=kept,
         method=f"ransac-{ransac.minimal}",
-        camera=camera,
-        sigma=None,
-        covariance=None,
-        known_axis=options.known_axis,
-        stretched_axes=options.stretched_axes,
-        focal=options.focal,
-        focal_prior=options.focal_prior,
-        stats=FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score)),
-        options=options,
+        stats=stats,
     )
 
 

@@ -7,27 +7,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.align_result import AlignAlternative, AlignResult
 from cadalign.estimation.estimates import curvature_of_rotations, is_other, stretch_of, with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import prior_of, rows_among
-from cadalign.estimation.problems import pixel_information, rays_of, whitening_of
-from cadalign.estimation.result import FitResult, FitStats
+from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import canonical_fit, equal_text, held_axes, without_free_turns
+from cadalign.estimation.symmetry import canonical_result
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.warnings import another_pose, misfits, weaknesses
-from cadalign.estimation.uncertainty.weakness import unknown_axes
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
@@ -54,8 +53,8 @@ def is_plain(model: object, views: Sequence[View]) -> bool:
 
 def align_plain(
     model: Model, view: View, *, loss: str, loss_scale: float, ransac: RansacOptions | None
-) -> AlignResult:
-    """The result of `fit`, in the form of `align`'s."""
+) -> Result:
+    """The result of `fit`, with all keypoints of the model."""
     prior = prior_of(model)
     points = cast(FloatArray, model.points_3d)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
@@ -72,75 +71,19 @@ def align_plain(
         ransac=ransac,
         confidences=view.confidences if ransac is not None else None,
     )
-    columns = [0, 1, 2, 3, 4, 5, *(6 + axis for axis in unknown_axes(model.known_axis))]
-    covariance = np.zeros((9, 9))
-    of_others = [points] * len(found.alternatives)
-    if model.symmetry is not None:
-        found, best, others = canonical_fit(found, model.symmetry)
-        points, of_others = best.relabelled(points), [each.relabelled(points) for each in others]
-    if found.covariance is not None:
-        covariance[np.ix_(columns, columns)] = found.covariance
-    if model.symmetry is not None:
-        covariance = without_free_turns(covariance, best)
-    scale = found.alignment.scale
-    of_points, of_seen = _points_covariances(points, found.alignment, covariance)
     bounds = cast(FloatArray, model.bounds)
-    return AlignResult(
-        alignment=found.alignment,
+    found = replace(
+        found,
+        views=(replace(found.views[0], ids=view.keypoint_ids),),
         ids=prior.ids,
         points_3d=points,
-        bounds=bounds,
-        poses=(found.alignment,),
-        residuals=(found.residuals,),
-        inliers=(found.inliers,),
-        covariance=covariance,
-        points_covariance=of_points,
-        points_cam_covariance=of_seen,
-        stretch=scale,
-        component=0,
-        model=model,
         alternatives=tuple(
-            AlignAlternative(other.alignment, of_other, bounds, other.relative_likelihood)
-            for other, of_other in zip(found.alternatives, of_others, strict=True)
+            replace(each, points_3d=points, own_bounds=bounds) for each in found.alternatives
         ),
-        warnings=found.warnings,
-        stats=found.stats,
-        evidence=(_summary(found, view),),
-        equal_under_symmetry=equal_text(
-            found.alignment, model.symmetry, held=held_axes(found.stretched_axes)
-        ),
-        cameras=(view.camera,),
-        observed=(cast(FloatArray, view.points_2d),),
+        model=model,
+        own_bounds=bounds,
     )
-
-
-def _summary(found: FitResult, view: View) -> EvidenceSummary:
-    """Agreement of the keypoints that the estimate rests on."""
-    residuals = found.residuals[found.inliers]
-    count = len(residuals)
-    sigma = found.sigma if view.sigma is None else view.sigma
-    squares = (residuals * residuals).sum()
-    if isinstance(sigma, int | float):
-        whitened = squares / sigma**2
-    else:
-        information = pixel_information(sigma, len(found.residuals))[found.inliers]
-        whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
-    in_sigmas = float(np.sqrt(whitened / (2 * count)))
-    return EvidenceSummary("keypoints", 0, count, in_sigmas, float(np.sqrt(squares / count)), "px")
-
-
-def _points_covariances(
-    points: FloatArray, alignment: Alignment, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
-    stretched = points * alignment.scale
-    by_logs = stretched[:, :, None] * np.eye(3)
-    of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
-    turned = stretched @ alignment.rotation.T
-    by_turn = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)  # columns: axis x turned
-    shifts = np.broadcast_to(np.eye(3), by_turn.shape)
-    rows = np.concatenate([by_turn, shifts, alignment.rotation @ by_logs], axis=2)
-    return of_points, rows @ covariance @ rows.swapaxes(1, 2)
+    return found if model.symmetry is None else canonical_result(found, model.symmetry)
 
 
 def is_single(model: object, views: Sequence[View]) -> bool:
@@ -154,7 +97,7 @@ def is_single(model: object, views: Sequence[View]) -> bool:
 
 def align_single(
     model: ShapeModel, view: View, *, options: FitOptions, init: Alignment | None
-) -> AlignResult:
+) -> Result:
     """The result of `cadalign.align` where `is_single` holds.
 
     Raises
@@ -193,11 +136,12 @@ def align_single(
     in_camera = alignment.apply(points[rows])
     of_mean = weights @ (means[:, -1] - means[:, -2])
     alternatives = tuple(
-        AlignAlternative(
+        Alternative(
             _alignment(likely.poses[k]),
+            float(likelihoods[k]),
+            view.camera,
             likely.points[k, :-2],
             likely.points[k, -2:],
-            float(likelihoods[k]),
         )
         for k in range(1, len(likelihoods))
         if is_other(moments, k)
@@ -207,30 +151,43 @@ def align_single(
         warnings += misfits(float(minima.costs[0]), 2 * len(rows) - POSE_UNKNOWNS)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component = int(minima.component[0])
-    return AlignResult(
-        alignment=alignment,
-        ids=model.ids,
-        points_3d=points[:-2],
-        bounds=points[-2:],
-        poses=(alignment,),
-        residuals=(view.camera.project(in_camera) - cast(FloatArray, view.points_2d),),
-        inliers=(np.ones(len(rows), dtype=bool),),
-        covariance=moments.covariance,
-        points_covariance=moments.of_points[:-2],
-        points_cam_covariance=moments.of_seen[:-2],
-        stretch=stretch_of(likely.lengths[0], of_mean),
-        component=component,
-        model=model,
-        alternatives=alternatives,
+    statistics = Stated(
+        moments.covariance,
+        likely.covariances[0],
+        moments.of_points[:-2],
+        moments.of_seen[:-2],
         warnings=(*warnings, *another_pose(alignment, alternatives)),
-        stats=stats,
         evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
+        degrees_of_freedom=model.degrees_of_freedom,
         basis=SingleBasis(
             model, view, options, component, minima.poses[0].copy(), minima.forces[0].copy()
         ),
-        cameras=(view.camera,),
-        observed=(cast(FloatArray, view.points_2d),),
-        degrees_of_freedom=model.degrees_of_freedom,
+    )
+    observed = cast(FloatArray, view.points_2d)
+    seen_in_view = ViewResult(
+        view.camera,
+        alignment,
+        view.keypoint_ids,
+        observed,
+        view.camera.project(in_camera) - observed,
+        np.ones(len(rows), dtype=bool),
+        statistics,
+    )
+    return Result(
+        views=(seen_in_view,),
+        ids=model.ids,
+        points_3d=points[:-2],
+        method="align",
+        statistics=statistics,
+        known_axis=None,
+        stretched_axes="",
+        cost=float(minima.costs[0]),
+        alternatives=alternatives,
+        stats=stats,
+        model=model,
+        component=component,
+        own_bounds=points[-2:],
+        own_stretch=stretch_of(likely.lengths[0], of_mean),
     )
 
 

@@ -386,11 +386,13 @@ def alternatives_of(
         ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    points = problems.points_3d.copy()
     return tuple(
         Alternative(
             Alignment.from_packed(solutions.poses[0, k]),
             float(ratios[k]),
             camera_of(problems, solutions, k),
+            points,
         )
         for k in range(1, minima)
         if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()

@@ -11,22 +11,20 @@ deviations are stated without that step, such that points on the axis keep their
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.uncertainty.weakness import unknown_axes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
 
 if TYPE_CHECKING:
-    from cadalign.estimation.batch import BatchResult
-    from cadalign.estimation.options import FitOptions
-    from cadalign.estimation.result import FitResult
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
@@ -55,6 +53,11 @@ def held_axes(stretched: str) -> tuple[bool, bool, bool]:
     """The axes whose scale is held, where the others are estimated."""
     x, y, z = (axis not in stretched for axis in "xyz")
     return x, y, z
+
+
+def stretched_axes(held: tuple[bool, bool, bool]) -> str:
+    """The axes whose scale is estimated, where those of others are held."""
+    return "".join(axis for axis, is_held in zip("xyz", held, strict=True) if not is_held)
 
 
 def step_to(best: Equal, given: Alignment) -> FloatArray:
@@ -119,63 +122,45 @@ def equal_text(
     return f"{count} alignments are equal under the model's symmetry"
 
 
-class CanonicalFit(NamedTuple):
-    """A canonical result, and what led to it and to each of its alternatives."""
-
-    result: FitResult
-    best: Equal
-    others: tuple[Equal, ...]
-
-
-def canonical_fit(result: FitResult, symmetry: Symmetry) -> CanonicalFit:
-    """A fit's result with the canonical alignment, and alternatives that are truly others."""
+def canonical_result(result: Result, symmetry: Symmetry) -> Result:
+    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
     group = group_of(symmetry)
     held = held_axes(result.stretched_axes)
     best = group.canonical(result.alignment, held=held)
-    covariance = result.covariance
+    statistics = cast("KeypointStatistics", result.statistics)
+    covariance = statistics.fisher_covariance
     if covariance is not None:
-        covariance = _carried(covariance, result.alignment, best, result.known_axis)
+        covariance = carried(covariance, result.alignment, best, held)
     canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
-    others = [
-        (equal, each)
-        for equal, each in canonical
-        if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
-    ]
-    found = replace(
-        result,
+    statistics = replace(
+        statistics,
         alignment=best.alignment,
-        points_3d=best.relabelled(result.points_3d),
-        covariance=covariance,
-        alternatives=tuple(replace(each, alignment=equal.alignment) for equal, each in others),
+        points_3d=best.relabelled(statistics.points_3d),
+        fisher_covariance=covariance,
         symmetry=symmetry,
     )
-    return CanonicalFit(found, best, tuple(equal for equal, _ in others))
-
-
-def canonical_batch(batch: BatchResult, symmetry: Symmetry, options: FitOptions) -> BatchResult:
-    """The results of a batch with canonical alignments, each as `canonical_fit` has it."""
-    group = group_of(symmetry)
-    if group.is_trivial:
-        return batch
-    rotation, translation = batch.rotation.copy(), batch.translation.copy()
-    scale = batch.scale.copy()
-    covariance = None if batch.covariance is None else batch.covariance.copy()
-    held = held_axes(options.stretched_axes)
-    for b in np.flatnonzero(batch.solved).tolist():
-        given = batch.alignment(b)
-        best = group.canonical(given, held=held)
-        rotation[b], translation[b] = best.alignment.rotation, best.alignment.translation
-        scale[b] = best.alignment.scale
-        if covariance is not None:
-            covariance[b] = _carried(covariance[b], given, best, options.known_axis)
     return replace(
-        batch, rotation=rotation, translation=translation, scale=scale, covariance=covariance
+        result,
+        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
+        points_3d=best.relabelled(result.points_3d),
+        statistics=statistics,
+        alternatives=tuple(
+            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
+            for equal, each in canonical
+            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+        ),
+        symmetry=symmetry,
     )
 
 
-def _carried(covariance: FloatArray, given: Alignment, best: Equal, known_axis: str) -> FloatArray:
-    """The covariance (8, 8) or (9, 9) of an equal alignment."""
-    places = [*range(6), *(6 + axis for axis in unknown_axes(known_axis))]
+def carried(
+    covariance: FloatArray,
+    given: Alignment,
+    best: Equal,
+    held: tuple[bool, bool, bool] = (False, False, False),
+) -> FloatArray:
+    """The covariance (9, 9) or (10, 10) of an equal alignment; zero for scales that are held."""
     step = np.eye(len(covariance))
-    step[:8, :8] = step_to(best, given)[np.ix_(places, places)]
+    step[:9, :9] = step_to(best, given)
+    step[6 + np.flatnonzero(held)] = 0.0
     return np.asarray(step @ covariance @ step.T)

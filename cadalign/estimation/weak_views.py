@@ -12,9 +12,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.result import Result, ViewResult
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.constants import LINEAR
@@ -62,44 +63,46 @@ def check_first(without_pose: Sequence[int]) -> None:
 
 
 def with_views_left_out(
-    result: AlignResult, prior: ShapePrior, views: Sequence[View], left_out: Sequence[int]
-) -> AlignResult:
+    result: Result, prior: ShapePrior, views: Sequence[View], left_out: Sequence[int]
+) -> Result:
     """The result of all views from that of the views that are not ``left_out``.
 
     The pose of a view that is left out is one of those that explain its keypoints.
     """
     used = [number for number in range(len(views)) if number not in left_out]
-    poses = dict(zip(used, result.poses, strict=True))
-    residuals = dict(zip(used, result.residuals, strict=True))
-    inliers = dict(zip(used, result.inliers, strict=True))
+    of_views = dict(zip(used, result.views, strict=True))
     masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
     for number in left_out:
         view = views[number]
-        poses[number] = _explaining(prior, view, result)
+        pose = _explaining(prior, view, result)
         rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
-        seen = view.camera.project(poses[number].apply(result.points_3d[rows]))
-        residuals[number] = seen - cast(FloatArray, view.points_2d)
-        inliers[number] = np.zeros(len(rows), dtype=bool)
+        observed = cast(FloatArray, view.points_2d)
+        residuals = view.camera.project(pose.apply(result.points_3d[rows])) - observed
+        kept, unknown = np.zeros(len(rows), dtype=bool), Stated(None)
+        of_views[number] = ViewResult(
+            view.camera, pose, view.keypoint_ids, observed, residuals, kept, unknown
+        )
     numbers = range(len(views))
     warnings = [
         f"views[{number}] is left out: its {len(views[number].keypoint_ids)} keypoints do not "
         "determine its pose"
         for number in left_out
     ]
-    return replace(
-        result,
-        poses=tuple(poses[number] for number in numbers),
-        residuals=tuple(residuals[number] for number in numbers),
-        inliers=tuple(inliers[number] for number in numbers),
-        mask_residuals=tuple(masks.get(number) for number in numbers) if masks else (),
+    stated = Stated.of(result.statistics)
+    statistics = replace(
+        stated,
         evidence=tuple(
             replace(each, view=None if each.view is None else used[each.view])
-            for each in result.evidence
+            for each in stated.evidence
         ),
-        warnings=(*(_renumbered(text, used) for text in result.warnings), *warnings),
-        basis=result.basis and replace(result.basis, numbers=tuple(used)),
-        cameras=tuple(view.camera for view in views),
-        observed=tuple(cast(FloatArray, view.points_2d) for view in views),
+        warnings=(*(_renumbered(text, used) for text in stated.warnings), *warnings),
+        basis=stated.basis and replace(stated.basis, numbers=tuple(used)),
+    )
+    return replace(
+        result,
+        views=tuple(of_views[number] for number in numbers),
+        statistics=statistics,
+        mask_residuals=tuple(masks.get(number) for number in numbers) if masks else (),
     )
 
 
@@ -125,7 +128,7 @@ def _is_on_a_line(points: FloatArray) -> bool:
     return bool(extents[1] <= _ON_A_LINE * extents[0])
 
 
-def _explaining(prior: ShapePrior, view: View, result: AlignResult) -> Alignment:
+def _explaining(prior: ShapePrior, view: View, result: Result) -> Alignment:
     """A pose near that of the first view under which a view's keypoints fit."""
     scale = result.alignment.scale
     alone = replace(view, depth=None, mask=None, mask_sigma=None, camera_height=None)

@@ -1,7 +1,7 @@
 """Errors of alignments and boxes, single or stacked: the formulas of `cadalign.geometry.metrics`.
 
 A stack's arrays have leading dimensions (...) more than those of one: `Alignments`, `Boxes` and
-`cadalign.BatchResult` are stacks, `Alignment` and `Box` single. Errors of a stack are those of its
+`cadalign.Results` are stacks, `Alignment` and `Box` single. Errors of a stack are those of its
 members, bit for bit. Nothing is checked.
 """
 

@@ -30,7 +30,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.shape_posterior import (
     ShapePosterior,
     gaussians_of,
@@ -260,7 +260,7 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
 
 
 def _poses(
-    result: AlignResult, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
+    result: Result, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
 ) -> FloatArray:
     """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
     pose = result.alignment

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from support.annotating import Case
 
-from cadalign import FitResult
+from cadalign import Result
 from cadalign.annotate.page_state import page_state
 from cadalign.cli import main
 from cadalign.io.observation import Observation
@@ -64,10 +64,10 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
 
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     command = json.loads(capsys.readouterr().out)
-    saved = FitResult.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    saved = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert page.std is not None
     np.testing.assert_allclose(flat(command["std"]), flat(asdict(page.std)), rtol=1e-9)
-    for fitted in (FitResult.from_json(json.dumps(command)), saved):
+    for fitted in (Result.from_json(json.dumps(command)), saved):
         np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(
             flat(fitted.alignment.to_dict()), flat(page.alignment.to_dict()), rtol=1e-9, atol=1e-9

@@ -14,7 +14,7 @@ from PIL import Image
 from support.annotating import Case, place, place_all, place_twenty
 from support.refusals import refusal_text
 
-from cadalign import Camera, FitResult, fit
+from cadalign import Camera, Result, fit
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
@@ -57,7 +57,7 @@ def test_file_gives_the_same_alignment_as_the_page(
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["alignment"] == state["alignment"]["alignment"]
-    written = FitResult.from_json((case.folder / "photo_fit" / "fit.json").read_text())
+    written = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert written.alignment.to_dict() == state["alignment"]["alignment"]
     observation = Observation.load(case.observation)
     assert observation.semantic_ids is not None
@@ -136,8 +136,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
     unready.warm_up()
     state = page_state(unready, 0)
     assert (
-        FitResult.from_json(file.read_text()).alignment.to_dict()
-        == (state["alignment"]["alignment"])
+        Result.from_json(file.read_text()).alignment.to_dict() == (state["alignment"]["alignment"])
     )
     assert file.read_bytes() != before
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.annotating import Case, place, place_all
 
-from cadalign import AlignResult, CadalignError, ShapeModel
+from cadalign import CadalignError, Result, ShapeModel
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.shape_alignment import LiveShape
@@ -93,8 +93,8 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     page = live_shape(session).shown
     assert page is not None
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
-    command = AlignResult.from_dict(json.loads(capsys.readouterr().out))
-    saved = AlignResult.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
+    command = Result.from_dict(json.loads(capsys.readouterr().out))
+    saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
     for fitted in (command, saved):
         np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
         ours, theirs = numbers(page.alignment.to_dict()), numbers(fitted.alignment.to_dict())
@@ -207,7 +207,7 @@ def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
     page = live_shape(session)
     assert page.counts.all()
     assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
-    fitted = AlignResult.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
+    fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
     assert page.shown is not None
     np.testing.assert_allclose(fitted.covariance, page.shown.covariance, rtol=1e-9, atol=1e-15)
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from support.exported import CAMERA, KEYPOINTS, POSE, photo_of, turned, wedge
 
-from cadalign import FitResult, Model, View, align, fit
+from cadalign import Model, Result, View, align, fit
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
@@ -143,7 +143,7 @@ def test_results_export_themselves(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         load_mesh(path).vertices, plain.alignment.apply(wedge().vertices), atol=1e-5
     )
-    again = FitResult.from_dict(plain.to_dict())
+    again = Result.from_dict(plain.to_dict())
     again.export(tmp_path / "a.coco.json", mesh=wedge())
     coco = json.loads((tmp_path / "a.coco.json").read_text())
     assert coco["annotations"][0]["keypoints"][2::3] == [2] * len(MORE)

@@ -17,7 +17,7 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import FitResult, RansacOptions, fit
+from cadalign import RansacOptions, Result, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
@@ -61,7 +61,7 @@ def test_prints_the_summary_and_writes_fit_and_overlay(
     assert captured.out == f"{expected}\n"
     out = tmp_path / "chair_fit"
     assert sorted(entry.name for entry in out.iterdir()) == ["fit.json", "overlay.png"]
-    written = FitResult.from_json((out / "fit.json").read_text())
+    written = Result.from_json((out / "fit.json").read_text())
     assert written.alignment == expected.alignment
     assert str(written) == str(expected)
     overlay = cv2.imread(str(out / "overlay.png"))
@@ -222,7 +222,7 @@ def test_a_rejected_keypoint_behind_the_camera_is_written_and_drawn(
     assert main(["fit", str(path), "--robust"]) == 0
     text = (tmp_path / "chair_fit" / "fit.json").read_text()
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    read = FitResult.from_json(text)
+    read = Result.from_json(text)
     assert read.inliers.tolist() == [False] + [True] * 10
     assert np.isposinf(read.residuals[0]).all()
     assert np.isfinite(read.residuals[1:]).all()

@@ -13,7 +13,7 @@ import pytest
 from support.refusals import refusal_line
 from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
 
-from cadalign import Alignment, AlignResult, Model, Size, View, align
+from cadalign import Alignment, Model, Result, Size, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import rotation_from_vector
@@ -44,8 +44,8 @@ def write(folder: Path, *images: ObservedImage, **fields: Any) -> Path:
     return folder / "a.json"
 
 
-def result_in(folder: Path) -> AlignResult:
-    return AlignResult.from_dict(json.loads((folder / "a_fit" / "fit.json").read_text()))
+def result_in(folder: Path) -> Result:
+    return Result.from_dict(json.loads((folder / "a_fit" / "fit.json").read_text()))
 
 
 def test_gravity_and_size_are_used_as_by_align(

@@ -12,7 +12,7 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import Alignment, AlignResult, Camera, Model, RansacOptions, ShapeModel, View, align
+from cadalign import Alignment, Camera, Model, RansacOptions, Result, ShapeModel, View, align
 from cadalign.cli import main
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.keypoint_layer import UNSEEN_COLOR
@@ -80,7 +80,7 @@ def test_learned_shape_gives_the_numbers_of_align(
     assert capsys.readouterr().out == f"{expected}\n"
     out = tmp_path / "box_fit"
     assert sorted(entry.name for entry in out.iterdir()) == ["fit.json", "overlay.png"]
-    written = AlignResult.from_dict(json.loads((out / "fit.json").read_text()))
+    written = Result.from_dict(json.loads((out / "fit.json").read_text()))
     assert written.alignment == expected.alignment
     assert written.ids == tuple(range(8))
     lengths = written.stretch / RIGHT  # one image does not tell the size

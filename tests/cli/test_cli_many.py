@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cadalign import Alignment, Camera, FitResult, __version__
+from cadalign import Alignment, Camera, Result, __version__
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.io.observation import Observation
@@ -79,7 +79,7 @@ def test_every_object_of_a_file_becomes_an_observation_and_is_fitted(
     ]
     assert [bool(row["error"]) for row in rows] == [False, False, False, True]
     for name, pose in zip(("a_0", "a_1", "b"), POSES, strict=True):
-        found = FitResult.load(out / name / "fit.json")
+        found = Result.load(out / name / "fit.json")
         np.testing.assert_allclose(found.alignment.scale, pose.scale, atol=1e-4)
     page = (out / "index.html").read_text()
     assert page.count("<img") == 3
@@ -90,7 +90,7 @@ def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
     assert main(observe(folder, "--every")) == 0
     files = [str(folder / "found_observations" / f"{name}.json") for name in ("a_0", "b")]
     assert main(["fit", *files, "--out", str(folder / "out"), "--stretch", "y"]) == 0
-    assert FitResult.load(folder / "out" / "b" / "fit.json").stretched_axes == "y"
+    assert Result.load(folder / "out" / "b" / "fit.json").stretched_axes == "y"
 
 
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
@@ -99,7 +99,7 @@ def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     np.save(folder / "K.npy", CAMERA.matrix * [[1.1], [1.1], [1]])
     flags = ["--camera", str(folder / "K.npy"), "--pixel-origin", "corner"]
     assert main(["fit", str(path), *flags]) == 0
-    camera = FitResult.load(path.with_name("b_fit") / "fit.json").camera
+    camera = Result.load(path.with_name("b_fit") / "fit.json").camera
     assert camera.fx == pytest.approx(770)
     assert camera.cx == pytest.approx(1.1 * 319.5 - 0.5)
 

@@ -14,7 +14,7 @@ from PIL import Image
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import Alignment, Camera, FitResult, FocalPrior, fit
+from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.simulation.problems import Problem, random_rotation
@@ -59,9 +59,9 @@ def observe(folder: Path, *options: str) -> int:
     return main(observing(folder, *options))
 
 
-def fitted(folder: Path, name: str, *options: str) -> FitResult:
+def fitted(folder: Path, name: str, *options: str) -> Result:
     assert main(["fit", str(folder / f"{name}.json"), *options]) == 0
-    return FitResult.from_json((folder / f"{name}_fit" / "fit.json").read_text())
+    return Result.from_json((folder / f"{name}_fit" / "fit.json").read_text())
 
 
 def test_photo_and_detection_become_an_observation(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cadalign import Box, Camera, FitResult, RansacOptions, fit
+from cadalign import Box, Camera, RansacOptions, Result, fit
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.io.images import read_photo
@@ -113,7 +113,7 @@ def test_detection_goes_all_the_way_from_file_to_picture(
     assert int(kept[1]) >= 25
     assert re.search(r"  scale        \(1, 0\.[89]", printed)
     out = tmp_path / "found.observation_fit"
-    written = FitResult.from_json((out / "fit.json").read_text())
+    written = Result.from_json((out / "fit.json").read_text())
     direct = fit(
         points_3d,
         points_2d,

@@ -156,12 +156,12 @@ class TestSeveralViews:
     [
         (
             lambda: rank_evidence(learned(), VIEW, TRUTH),
-            "estimate: an alignment does not tell the shape; give the AlignResult of `align`",
+            "estimate: an alignment does not tell the shape; give the Result of `align`",
         ),
         (
             lambda: rank_evidence(MODEL, [VIEW, VIEW], TRUTH),
             "estimate: an alignment does not tell the poses of the other views; "
-            "give the AlignResult of `align`",
+            "give the Result of `align`",
         ),
         (
             lambda: rank_evidence(MODEL, [VIEW, VIEW], align(MODEL, VIEW)),
@@ -170,7 +170,7 @@ class TestSeveralViews:
         (lambda: rank_evidence(MODEL, [], TRUTH), "views: none is given"),
         (
             lambda: rank_evidence(MODEL, VIEW, TRUTH.rotation),  # type: ignore[arg-type]
-            "estimate: expected an Alignment or an AlignResult, got ndarray",
+            "estimate: expected an Alignment or a Result, got ndarray",
         ),
         (
             lambda: rank_evidence(MODEL, VIEW, TRUTH, candidates=[0]),

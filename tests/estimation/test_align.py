@@ -11,7 +11,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
@@ -59,10 +59,13 @@ class TestExactModel:
         result = align(Model(points_3d=points), view)
         expected = fit(points, view.points_2d, CAMERA)
         assert result.alignment == expected.alignment
-        assert expected.covariance is not None
-        columns = [0, 1, 2, 3, 4, 5, 7, 8]
-        assert (result.covariance[np.ix_(columns, columns)] == expected.covariance).all()
+        for name in ("covariance", "fisher_covariance", "points_covariance"):
+            np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
+        assert result.std == expected.std
         assert result.warnings == expected.warnings
+        assert str(result) == str(expected)
+        assert result.evidence == expected.evidence
+        assert result.contributions() == expected.contributions() == ()
 
     def test_a_shape_without_deviations_equals_the_rigid_fit(self) -> None:
         rng = np.random.default_rng(1)
@@ -142,7 +145,7 @@ class TestSimilarModel:
         assert plain.radius(0.95) == pytest.approx(1.96, abs=1e-3)
         assert tails.radius(0.999, dimension=3) > plain.radius(0.999, dimension=3)
         assert tails.radius(0.5) < plain.radius(0.5)
-        read = AlignResult.from_dict(json.loads(json.dumps(tails.to_dict())))
+        read = Result.from_dict(json.loads(json.dumps(tails.to_dict())))
         assert read.degrees_of_freedom == 4
         for wrong in (0.0, 1.0, float("nan")):
             with pytest.raises(InputError, match="probability"):
@@ -259,7 +262,7 @@ class TestOutliers:
         pixels = np.array(view.points_2d)
         pixels[[1, 5, 11, 12]] = rng.uniform(0, 480, (4, 2))
         result = align(model, View(CAMERA, pixels), ransac=RansacOptions(max_reproj_error=4.0))
-        assert np.flatnonzero(~result.inliers[0]).tolist() == [1, 5, 11, 12]
+        assert np.flatnonzero(~result.inliers).tolist() == [1, 5, 11, 12]
         assert rotation_error(est=result.alignment, gt=truth) < 2.0
 
     def test_inliers_are_in_the_order_of_the_view(self) -> None:
@@ -269,7 +272,7 @@ class TestOutliers:
         pixels[3] += 150
         view = View(CAMERA, pixels, ids=order.tolist())
         result = align(model, view, ransac=RansacOptions())
-        assert np.flatnonzero(~result.inliers[0]).tolist() == [3]
+        assert np.flatnonzero(~result.inliers).tolist() == [3]
 
 
 def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
@@ -279,7 +282,7 @@ def test_a_batch_is_its_single_results_and_keeps_errors() -> None:
     batch = align_batch(model, [*views, too_few], workers=2)
     assert isinstance(batch[3], DegenerateError)
     for view, result in zip(views, batch, strict=False):
-        assert isinstance(result, AlignResult)
+        assert isinstance(result, Result)
         assert result.alignment == align(model, view).alignment
 
 
@@ -301,11 +304,11 @@ def test_a_batch_takes_a_size_and_a_start_for_each_object() -> None:
         align(model, four, init=start),
     )
     for result, expected in zip(batch, alone, strict=False):
-        assert isinstance(result, AlignResult)
+        assert isinstance(result, Result)
         assert result.alignment == expected.alignment
     assert isinstance(batch[3], DegenerateError)  # two keypoints, whatever the start
     for result in align_batch(model, views, size=size, workers=2):
-        assert isinstance(result, AlignResult)
+        assert isinstance(result, Result)
         width = result.alignment.scale[0] * np.ptp(result.bounds[:, 0])
         assert width == pytest.approx(3.0, rel=0.1)
 
@@ -338,7 +341,7 @@ def test_a_result_survives_json() -> None:
     views = [seen(keypoints(), truth_of((1, 1, 1)), turned(a), noise=noise) for a in (0, 20)]
     result = align(model, views)
     text = json.dumps(result.to_dict(), allow_nan=False)
-    again = AlignResult.from_dict(json.loads(text))
+    again = Result.from_dict(json.loads(text))
     assert json.dumps(again.to_dict()) == text
     assert str(again) == str(result)
 
@@ -346,12 +349,12 @@ def test_a_result_survives_json() -> None:
 def test_a_damaged_result_is_refused_by_field() -> None:
     data = align(spreads(0.05), seen(keypoints(), truth_of((1, 1, 1)), np.eye(4))).to_dict()
     for name, value, message in (
-        ("covariance", [[1.0]], "alignment result: covariance: shape (1, 1), expected (9, 9)"),
-        ("views", [], "alignment result: views: there are none"),
-        ("ids", [1], "alignment result: ids: 1 entries, but points_3d has 10"),
+        ("fisher_covariance", [[1.0]], "result: fisher_covariance: shape (1, 1), expected (9, 9)"),
+        ("views", [], "result: views: there are none"),
+        ("ids", [1], "result: ids: 1 entries, but points_3d has 10"),
     ):
         with pytest.raises(InputError) as caught:
-            AlignResult.from_dict({**data, name: value})
+            Result.from_dict({**data, name: value})
         assert str(caught.value).startswith(message)
 
 

@@ -13,7 +13,7 @@ from support.scenes import CAMERA, around
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.shapes.examples import examples_of
@@ -33,7 +33,7 @@ class Case(NamedTuple):
     told: Mapping[str, Any]
     second: tuple[np.ndarray, np.ndarray]
 
-    def align(self, *kinds: str) -> AlignResult:
+    def align(self, *kinds: str) -> Result:
         """The alignment from keypoints and evidence of some kinds."""
         fields = {"gravity": ("up",), "camera height": ("up", "camera_height")}
         names = [name for kind in kinds for name in fields.get(kind, (kind,))]
@@ -95,7 +95,7 @@ def case_of(root: Path, kind: str) -> Case:
     return Case(model, truth, points, scene.bounds, ids[rows].tolist(), told, second)
 
 
-def check(case: Case, result: AlignResult) -> None:
+def check(case: Case, result: Result) -> None:
     """The estimate is near the truth, by its own covariance, and nothing contradicts."""
     error = rotation_error(est=result.alignment, gt=case.truth)
     assert error < 5 * result.std.rotation_deg + 0.1

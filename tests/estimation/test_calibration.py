@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
+from support.covariances import of_unknowns
 
-from cadalign import Camera, FitResult, RansacOptions, fit, fit_batch
+from cadalign import Camera, RansacOptions, Result, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
@@ -24,20 +25,19 @@ ROUNDS = 120
 LENS = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.1, 0.02, 0.001, -0.001))
 
 
-def fits(points: int, rounds: int = ROUNDS, **options: Any) -> Iterator[tuple[Problem, FitResult]]:
+def fits(points: int, rounds: int = ROUNDS, **options: Any) -> Iterator[tuple[Problem, Result]]:
     for seed in range(rounds):
         problem = simulate_problem(np.random.default_rng(seed), points=points, noise_px=1.0)
         with suppress(CadalignError):  # with few keypoints, the noise may leave no solution
             yield problem, fit(problem.points_3d, problem.points_2d, problem.camera, **options)
 
 
-def holds_truth(result: FitResult, problem: Problem) -> bool:
+def holds_truth(result: Result, problem: Problem) -> bool:
     est, gt = result.alignment, problem.alignment
     vector = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
     log_ratio = np.log(gt.scale / est.scale)
     error = np.concatenate([vector, gt.translation - est.translation, log_ratio[1:]])
-    assert result.posterior_covariance is not None
-    distance = error @ np.linalg.solve(result.posterior_covariance, error)
+    distance = error @ np.linalg.solve(of_unknowns(result.covariance), error)
     return bool(distance < chdtri(8, 0.05))
 
 
@@ -131,16 +131,20 @@ def test_misfit_stands_in_the_file() -> None:
     data = result.to_dict()
     assert [entry["row"] for entry in data["misfit"]["outliers"]] == [4]
     assert data["options"]["sigma"] == sigma.tolist()
-    assert FitResult.from_json(result.to_json()).to_json() == result.to_json()
+    assert Result.from_json(result.to_json()).to_json() == result.to_json()
 
 
-def test_files_without_options_are_read() -> None:
+def test_files_state_what_the_fit_stated() -> None:
     problem = simulate_problem(np.random.default_rng(3), points=12, noise_px=1.0)
-    data = fit(problem.points_3d, problem.points_2d, problem.camera).to_dict()
-    del data["options"], data["misfit"]
-    result = FitResult.from_json(json.dumps(data))
-    assert result.misfit is None
-    assert result.posterior_covariance is result.covariance
+    problem.points_2d[4] += 60
+    fitted = fit(problem.points_3d, problem.points_2d, problem.camera)
+    data = fitted.to_dict()
+    del data["options"]
+    result = Result.from_json(json.dumps(data))
+    assert result.misfit == fitted.misfit
+    assert result.warnings == fitted.warnings
+    assert result.std == fitted.std
+    np.testing.assert_array_equal(result.covariance, fitted.covariance)
 
 
 def test_sigma_that_is_changed_afterwards_changes_no_result() -> None:
@@ -166,15 +170,16 @@ def test_ellipsoid_holds_the_truth(points: int, sigma: float | None) -> None:
 
 def test_nothing_is_more_certain_than_the_cramer_rao_bound() -> None:
     for _, result in fits(7, 10):
-        excess = result.posterior_covariance - result.covariance
-        scale = np.sqrt(np.outer(result.covariance.diagonal(), result.covariance.diagonal()))
+        bound = of_unknowns(result.fisher_covariance)
+        excess = of_unknowns(result.covariance) - bound
+        scale = np.sqrt(np.outer(bound.diagonal(), bound.diagonal()))
         assert np.linalg.eigvalsh(excess / scale)[0] > -1e-6 * np.abs(excess / scale).max() - 1e-9
 
 
 def test_many_keypoints_leave_the_inverse_fisher_information() -> None:
     problem = simulate_problem(np.random.default_rng(1), points=150, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
-    np.testing.assert_array_equal(result.posterior_covariance, result.covariance)
+    np.testing.assert_array_equal(result.covariance, result.fisher_covariance)
 
 
 # --- estimated noise ---------------------------------------------------------------------------
@@ -250,4 +255,4 @@ def test_batches_estimate_the_same_noise() -> None:
     )
     for b, problem in enumerate(problems):
         single = fit(problem.points_3d, problem.points_2d, problem.camera, **options)
-        np.testing.assert_array_equal(batch.covariance[b], single.covariance)
+        np.testing.assert_array_equal(batch.fisher_covariance[b], single.fisher_covariance)

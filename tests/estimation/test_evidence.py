@@ -23,7 +23,7 @@ from support.scenes import (
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
-from cadalign.estimation.align_result import AlignResult
+from cadalign.estimation.result import Result
 from cadalign.geometry.gravity import up_from_vertical_edges
 
 
@@ -256,7 +256,7 @@ def test_the_rig_frame_is_that_of_the_cameras() -> None:
     expected = truth.apply(points) @ world[:3, :3].T + world[:3, 3]
     assert result.rig_from_model is not None
     assert np.allclose(result.rig_from_model.apply(points), expected, atol=1e-5)
-    again = AlignResult.from_dict(json.loads(json.dumps(result.to_dict())))
+    again = Result.from_dict(json.loads(json.dumps(result.to_dict())))
     assert again.rig_from_model == result.rig_from_model
     assert again.evidence == result.evidence
     with pytest.raises(InputError, match="read from a file"):

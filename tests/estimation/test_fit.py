@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from support.covariances import of_unknowns
 from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
 from cadalign import Alignment, Camera, fit
@@ -120,12 +121,12 @@ def test_scales_that_do_not_stretch_stay_exactly_one(stretch: str, held: list[in
     result = fit_problem(problem_of(2), stretch=stretch)
     assert (result.alignment.scale[held] == 1.0).all()
     assert result.stretched_axes == stretch.replace("none", "")
-    covariance = result.covariance
+    covariance = result.fisher_covariance
     assert covariance is not None
-    fixed = [5 + axis for axis in held if axis]
+    fixed = [6 + axis for axis in held]
     assert (covariance[fixed] == 0).all()
     assert (covariance[:, fixed] == 0).all()
-    assert np.linalg.matrix_rank(covariance) == 8 - len(fixed)
+    assert np.linalg.matrix_rank(covariance) == 9 - len(fixed)
     assert result.std is not None
     assert [s == 0.0 for s in result.std.scale] == [axis in held for axis in range(3)]
 
@@ -165,10 +166,13 @@ def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
 def test_prior_adds_its_information() -> None:
     problem = problem_of(2, points=20, noise_px=0.0, stretch=(1.0, 1.0))
     free, prior = fit_problem(problem), fit_problem(problem, scale_prior_sigma=0.02)
-    added = np.linalg.inv(prior.covariance) - np.linalg.inv(free.covariance)
+    information, without = (
+        np.linalg.inv(of_unknowns(each.fisher_covariance)) for each in (prior, free)
+    )
+    added = information - without
     expected = np.diag([0.0] * 6 + [2500.0] * 2)
-    information = np.linalg.inv(prior.covariance).diagonal()
-    assert (np.abs(added - expected) < 1e-5 * np.sqrt(np.outer(information, information))).all()
+    sizes = np.sqrt(information.diagonal())
+    assert (np.abs(added - expected) < 1e-5 * np.outer(sizes, sizes)).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -203,10 +207,10 @@ def test_renaming_the_models_axes_renames_the_result(known_axis: str, order: lis
     )
     np.testing.assert_allclose(other.alignment.scale, base.alignment.scale[order], rtol=1e-12)
     np.testing.assert_allclose(other.alignment.translation, base.alignment.translation)
-    # The two unknown scales come in the order of the axes: z, y of the base for known y.
-    scales = [7, 6] if known_axis == "y" else [6, 7]
-    place = [0, 1, 2, 3, 4, 5, *scales]
-    np.testing.assert_allclose(other.covariance, base.covariance[np.ix_(place, place)])
+    place = [0, 1, 2, 3, 4, 5, *(6 + axis for axis in order)]
+    np.testing.assert_allclose(
+        other.fisher_covariance, base.fisher_covariance[np.ix_(place, place)]
+    )
     assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in order])
 
 

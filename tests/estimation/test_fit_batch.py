@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cadalign import BatchResult, Camera, RansacOptions, fit, fit_batch
+from cadalign import Camera, RansacOptions, Results, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 
@@ -20,7 +20,7 @@ def problems_of(counts: list[int], *, seed: int = 0, **options: Any) -> list[Pro
     return [simulate_problem(rng, points=count, **options) for count in counts]
 
 
-def run(problems: list[Problem], camera: Any = None, **options: Any) -> BatchResult:
+def run(problems: list[Problem], camera: Any = None, **options: Any) -> Results:
     return fit_batch(
         [p.points_3d for p in problems],
         [p.points_2d for p in problems],
@@ -30,7 +30,7 @@ def run(problems: list[Problem], camera: Any = None, **options: Any) -> BatchRes
 
 
 def assert_like_single_fits(
-    batch: BatchResult,
+    batch: Results,
     problems: list[Problem],
     each: list[dict[str, Any]] | None = None,
     **options: Any,
@@ -46,11 +46,11 @@ def assert_like_single_fits(
         rows = slice(batch.offsets[b], batch.offsets[b + 1])
         assert (batch.residuals[rows] == single.residuals).all()
         assert batch.rms[b] == pytest.approx(single.rms, rel=1e-12)
-        if single.covariance is None:
-            assert batch.covariance is None
+        if single.fisher_covariance is None:
+            assert batch.fisher_covariance is None
         else:
-            assert batch.covariance is not None
-            assert (batch.covariance[b] == single.covariance).all()
+            assert batch.fisher_covariance is not None
+            assert (batch.fisher_covariance[b] == single.fisher_covariance).all()
 
 
 RAGGED = problems_of([6, 20, 7, 100, 10, 64])
@@ -293,8 +293,8 @@ def test_threads_agree_where_all_of_a_share_fail() -> None:
     ]
     batch = run([*good, *bad], focal="estimate", ransac=RansacOptions(max_iterations=20), workers=2)
     assert batch.solved.tolist() == [True, True, False, False]
-    assert batch.covariance is not None
-    assert batch.covariance.shape == (4, 9, 9)
+    assert batch.fisher_covariance is not None
+    assert batch.fisher_covariance.shape == (4, 10, 10)
 
 
 def test_confidences_without_ransac_are_refused() -> None:

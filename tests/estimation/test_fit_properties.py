@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.problems import problem_of
 
-from cadalign import Alignment, Camera, FitResult, fit
+from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation.problems import Problem, random_rotation
 from cadalign.geometry.metrics import rotation_error
@@ -20,7 +20,7 @@ METHODS = pytest.mark.parametrize("method", ["optimal", "aepnp"])
 UNITS = st.sampled_from([1e-6, 1e-3, 1e3, 1e6])
 
 
-def assert_aligned(result: FitResult, expected: Alignment, tolerance: float = 1e-6) -> None:
+def assert_aligned(result: Result, expected: Alignment, tolerance: float = 1e-6) -> None:
     """Rotation [rad], translation over the distance and relative scale within the tolerance."""
     est = result.alignment
     assert np.radians(rotation_error(est=est, gt=expected)) < tolerance
@@ -29,7 +29,7 @@ def assert_aligned(result: FitResult, expected: Alignment, tolerance: float = 1e
     assert np.abs(est.scale / expected.scale - 1).max() < tolerance
 
 
-def assert_explains(result: FitResult, problem: Problem, tolerance_px: float = 1e-5) -> None:
+def assert_explains(result: Result, problem: Problem, tolerance_px: float = 1e-5) -> None:
     """No residual is larger than that: where several alignments fit, each is as good."""
     assert np.abs(result.residuals).max() < tolerance_px
     assert (result.alignment.apply(problem.points_3d)[:, 2] > 0).all()
@@ -173,7 +173,9 @@ def test_optimum_is_equivariant_under_stretching_the_model(seed: int, points: in
     after = fit(problem.points_3d * factor, problem.points_2d, problem.camera)
     old = before.alignment
     assert_aligned(after, Alignment(old.rotation, old.translation, old.scale / factor), 1e-4)
-    np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(
+        after.fisher_covariance, before.fisher_covariance, rtol=1e-2, atol=1e-6
+    )
 
 
 @given(seed=SEEDS, points=COUNTS)
@@ -208,11 +210,11 @@ def test_equivariance_under_a_change_of_the_models_unit(
     after = fit(unit * problem.points_3d, problem.points_2d, problem.camera, method=method)
     old = before.alignment
     assert_aligned(after, Alignment(old.rotation, unit * old.translation, old.scale), 1e-5)
-    if before.covariance is not None:
-        factor = np.array([1, 1, 1, unit, unit, unit, 1, 1])
-        deviation = np.sqrt(before.covariance.diagonal())
-        difference = after.covariance / np.outer(factor, factor) - before.covariance
-        assert (np.abs(difference) < 1e-4 * np.outer(deviation, deviation)).all()
+    if before.fisher_covariance is not None:
+        factor = np.array([1, 1, 1, unit, unit, unit, 1, 1, 1])
+        deviation = np.sqrt(before.fisher_covariance.diagonal())
+        difference = after.fisher_covariance / np.outer(factor, factor) - before.fisher_covariance
+        assert (np.abs(difference) <= 1e-4 * np.outer(deviation, deviation)).all()
 
 
 @METHODS
@@ -255,9 +257,9 @@ def test_duplicating_every_point_halves_the_variance(seed: int, points: int) -> 
     rows = np.tile(np.arange(points), 2)
     twice = fit(problem.points_3d[rows], problem.points_2d[rows], problem.camera)
     assert_aligned(twice, once.alignment, 1e-4)
-    deviation = np.sqrt(once.covariance.diagonal())
-    difference = np.abs(2 * twice.covariance - once.covariance)
-    assert (difference < 1e-3 * np.outer(deviation, deviation)).all()
+    deviation = np.sqrt(once.fisher_covariance.diagonal())
+    difference = np.abs(2 * twice.fisher_covariance - once.fisher_covariance)
+    assert (difference <= 1e-3 * np.outer(deviation, deviation)).all()
 
 
 # --- valid results ---------------------------------------------------------------------------
@@ -289,10 +291,10 @@ def test_every_result_is_a_valid_alignment(
     for other in result.alternatives:
         assert_valid(other.alignment, problem.points_3d)
     assert np.isfinite(result.residuals).all()
-    if result.covariance is not None:
-        assert (np.linalg.eigvalsh(result.covariance) > 0).all()
-        assert (result.covariance == result.covariance.T).all() or np.allclose(
-            result.covariance, result.covariance.T, rtol=1e-6
+    if result.fisher_covariance is not None:
+        assert (np.linalg.eigvalsh(result.fisher_covariance) > 0).all()
+        assert (result.fisher_covariance == result.fisher_covariance.T).all() or np.allclose(
+            result.fisher_covariance, result.fisher_covariance.T, rtol=1e-6
         )
 
 

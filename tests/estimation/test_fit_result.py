@@ -3,38 +3,51 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.problems import fit_problem, problem_of
 
-from cadalign import Alignment, FitResult, FocalPrior
+from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
-from cadalign.estimation.result import Alternative, FitStats
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result import Alternative, FitStats, ViewResult
+from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
 
-MADE = FitResult(
-    alignment=Alignment(
-        Rotation.from_rotvec([0, np.pi / 3, 0]).as_matrix(), [0.5, -0.25, 6], [1, 0.75, 1.25]
-    ),
-    points_3d=np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]]),
-    residuals=np.array([[3.0, 4.0]] + [[0.0, 0.0]] * 5),
-    inliers=np.array([False, True, True, True, True, True]),
-    method="optimal",
-    camera=SIMULATION_CAMERA,
-    sigma=1.0,
-    covariance=np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0.0001, 0.0225]),
-    known_axis="x",
-    stretched_axes="yz",
-    focal="known",
-    focal_prior=None,
-    alternatives=(
-        Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125, SIMULATION_CAMERA),
-    ),
-    stats=FitStats(12, 34, 0.5),
+COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
+WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"
+STATED = Stated(COVARIANCE, COVARIANCE, warnings=(WARNING,))
+POINTS = np.array([[0.0, 0, 1], [1, 0, -1], [0, 1, 1], [1, 1, 1], [1, 0, 1], [0, 0, -1]])
+POSE = Alignment(
+    Rotation.from_rotvec([0, np.pi / 3, 0]).as_matrix(), [0.5, -0.25, 6], [1, 0.75, 1.25]
 )
+
+
+def made(
+    residuals: list[list[float]],
+    inliers: list[bool],
+    stated: Stated = STATED,
+    **changes: Any,
+) -> Result:
+    """A result of the six points."""
+    ids, camera = tuple(range(6)), SIMULATION_CAMERA
+    arrays = SIMULATION_CAMERA.project(POSE.apply(POINTS)), np.array(residuals), np.array(inliers)
+    view = ViewResult(camera, POSE, ids, *arrays, stated)
+    other = Alternative(Alignment(np.eye(3), [0, 0, 5], [1, 2, 0.5]), 0.125, camera, POINTS)
+    fields: dict[str, Any] = {
+        "method": "optimal",
+        "sigma": 1.0,
+        "alternatives": (other,),
+        "stats": FitStats(12, 34, 0.5),
+    }
+    return Result((view,), ids, POINTS, statistics=stated, **{**fields, **changes})
+
+
+NEAR = [[0.0, 0.0]] * 5
+MADE = made([[3.0, 4.0], *NEAR], [False, *[True] * 5])
 
 
 def test_text_of_a_result() -> None:
@@ -42,26 +55,21 @@ def test_text_of_a_result() -> None:
         "optimal: 5 of 6 keypoints, rms 0 px\n"
         "  rotation     60 deg from the camera's axes, +- 0.99 deg\n"
         "  translation  (0.5, -0.25, 6) +- (0.02, 0.03, 0.1)\n"
-        "  scale        (1, 0.75 +- 1 %, 1.25 +- 15 %)\n"
+        "  stretch      (1, 0.75 +- 1 %, 1.25 +- 15 %)\n"
         "  also likely  (0.12 x): scale (1, 2, 0.5)\n"
         "  warning      s_z is known only to +-15 %: there are few keypoints for their noise"
     )
 
 
 def test_text_of_a_result_without_statistics() -> None:
-    plain = replace(
-        MADE,
-        inliers=np.ones(6, dtype=bool),
-        method="aepnp",
-        sigma=None,
-        covariance=None,
-        alternatives=(),
+    plain = made(
+        [[3.0, 4.0], *NEAR], [True] * 6, Stated(None), method="aepnp", sigma=None, alternatives=()
     )
     assert str(plain) == (
         "aepnp: 6 keypoints, rms 2.04 px\n"
         "  rotation     60 deg from the camera's axes\n"
         "  translation  (0.5, -0.25, 6)\n"
-        "  scale        (1, 0.75, 1.25)"
+        "  stretch      (1, 0.75, 1.25)"
     )
 
 
@@ -76,9 +84,9 @@ def test_text_of_a_result_without_statistics() -> None:
     ],
     ids=["made", "alternatives", "linear", "known axis", "unknown focal length"],
 )
-def test_json_brings_back_the_same_result(result: FitResult) -> None:
+def test_json_brings_back_the_same_result(result: Result) -> None:
     text = result.to_json()
-    again = FitResult.from_json(text)
+    again = Result.from_json(text)
     assert again.to_json() == text
     assert str(again) == str(result)
     assert again.alignment == result.alignment
@@ -89,68 +97,61 @@ def test_json_brings_back_the_same_result(result: FitResult) -> None:
 
 
 def test_residuals_behind_the_camera_are_null_in_json() -> None:
-    behind = replace(MADE, residuals=np.array([[np.inf, np.inf]] + [[0.0, 0.0]] * 5))
+    behind = made([[np.inf, np.inf], *NEAR], [False, *[True] * 5])
     text = behind.to_json()
-    assert json.loads(text)["residuals"][0] is None
-    np.testing.assert_array_equal(FitResult.from_json(text).residuals, behind.residuals)
-    # As earlier versions wrote it.
-    older = text.replace("null", "[Infinity, Infinity]", 1)
-    assert '"residuals": [[Infinity' in older
-    np.testing.assert_array_equal(FitResult.from_json(older).residuals, behind.residuals)
+    assert json.loads(text)["views"][0]["residuals"][0] is None
+    np.testing.assert_array_equal(Result.from_json(text).residuals, behind.residuals)
+
+
+def changed(**changes: Any) -> str:
+    return json.dumps(MADE.to_dict() | changes)
+
+
+def with_view(**changes: Any) -> str:
+    (view,) = MADE.to_dict()["views"]
+    return changed(views=[view | changes])
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("{", "fit result: not valid JSON: "),
-        ("[]", "fit result: [] is not an object"),
-        ("{}", "fit result: alignment: missing"),
+        ("{", "result: not valid JSON: "),
+        ("[]", "result: [] is not an object"),
+        ("{}", "result: alignment: missing"),
+        ('{"version": 2}', "result: method: missing"),
+        (changed(version=3), "result: version: 3 is not 2"),
         (
-            json.dumps(MADE.to_dict() | {"alignment": {"scale": [1, 1, 1]}}),
-            "fit result: alignment: missing rotation, translation",
+            with_view(alignment={"scale": [1, 1, 1]}),
+            "result: views[0].alignment: missing rotation, translation",
         ),
         (
-            json.dumps(MADE.to_dict() | {"residuals": [[1, 2, 3]]}),
-            "fit result: residuals[0]: [1, 2, 3] is not a list of 2",
+            with_view(residuals=[[1, 2, 3]]),
+            "result: views[0].residuals[0]: [1, 2, 3] is not a list of 2",
         ),
         (
-            json.dumps(MADE.to_dict() | {"residuals": [None] * 6}),
-            "fit result: residuals[1]: an inlier's residual is not finite",
+            with_view(residuals=[None] * 6),
+            "result: views[0].residuals[1]: an inlier's residual is not finite",
         ),
-        (
-            json.dumps(MADE.to_dict() | {"inliers": [True]}),
-            f"fit result: inliers: 1 entries, but points_3d has {len(MADE.points_3d)}",
-        ),
-        (
-            json.dumps(MADE.to_dict() | {"known_axis": "q"}),
-            "fit result: known_axis: 'q' is not one of 'x', 'y', 'z'",
-        ),
-        (
-            json.dumps(MADE.to_dict() | {"sigma": "1"}),
-            "fit result: sigma: '1' is not a finite number",
-        ),
-        (
-            json.dumps(MADE.to_dict() | {"stats": {"speed": 1}}),
-            "fit result: stats.iterations: missing",
-        ),
+        (with_view(inliers=[True]), "result: views[0].inliers: 1 entries for 6 residuals"),
+        (changed(known_axis="q"), "result: known_axis: 'q' is not one of 'x', 'y', 'z'"),
+        (changed(sigma="1"), "result: sigma: '1' is not a finite number"),
+        (changed(stats={"speed": 1}), "result: stats.iterations: missing"),
     ],
 )
 def test_malformed_json_is_refused(text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
-        FitResult.from_json(text)
+        Result.from_json(text)
     assert str(caught.value).startswith(expected)
 
 
 def test_warnings_look_at_the_inliers_alone() -> None:
-    in_plane = MADE.points_3d * [1, 1, 0] + [0, 0, 0.25]
-    points_3d = np.concatenate([in_plane, [[0.5, 0.5, 3.0]]])
-    result = replace(
-        MADE,
-        points_3d=points_3d,
-        residuals=np.zeros((7, 2)),
-        inliers=np.array([True] * 6 + [False]),
-        alternatives=(),
+    in_plane = POINTS * [1, 1, 0] + [0, 0, 0.25]
+    points, inliers = np.vstack([in_plane, [[0.5, 0.5, 3.0]]]), np.array([True] * 6 + [False])
+    options = FitOptions()
+    statistics = KeypointStatistics(
+        points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
     )
-    assert result.warnings == (
+    vars(statistics)["covariance"] = COVARIANCE
+    assert statistics.warnings == (
         "s_z is known only to +-15 %: the keypoints lie nearly in the plane z = 0.25",
     )

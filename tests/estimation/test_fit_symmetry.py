@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from cadalign import (
     Alignment,
     Camera,
-    FitResult,
     Model,
     RansacOptions,
+    Result,
     Symmetry,
     View,
     align,
@@ -66,7 +66,9 @@ def test_permuted_labels_give_the_same_result(fold, step, angle):
     np.testing.assert_allclose(first.alignment.translation, second.alignment.translation, atol=1e-5)
     np.testing.assert_allclose(first.alignment.scale, second.alignment.scale, atol=1e-5)
     np.testing.assert_allclose(first.points_3d, second.points_3d, atol=1e-4)
-    np.testing.assert_allclose(first.covariance, second.covariance, rtol=1e-2, atol=1e-9)
+    np.testing.assert_allclose(
+        first.fisher_covariance, second.fisher_covariance, rtol=1e-2, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("fold", FOLDS)
@@ -79,7 +81,9 @@ def test_it_is_the_fit_of_keypoints_labelled_as_it_says(fold):
     np.testing.assert_allclose(seen - pixels, result.residuals, atol=1e-7)
     plain = fit(result.points_3d, pixels, CAMERA, stretch="y")
     np.testing.assert_allclose(plain.alignment.rotation, result.alignment.rotation, atol=1e-6)
-    np.testing.assert_allclose(plain.covariance, result.covariance, rtol=1e-3, atol=1e-10)
+    np.testing.assert_allclose(
+        plain.fisher_covariance, result.fisher_covariance, rtol=1e-3, atol=1e-10
+    )
     if fold is not None:
         assert result.std.rotation_deg == pytest.approx(plain.std.rotation_deg, rel=0.02)
         # It looks at the camera within half a step.
@@ -103,7 +107,7 @@ def test_rotations_about_the_axis_count_for_nothing():
     # The axis' own deviation stays: that of the direction of y in the camera frame.
     axis = plain.alignment.rotation @ UP
     across = np.eye(3) - np.outer(axis, axis)
-    deviation = np.sqrt(np.trace(across @ plain.posterior_covariance[:3, :3] @ across))
+    deviation = np.sqrt(np.trace(across @ plain.covariance[:3, :3] @ across))
     assert result.std.rotation_deg == pytest.approx(np.degrees(deviation), rel=0.1)
 
 
@@ -132,7 +136,9 @@ def test_with_the_height_known_a_quarter_turn_exchanges_the_other_two_lengths():
         np.testing.assert_allclose(result.alignment.scale, (1.5, 1, 1), rtol=0.02)
         assert angle_between(result.alignment.rotation, results[0].alignment.rotation) < 1e-3
         plain = fit(result.points_3d, pixels, CAMERA, known_axis="y")
-        np.testing.assert_allclose(result.covariance, plain.covariance, rtol=1e-2, atol=1e-8)
+        np.testing.assert_allclose(
+            result.fisher_covariance, plain.fisher_covariance, rtol=1e-2, atol=1e-8
+        )
 
 
 def test_an_equal_minimum_is_no_alternative():
@@ -164,7 +170,7 @@ def test_a_batch_is_as_single_fits():
         for b, single in enumerate(singles):
             assert (batch.rotation[b] == single.alignment.rotation).all()
             assert (batch.translation[b] == single.alignment.translation).all()
-            assert (batch.covariance[b] == single.covariance).all()
+            assert (batch.fisher_covariance[b] == single.fisher_covariance).all()
 
 
 def test_with_outliers_and_an_unknown_focal_length():
@@ -180,17 +186,19 @@ def test_with_outliers_and_an_unknown_focal_length():
                   stretch="y", symmetry=symmetry)  # fmt: skip
     again = fit(unknown.points_3d, pixels, Camera.without_focal(640, 480), focal="estimate",
                 stretch="y")  # fmt: skip
-    np.testing.assert_allclose(unknown.covariance, again.covariance, rtol=1e-2, atol=1e-8)
+    np.testing.assert_allclose(
+        unknown.fisher_covariance, again.fisher_covariance, rtol=1e-2, atol=1e-8
+    )
 
 
 def test_results_keep_their_symmetry_in_json():
     symmetry = Symmetry.around(UP, fold=None, offset=OFFSET)
     result = fit(*observed(1.0, fold=None), CAMERA, stretch="y", symmetry=symmetry)
-    read = FitResult.from_json(result.to_json())
+    read = Result.from_json(result.to_json())
     assert str(read) == str(result)
     data = result.to_dict()
     del data["symmetry"]  # as in files of earlier versions
-    assert FitResult.from_dict(data).symmetry is None
+    assert Result.from_dict(data).symmetry is None
 
 
 @pytest.mark.parametrize("given", ["__SYM_ROTATE_UP_2", 4, {"axis": [0, 1, 0], "fold": 2}])

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
+from support.covariances import of_unknowns
 from support.problems import LENS, assert_same, moved, problem_of, with_outliers
 
-from cadalign import Alignment, Camera, FitResult, FocalPrior, RansacOptions, fit, fit_batch
+from cadalign import Alignment, Camera, FocalPrior, RansacOptions, Result, fit, fit_batch
 from cadalign.datasets import Bundler, Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import focal_search
@@ -26,7 +27,7 @@ UNKNOWN = Camera.without_focal(640, 480)
 LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
-def fit_unknown(problem: Problem, camera: Camera = UNKNOWN, **options: Any) -> FitResult:
+def fit_unknown(problem: Problem, camera: Camera = UNKNOWN, **options: Any) -> Result:
     return fit(problem.points_3d, problem.points_2d, camera, focal="estimate", **options)
 
 
@@ -131,9 +132,9 @@ def test_result_is_a_minimum_over_all_nine_unknowns(loss: str, prior: FocalPrior
         off = 0.0 if prior is None else np.log(result.camera.fx / prior.focal) + step[8]
         return float(squares.sum() + (off / (prior.relative_sigma if prior else 1.0)) ** 2)
 
-    assert result.covariance is not None
+    assert result.fisher_covariance is not None
     here = cost(np.zeros(9))
-    for k, deviation in enumerate(np.sqrt(result.covariance.diagonal())):
+    for k, deviation in enumerate(np.sqrt(of_unknowns(result.fisher_covariance).diagonal())):
         for sign in (1e-3, -1e-3):
             assert cost(sign * deviation * np.eye(9)[k]) >= here - 1e-9
 
@@ -149,9 +150,9 @@ def test_lens_distortion_is_honoured() -> None:
         np.zeros(9),
         x_scale="jac",
     )
-    assert result.covariance is not None
+    assert result.fisher_covariance is not None
     # Through a lens, errors of pixels become errors of rays by the lens's derivative.
-    assert np.abs(found.x / np.sqrt(result.covariance.diagonal())).max() < 0.3
+    assert np.abs(found.x / np.sqrt(of_unknowns(result.fisher_covariance).diagonal())).max() < 0.3
     assert result.camera.fx == pytest.approx(500, rel=4 * result.std.focal)  # type: ignore[union-attr]
     assert result.camera.distortion == LENS.distortion
 
@@ -189,10 +190,10 @@ def test_known_axis_and_stretch_are_honoured(axis: str, stretch: str | None) -> 
         problem.points_3d, problem.points_2d, problem.camera, known_axis=axis, stretch=stretch
     )
     assert_same(result.alignment, known.alignment, 1e-5)
-    assert result.covariance is not None
-    assert known.covariance is not None
-    where_known = result.covariance.diagonal()[:8] == 0
-    assert (where_known == (known.covariance.diagonal() == 0)).all()
+    assert result.fisher_covariance is not None
+    assert known.fisher_covariance is not None
+    where_known = result.fisher_covariance.diagonal()[:9] == 0
+    assert (where_known == (known.fisher_covariance.diagonal() == 0)).all()
 
 
 def test_linear_guess_is_exact_without_noise() -> None:
@@ -220,14 +221,17 @@ def test_covariance_is_that_of_the_nine_unknowns() -> None:
         np.zeros(9),
         max_nfev=1,
     )
-    assert result.covariance is not None
+    assert result.fisher_covariance is not None
     np.testing.assert_allclose(
-        result.covariance, np.linalg.inv(found.jac.T @ found.jac), rtol=2e-3, atol=1e-9
+        of_unknowns(result.fisher_covariance),
+        np.linalg.inv(found.jac.T @ found.jac),
+        rtol=2e-3,
+        atol=1e-9,
     )
     assert result.std is not None
-    assert result.posterior_covariance is not None
-    assert result.std.focal == pytest.approx(np.sqrt(result.posterior_covariance[8, 8]))
-    assert result.std.focal >= np.sqrt(result.covariance[8, 8])
+    assert result.covariance is not None
+    assert result.std.focal == pytest.approx(np.sqrt(result.covariance[9, 9]))
+    assert result.std.focal >= np.sqrt(result.fisher_covariance[9, 9])
 
 
 def test_known_focal_length_has_eight_unknowns_and_no_deviation() -> None:
@@ -235,8 +239,8 @@ def test_known_focal_length_has_eight_unknowns_and_no_deviation() -> None:
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
     assert result.camera == problem.camera
     assert result.focal == "known"
-    assert result.covariance is not None
-    assert result.covariance.shape == (8, 8)
+    assert result.fisher_covariance is not None
+    assert result.fisher_covariance.shape == (9, 9)
     assert result.std is not None
     assert result.std.focal == 0.0
 
@@ -312,7 +316,7 @@ def test_estimated_noise_comes_with_nine_unknowns() -> None:
     result = fit_unknown(problem, sigma=None)
     assert result.sigma == pytest.approx(np.sqrt((result.residuals**2).sum() / (2 * 60 - 9)))
     known = fit_unknown(problem, sigma=result.sigma)
-    np.testing.assert_allclose(known.covariance, result.covariance, rtol=1e-4)
+    np.testing.assert_allclose(known.fisher_covariance, result.fisher_covariance, rtol=1e-4)
 
 
 # --- priors -----------------------------------------------------------------------------------
@@ -370,7 +374,9 @@ def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() ->
     assert np.abs(np.log(result.alignment.scale)).sum() < np.abs(np.log(free.alignment.scale)).sum()
     known = fit_unknown(problem, sigma=result.sigma, scale_prior_sigma=0.05)
     np.testing.assert_allclose(result.alignment.scale, known.alignment.scale, rtol=1e-3)
-    np.testing.assert_allclose(result.covariance, known.covariance, rtol=1e-2, atol=1e-8)
+    np.testing.assert_allclose(
+        result.fisher_covariance, known.fisher_covariance, rtol=1e-2, atol=1e-8
+    )
 
 
 # --- robust -----------------------------------------------------------------------------------
@@ -429,7 +435,7 @@ def test_best_hypothesis_can_be_had_as_it_is() -> None:
     problem = problem_of(2, points=30, noise_px=0.2)
     result = fit_unknown(problem, ransac=RansacOptions(refine=False))
     assert result.method == "ransac-ap4p"
-    assert result.covariance is None
+    assert result.fisher_covariance is None
     assert result.camera.focal_known
     assert result.rms < 4.0
 
@@ -454,8 +460,8 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         single = fit_unknown(problem, ransac=ransac)
         assert batch.alignment(b) == single.alignment
         assert batch.focal_length[b] == single.camera.fx
-        assert batch.covariance is not None
-        np.testing.assert_array_equal(batch.covariance[b], single.covariance)
+        assert batch.fisher_covariance is not None
+        np.testing.assert_array_equal(batch.fisher_covariance[b], single.fisher_covariance)
     assert list(batch.errors) == [5]
     assert np.isnan(batch.focal_length[5])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign import Alignment, AlignResult, Camera, Model, Size, Symmetry, View, align
+from cadalign import Alignment, Camera, Model, Result, Size, Symmetry, View, align
 from cadalign.errors import InputError
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.geometry.symmetry_group import FACING
@@ -66,9 +66,9 @@ def test_labels_that_are_turned_give_the_same_result(options):
     assert angle_between(first.alignment.rotation, truth.rotation) < 1
     for result in (first, second):
         seen = CAMERA.project(result.alignment.apply(result.points_3d))
-        np.testing.assert_allclose(seen - view.points_2d, result.residuals[0], atol=1e-6)
+        np.testing.assert_allclose(seen - view.points_2d, result.residuals, atol=1e-6)
         assert "4 alignments are equal under the model's symmetry" in str(result)
-        assert str(AlignResult.from_dict(result.to_dict())) == str(result)
+        assert str(Result.from_dict(result.to_dict())) == str(result)
 
 
 def test_with_its_size_known_a_quarter_turn_exchanges_stretches():
@@ -96,9 +96,9 @@ def test_the_motion_turns_every_view(known):
     first, second = (align(model, views) for model in models(stretch="y"))
     assert_same(first, second, tolerance=5e-4)
     assert (second.rig_from_model is not None) == known
-    for view, pose, residuals in zip(views, second.poses, second.residuals, strict=True):
+    for view, found, pose in zip(views, second.views, second.poses, strict=True):
         seen = CAMERA.project(pose.apply(second.points_3d))
-        np.testing.assert_allclose(seen - view.points_2d, residuals, atol=1e-6)
+        np.testing.assert_allclose(seen - view.points_2d, found.residuals, atol=1e-6)
         if known:
             in_camera = Alignment(view.cam_from_rig[:3, :3], view.cam_from_rig[:3, 3], np.ones(3))
             in_view = in_camera @ second.rig_from_model

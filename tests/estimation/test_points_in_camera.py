@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cadalign import Alignment, AlignResult, Camera, Model, ShapeModel, View, align
+from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.projection import projected_covariances
@@ -53,7 +53,7 @@ def test_keypoints_that_are_seen_are_better_known_than_the_rest() -> None:
 def test_they_are_read_as_they_were_written() -> None:
     model = Model(points_3d=CORNERS, shape_sigma=0.05)
     result = align(model, View(CAMERA, photo_of(CORNERS)))
-    again = AlignResult.from_dict(result.to_dict())
+    again = Result.from_dict(result.to_dict())
     assert (again.points_cam_covariance == result.points_cam_covariance).all()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.scenes import CAMERA, around, in_camera, keypoints, seen, truth_of
 
-from cadalign import Alignment, AlignResult, Model, ShapeModel, View, align
+from cadalign import Alignment, Model, Result, ShapeModel, View, align
 from cadalign.errors import DegenerateError, InputError
 from cadalign.metrics import rotation_error
 
@@ -46,11 +46,11 @@ def test_a_view_that_determines_no_pose_is_left_out_and_named(count: int) -> Non
     assert result.warnings == (*expected.warnings, plural)
     assert result.alignment == expected.alignment
     assert result.poses[2] == expected.poses[1]
-    assert not result.inliers[1].any()
-    assert np.abs(result.residuals[1]).max() < 1e-3  # its pose is one that explains them
+    assert not result.views[1].inliers.any()
+    assert np.abs(result.views[1].residuals).max() < 1e-3  # its pose is one that explains them
     assert [each.view for each in result.evidence] == [0, 2]
     assert [each.view for each in result.contributions()] == [0, 2]
-    written = AlignResult.from_dict(result.to_dict())
+    written = Result.from_dict(result.to_dict())
     assert written.cameras == tuple(view.camera for view in (views[0], weak, views[1]))
     assert [len(points) for points in result.observed] == [8, count, 8]
 

@@ -18,7 +18,7 @@ from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_c
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.evaluation import plots
 from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
@@ -305,7 +305,7 @@ class TestRows:
         )
         angle = np.radians(0.4)
         turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-        est = FitResult(
+        est = Result(
             alignment=Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99]),
             points_3d=points,
             residuals=np.zeros((4, 2)),

@@ -10,8 +10,8 @@ import numpy as np
 from fuzz.fit_cases import Case
 from fuzz.hostile import Call, made
 
-from cadalign import Alignment, CadalignError, Camera, FitResult, fit, fit_batch
-from cadalign.estimation.batch import BatchResult
+from cadalign import Alignment, CadalignError, Camera, Result, fit, fit_batch
+from cadalign.estimation.results import Results
 from cadalign.metrics import rotation_error
 
 ROTATION_TOLERANCE = 1e-9
@@ -46,7 +46,7 @@ def run_case(case: Case) -> float:
         seconds = time.process_time() - begin
         check_result(result)
         text = result.to_json()
-        assert FitResult.from_json(text).to_json() == text, "JSON does not give the result back"
+        assert Result.from_json(text).to_json() == text, "JSON does not give the result back"
         assert all(line.isprintable() for line in str(result).splitlines())
     if case.truth is not None:
         cameras = [result.camera, *(other.camera for other in result.alternatives)]
@@ -70,7 +70,7 @@ def run_batch(cases: Sequence[Case]) -> None:
     given = [case for case in cases if not isinstance(case.camera, Call)]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fits: list[FitResult | CadalignError] = []
+        fits: list[Result | CadalignError] = []
         for case in given:
             try:
                 fits.append(fit(case.points_3d, case.points_2d, case.camera, **options))
@@ -93,7 +93,7 @@ def run_batch(cases: Sequence[Case]) -> None:
         _compare(batch, problem, one)
 
 
-def check_result(result: FitResult) -> None:
+def check_result(result: Result) -> None:
     """Check that all alignments of a result are rotations and that all its numbers are finite."""
     for alignment in (result.alignment, *(other.alignment for other in result.alternatives)):
         _check_alignment(alignment)
@@ -113,7 +113,7 @@ def check_message(error: CadalignError) -> None:
     assert len(str(error)) < LONGEST_MESSAGE, "the message quotes its input at length"
 
 
-def _fit(case: Case) -> FitResult:
+def _fit(case: Case) -> Result:
     options = {name: made(value) for name, value in case.options.items()}
     return fit(case.points_3d, case.points_2d, made(case.camera), **options)
 
@@ -127,7 +127,7 @@ def _check_alignment(alignment: Alignment) -> None:
     assert (alignment.scale > 0).all()
 
 
-def _compare(batch: BatchResult, problem: int, one: FitResult | CadalignError) -> None:
+def _compare(batch: Results, problem: int, one: Result | CadalignError) -> None:
     if isinstance(one, CadalignError):
         assert type(batch.errors.get(problem)) is type(one), "only a single call refuses"
         return

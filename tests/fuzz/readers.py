@@ -18,7 +18,7 @@ import trimesh
 from PIL import Image
 
 import cadalign
-from cadalign import Alignment, Camera, FitResult, FocalPrior, Library, fit
+from cadalign import Alignment, Camera, FocalPrior, Library, Result, fit
 from cadalign.datasets import (
     BlindPnP,
     Bundler,
@@ -368,7 +368,7 @@ def _read_colmap(path: Path) -> object:
 
 
 def _read_fit(path: Path) -> object:
-    return FitResult.from_json(path.read_text("utf-8", "replace"))
+    return Result.from_json(path.read_text("utf-8", "replace"))
 
 
 def _read_run(path: Path) -> object:

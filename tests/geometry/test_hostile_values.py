@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.refusals import refusal_text
 
-from cadalign import Alignment, CadalignError, Camera, FitResult
+from cadalign import Alignment, CadalignError, Camera, Result
 from cadalign.arrays import as_floats
 from cadalign.geometry.camera import COLMAP_PARAMS
 
@@ -42,7 +42,7 @@ def read_or_refuse(act: Callable[[], object]) -> None:
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
 def test_cameras_and_alignments_take_any_value_or_refuse_it(value: Any) -> None:
     camera, alignment = CAMERA.to_dict(), Alignment.identity().to_dict()
-    for reader in (Camera, Alignment, FitResult):
+    for reader in (Camera, Alignment, Result):
         read_or_refuse(lambda reader=reader: reader.from_dict(value))  # type: ignore[misc]
     for key in camera:
         read_or_refuse(lambda key=key: Camera.from_dict({**camera, key: value}))  # type: ignore[misc]

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign import Alignment
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import State
 
 
-def bound_of(result: AlignResult, truths: Sequence[Alignment]) -> np.ndarray:
+def bound_of(result: Result, truths: Sequence[Alignment]) -> np.ndarray:
     """Covariance (9, 9) of pose in the first camera and log lengths, at the true poses.
 
     ``truths`` are in the frame of each pose: the rig's, or each view's camera.
@@ -31,7 +31,7 @@ def bound_of(result: AlignResult, truths: Sequence[Alignment]) -> np.ndarray:
     return pose_and_lengths(result.basis.evidence, true_state, unknowns)
 
 
-def whitened_square(result: AlignResult, truths: Sequence[Alignment]) -> float:
+def whitened_square(result: Result, truths: Sequence[Alignment]) -> float:
     """Square of the error over the bound, divided by its number of unknowns: 1 on average."""
     bound = bound_of(result, truths)
     turn = vector_from_rotation(result.alignment.rotation @ truths[0].rotation.T)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cadalign import Alignment, Camera, FitResult, fit
+from cadalign import Alignment, Camera, Result, fit
 from cadalign.datasets import Correspondences
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
@@ -23,7 +23,7 @@ def problem_of(seed: int, *, points: int = 12, noise_px: float = 0.5, **options:
     )
 
 
-def fit_problem(problem: Problem, **options: Any) -> FitResult:
+def fit_problem(problem: Problem, **options: Any) -> Result:
     return fit(problem.points_3d, problem.points_2d, problem.camera, **options)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.assemble import Minimum
 from cadalign.estimation.contours.loop import (
     ContourFit,
@@ -39,6 +38,8 @@ from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.result import Result
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -73,7 +74,7 @@ class MaskFit(NamedTuple):
     residuals: tuple[MaskResiduals | None, ...]
     warnings: tuple[str, ...]
 
-    def noted_in(self, result: AlignResult) -> AlignResult:
+    def noted_in(self, result: Result) -> Result:
         """The result with what is known of the masks."""
         if not self.residuals:
             return result
@@ -84,12 +85,12 @@ class MaskFit(NamedTuple):
             for number, each in enumerate(self.residuals)
             if each is not None
         ]
-        return replace(
-            result,
-            mask_residuals=self.residuals,
+        statistics = replace(
+            Stated.of(result.statistics),
             evidence=(*result.evidence, *summaries),
             warnings=(*result.warnings, *self.warnings),
         )
+        return replace(result, mask_residuals=self.residuals, statistics=statistics)
 
 
 class _Candidate(NamedTuple):
@@ -370,7 +371,7 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
     Returns
     -------
     (9, 9) float
-        As `AlignResult.covariance`.
+        As `cadalign.Result.covariance`.
 
     Raises
     ------

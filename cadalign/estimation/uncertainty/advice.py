@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
     is_exact,
@@ -26,6 +25,7 @@ from cadalign.estimation.estimates import (
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
@@ -76,7 +76,7 @@ class Advice:
 def rank_evidence(
     model: Model | ShapeModel,
     views: View | Sequence[View],
-    estimate: Alignment | AlignResult,
+    estimate: Alignment | Result,
     *,
     candidates: Sequence[Hashable] = (),
     mask: npt.ArrayLike | None = None,
@@ -94,7 +94,7 @@ def rank_evidence(
     model : Model or ShapeModel
     views : View or sequence of View
         All that is there; of a depth image, what it tells at keypoints counts.
-    estimate : Alignment or AlignResult
+    estimate : Alignment or Result
         The estimate from them. An alignment, in the first camera, suffices for an exact model and
         one view, or views with ``cam_from_rig``.
     candidates : sequence of int or str
@@ -309,7 +309,7 @@ class KnownScene:
         return self.views[number].camera.project(seen)
 
     def covariance(self) -> FloatArray:
-        """Covariance (9, 9) of an estimate, as `AlignResult.covariance`, linearised."""
+        """Covariance (9, 9) of an estimate, as `cadalign.Result.covariance`, linearised."""
         evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
         evidence, state = self._widened(evidence, self._state(evidence))
         own = evidence
@@ -359,7 +359,7 @@ def scene_of(
     Raises
     ------
     InputError
-        If the estimate is neither an Alignment nor an AlignResult, or does not tell shape and all
+        If the estimate is neither an Alignment nor a Result, or does not tell shape and all
         poses, or a view has a mask that is not of an exact model.
     """
     if not views:
@@ -370,8 +370,8 @@ def scene_of(
         poses = _poses_from(model, views, estimate)
         shape = prior.components[0].mean
         return KnownScene(model, prior, views, poses, shape[:-2], shape[-2:], size)
-    if not isinstance(estimate, AlignResult):
-        what = f"expected an Alignment or an AlignResult, got {type(estimate).__name__}"
+    if not isinstance(estimate, Result):
+        what = f"expected an Alignment or a Result, got {type(estimate).__name__}"
         raise InputError(what, where="estimate")
     if len(estimate.poses) != len(views):
         what = f"the estimate is from {len(estimate.poses)} views, given are {len(views)}"
@@ -395,7 +395,7 @@ def _poses_from(
     model: Model | ShapeModel, views: Sequence[View], first: Alignment
 ) -> tuple[Alignment, ...]:
     """Poses in every camera from that in the first."""
-    fix = "give the AlignResult of `align`"
+    fix = "give the Result of `align`"
     if isinstance(model, ShapeModel) or model.shape_sigma is not None:
         raise InputError("an alignment does not tell the shape", where="estimate", fix=fix)
     if len(views) == 1:

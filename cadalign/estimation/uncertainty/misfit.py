@@ -16,14 +16,14 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
 from cadalign.estimation.uncertainty.posterior import Likelihood
+from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
-from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.projection import ray_derivatives
 
 _FALSE_ALARMS = 0.004
@@ -31,8 +31,9 @@ _FALSE_STRETCH_ALARMS = 0.002
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 _MOST_NAMED = 5
 _SCALES = 2  # unknown ones, of an alignment without constraints
+_UNKNOWNS = 10  # of a result's covariance, focal length included
 Rows = npt.NDArray[np.intp]
-FitRows = Callable[[Rows, bool], FitResult]
+FitRows = Callable[[Rows, bool], Result]
 """Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
 True."""
 
@@ -97,7 +98,7 @@ class Misfit:
         )
 
 
-def find_misfit(result: FitResult, options: FitOptions) -> Misfit | None:
+def find_misfit(result: KeypointStatistics) -> Misfit | None:
     """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
 
     The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
@@ -105,10 +106,10 @@ def find_misfit(result: FitResult, options: FitOptions) -> Misfit | None:
     count as equations that are always met. A constraint on the scales is tested by the decrease of
     the sum without it, which has one degree of freedom for each scale.
     """
-    if options.sigma is None:
+    if result.options.sigma is None:
         return None
     try:
-        tested = _Tested.of(result, options)
+        tested = _Tested.of(result)
     except InputError:  # a depth that rounds to zero has no projection
         return None
     free_scale = _contradicting_scale(tested)
@@ -119,21 +120,22 @@ def find_misfit(result: FitResult, options: FitOptions) -> Misfit | None:
     return Misfit(tested.chi_square, tested.redundancy, outliers=_outliers(tested))
 
 
-def unverified_stretch(result: FitResult, options: FitOptions) -> str | None:
+def unverified_stretch(result: KeypointStatistics) -> str | None:
     """Warn about scales held at 1 where the keypoints would not contradict another value.
 
     None where nothing is held, sigma is estimated, or the free scales are not determined at all,
     which is what holding them is for.
     """
+    options = result.options
     held = set("xyz") - {options.known_axis} - set(options.stretched_axes)
     if not held or options.sigma is None:
         return None
     try:
-        free = _Tested.of(result, options).fit(stretch=None)
+        free = _Tested.of(result).fit(stretch=None)
     except CadalignError:
         return None
-    assert free.covariance is not None
-    scale = uncertainty_of(free.covariance, free.known_axis).scale
+    assert free.fisher_covariance is not None
+    scale = uncertainty_of(free.fisher_covariance).scale
     doubtful = [axis for axis in sorted(held) if scale["xyz".index(axis)] > WEAK_SCALE]
     if not doubtful:
         return None
@@ -156,11 +158,11 @@ class _Tested:
     chi_square: float
 
     @classmethod
-    def of(cls, result: FitResult, options: FitOptions) -> _Tested:
+    def of(cls, result: KeypointStatistics) -> _Tested:
         rows = np.flatnonzero(result.inliers)
         points_3d, residuals = result.points_3d[rows], result.residuals[rows]
         projected = result.camera.project(result.alignment.apply(points_3d))
-        likelihood = Likelihood.of(result, options)
+        likelihood = Likelihood.of(result)
         covariances = np.linalg.inv(likelihood.information)
         return cls(
             points_3d,
@@ -168,7 +170,7 @@ class _Tested:
             np.broadcast_to(covariances, (len(rows), 2, 2)),
             rows,
             result.camera,
-            options,
+            result.options,
             float(likelihood.losses(residuals).sum()),
         )
 
@@ -186,7 +188,7 @@ class _Tested:
         redundancy = self.redundancy
         return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
 
-    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FitResult:
+    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> Result:
         """Fit some of the keypoints anew, with changed options."""
         from cadalign.estimation.fit import fit
 
@@ -201,8 +203,7 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
         return None
     try:
         free = tested.fit(stretch=None, scale_prior_sigma=None)
-        assert free.options is not None
-        decrease = tested.chi_square - _Tested.of(free, free.options).chi_square
+        decrease = tested.chi_square - _retested(free).chi_square
     except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
         return None
     if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
@@ -211,10 +212,16 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     return x, y, z
 
 
+def _retested(result: Result) -> _Tested:
+    """The test of another fit."""
+    assert isinstance(result.statistics, KeypointStatistics)
+    return _Tested.of(result.statistics)
+
+
 def _outliers(tested: _Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
-    def fit_rows(rows: Rows, robust: bool) -> FitResult:
+    def fit_rows(rows: Rows, robust: bool) -> Result:
         loss = "cauchy" if robust else "linear"
         return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
 
@@ -229,8 +236,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
     rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
-    assert rest.options is not None
-    if not _Tested.of(rest, rest.options).passes:
+    if not _retested(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}
 
@@ -343,19 +349,14 @@ class _Search:
         expected = self.noise.copy()
         others = np.setdiff1d(np.arange(len(self.points_3d)), rows)
         others = others[result.alignment.apply(self.points_3d[others])[:, 2] > 0]
-        if len(others) and result.covariance is not None:
-            jacobian = projection_jacobian(
-                self.points_3d[others],
-                result.camera,
-                result.alignment,
-                known_axis=result.known_axis,
-                unknowns=len(result.covariance),
-            )
-            expected[others] += predicted_covariances(jacobian, result.covariance)
+        covariance = result.fisher_covariance
+        if len(others) and covariance is not None:
+            jacobian = projection_jacobian(self.points_3d[others], result.camera, result.alignment)
+            expected[others] += predicted_covariances(jacobian, covariance)
         squares = _squares(residuals, expected) / 2
         return squares / self.level.variance(total, redundancy), redundancy
 
-    def residuals(self, result: FitResult) -> FloatArray:
+    def residuals(self, result: Result) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
         in_camera = result.alignment.apply(self.points_3d)
         ahead = in_camera[:, 2] > 0
@@ -378,39 +379,30 @@ def _f_quantile(chance: float, equations: float) -> float:
     return equations / 2 * (math.pow(chance, -2 / equations) - 1)
 
 
-def projection_jacobian(
-    points_3d: FloatArray,
-    camera: Camera,
-    alignment: Alignment,
-    *,
-    known_axis: str,
-    unknowns: int,
-) -> FloatArray:
-    """Derivatives (n, 2, unknowns) of projected points, in the order of `FitResult.covariance`.
+def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Derivatives (n, 2, 10) of projected points, in the order of `cadalign.Result.covariance`.
 
-    In pixels per rad, model unit, and unit of a logarithm; 9 unknowns include that of the focal
-    length. Refuses points behind the camera.
+    In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
     """
-    if unknowns not in (UNKNOWNS, UNKNOWNS + 1):
-        raise InputError(f"{unknowns} is neither 8 nor 9", where="unknowns")
     in_camera = alignment.apply(points_3d)
     if not (in_camera[:, 2] > 0).all():
         raise InputError("a point lies behind the camera", where="points_3d")
     rays = perspective(in_camera)
-    # The kernel takes the known axis first, and has the scales of the other two in cyclic order.
-    first = "xyz".index(known_axis)
-    order = [first, (first + 1) % 3, (first + 2) % 3]
-    ordered = Alignment(
-        alignment.rotation[:, order], alignment.translation, alignment.scale[order], is_valid=True
-    )
-    of_rays = ray_derivatives(np.ascontiguousarray(points_3d[:, order], float), ordered.packed)
-    if order[1] > order[2]:
-        of_rays = of_rays[:, :, [0, 1, 2, 3, 4, 5, 7, 6]]
+    of_rays = np.zeros((len(rays), 2, _UNKNOWNS))
+    # The kernel knows the first axis, and gives the derivatives by the scales of the other two.
+    for order, last in (([0, 1, 2], [7, 8]), ([2, 0, 1], [6, 7])):
+        ordered = Alignment(
+            alignment.rotation[:, order],
+            alignment.translation,
+            alignment.scale[order],
+            is_valid=True,
+        )
+        of_rays[:, :, [0, 1, 2, 3, 4, 5, *last]] = ray_derivatives(
+            np.ascontiguousarray(points_3d[:, order], float), ordered.packed
+        )
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
     jacobian = to_pixels @ of_rays
-    if unknowns > UNKNOWNS:
-        off_center = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
-        jacobian = np.concatenate([jacobian, off_center[:, :, None]], axis=2)
+    jacobian[:, :, 9] = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
     return np.asarray(jacobian)
 
 
@@ -419,9 +411,10 @@ def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> Float
 
     Parameters
     ----------
-    jacobian : (n, 2, k) float
+    jacobian : (n, 2, 10) float
         See `projection_jacobian`.
-    covariance : (k, k) float
-        Of the unknowns.
+    covariance : (9, 9) or (10, 10) float
+        Of the unknowns, without the focal length where that is known.
     """
+    jacobian = jacobian[:, :, : len(covariance)]
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

@@ -25,7 +25,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result import FitResult
+    from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
@@ -45,20 +45,21 @@ _SEED = 0
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 
 
-def posterior_covariance(result: FitResult, options: FitOptions) -> FloatArray:
-    """Covariance of the errors by the posterior; see `FitResult.posterior_covariance`."""
-    assert result.covariance is not None
+def posterior_covariance(result: KeypointStatistics) -> FloatArray:
+    """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
+    assert result.fisher_covariance is not None
+    options = result.options
     points = result.points_3d[result.inliers]
     widening = 1.0
     if options.sigma is None:
         pairs = distinct_rows(np.concatenate([points, result.residuals[result.inliers]], axis=1))
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
-    first = _with_noise_times(widening, result.covariance, options)
+    first = _with_noise_times(widening, result.fisher_covariance, options)
     if len(points) > MOST_POINTS:
         return first
     try:
-        sampled = _sample(result, first, Likelihood.of(result, options), widening)
+        sampled = _sample(result, first, Likelihood.of(result), widening)
     except (np.linalg.LinAlgError, InputError):  # coordinates come near the range of numbers
         return first
     return first if sampled is None else sampled
@@ -72,50 +73,42 @@ def widening_of(unknowns: int, redundancy: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Chart:
-    """Coordinates (9,) about an alignment, in which its posterior is nearly Gaussian."""
+    """Coordinates (10,) about an alignment, in which its posterior is nearly Gaussian."""
 
     alignment: Alignment
     camera: Camera
-    known_axis: str
     points: FloatArray  # centred
     center: FloatArray
     in_camera: FloatArray  # the center
 
     @classmethod
-    def of(cls, result: FitResult) -> _Chart:
+    def of(cls, result: KeypointStatistics) -> _Chart:
         points = result.points_3d[result.inliers]
         center = points.mean(axis=0)
         (in_camera,) = result.alignment.apply(center[None])
-        known = result.known_axis
-        return cls(result.alignment, result.camera, known, points - center, center, in_camera)
-
-    @property
-    def _stretched(self) -> list[int]:
-        return [axis for axis in range(3) if "xyz"[axis] != self.known_axis]
+        return cls(result.alignment, result.camera, points - center, center, in_camera)
 
     def jacobian(self) -> FloatArray:
-        """Derivatives (9, 9) of the coordinates by the unknowns of a covariance."""
+        """Derivatives (10, 10) of the coordinates by the unknowns of a covariance."""
         of_axes = self.alignment.rotation * (self.alignment.scale * self.center)
         x, y, z = of_axes.sum(axis=1)
-        of_center = np.zeros((3, 9))
+        of_center = np.zeros((3, 10))
         of_center[:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
         of_center[:, 3:6] = np.eye(3)
-        of_center[:, 6:8] = of_axes[:, self._stretched]
+        of_center[:, 6:9] = of_axes
         u, v, depth = self.in_camera
-        jacobian = np.eye(9)
+        jacobian = np.eye(10)
         jacobian[3:6] = np.array([[1, 0, -u / depth], [0, 1, -v / depth], [0, 0, 1]]) @ of_center
         jacobian[3:6] /= depth
         return jacobian
 
     def evaluate(self, steps: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Evaluate alignments at coordinates (k, 9).
+        """Evaluate alignments at coordinates (k, 10).
 
-        Returns projections (k, n, 2) [px], NaN behind the camera; deviations (k, 9) of the unknowns
-        of a covariance; logarithms of the scales (k, 3) and of the focal lengths (k,).
+        Returns projections (k, n, 2) [px], NaN behind the camera; deviations (k, 10) of the
+        unknowns of a covariance; logarithms of the scales (k, 3) and of the focal lengths (k,).
         """
-        log_scales = np.zeros((len(steps), 3))
-        log_scales[:, self._stretched] = steps[:, 6:8]
-        log_scales += np.log(self.alignment.scale)
+        log_scales = steps[:, 6:9] + np.log(self.alignment.scale)
         u, v, depth = self.in_camera
         depths = depth * np.exp(steps[:, 5])
         centers = np.stack(
@@ -129,18 +122,18 @@ class _Chart:
         rays = (in_camera[:, :2] / ahead[:, None]).transpose(0, 2, 1)
         principal = np.array([self.camera.cx, self.camera.cy])
         pixels = self.camera.pixels_from_normalized(rays.reshape(-1, 2)).reshape(rays.shape)
-        pixels = (pixels - principal) * np.exp(steps[:, 8])[:, None, None] + principal
+        pixels = (pixels - principal) * np.exp(steps[:, 9])[:, None, None] + principal
         deviations = steps.copy()
         deviations[:, 3:6] = centers - linear @ self.center - self.alignment.translation
-        return pixels, deviations, log_scales, np.log(self.camera.fx) + steps[:, 8]
+        return pixels, deviations, log_scales, np.log(self.camera.fx) + steps[:, 9]
 
 
 def _prior_information(options: FitOptions, size: int) -> FloatArray:
-    """Inverse variances (8,) or (9,) of the priors; 0 for none."""
+    """Inverse variances (9,) or (10,) of the priors; 0 for none."""
     information = np.zeros(size)
-    information[6:8] = options.prior_weight
+    information[6:9] = options.prior_weight
     if options.focal_prior is not None:
-        information[8] = options.focal_prior.relative_sigma**-2
+        information[9] = options.focal_prior.relative_sigma**-2
     return information
 
 
@@ -162,7 +155,7 @@ def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptio
 
 @np.errstate(all="ignore")  # draws that overflow have no weight
 def _sample(
-    result: FitResult, first: FloatArray, likelihood: Likelihood, widening: float
+    result: KeypointStatistics, first: FloatArray, likelihood: Likelihood, widening: float
 ) -> FloatArray | None:
     """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
 
@@ -181,12 +174,12 @@ def _sample(
     observed = projected - result.residuals[kept]
     loss_weights = likelihood.weights(result.residuals[kept])
     rng = np.random.default_rng(_SEED)
-    deviations, costs, weights = np.zeros((1, 9)), np.zeros(1), np.ones(1)
+    deviations, costs, weights = np.zeros((1, 10)), np.zeros(1), np.ones(1)
     for count in _DRAWS:
         factor = np.linalg.cholesky(proposal)
         normal = rng.standard_normal((count, len(free)))
         draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
-        steps = np.zeros((count, 9))
+        steps = np.zeros((count, 10))
         steps[:, free] = mean + draws @ factor.T
         pixels, deviations, log_scales, log_focals = chart.evaluate(steps)
         costs = likelihood.squares(pixels - observed) @ loss_weights / widening
@@ -209,7 +202,7 @@ def _sample(
         centered = steps[:, free] - mean
         proposal = _INFLATION * (centered * adapted[:, None]).T @ centered
     at_estimate = likelihood.squares(result.residuals[kept]) @ loss_weights / widening
-    at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 9)))[2:])[0]
+    at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 10)))[2:])[0]
     limit = chi_square_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
     moved = deviations[:, free]
@@ -281,8 +274,9 @@ class Likelihood:
     options: FitOptions
 
     @classmethod
-    def of(cls, result: FitResult, options: FitOptions) -> Likelihood:
+    def of(cls, result: KeypointStatistics) -> Likelihood:
         """The likelihood of the inliers that the result maximises, at its estimated sigma."""
+        options = result.options
         sigma: Any = result.sigma if options.sigma is None else options.sigma
         if np.ndim(sigma) == 0:
             return cls(np.eye(2) / float(sigma) ** 2, options)

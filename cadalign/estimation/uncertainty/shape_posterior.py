@@ -15,10 +15,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.projection import perspective
 from cadalign.shapes.gaussians import Gaussians
@@ -48,13 +48,13 @@ class ShapePosterior:
 
 
 def shape_posterior(
-    result: AlignResult, view: View, *, loss: str = "linear", loss_scale: float = 2.0
+    result: Result, view: View, *, loss: str = "linear", loss_scale: float = 2.0
 ) -> ShapePosterior:
     """Posterior of the shape whose alignment with one view's keypoints is ``result``.
 
     Parameters
     ----------
-    result : AlignResult
+    result : Result
         `align` of a `ShapeModel` with ``view`` alone. Its outliers are left out.
     view : View
         The keypoints; depths and directions are not used.
@@ -105,10 +105,10 @@ def gaussians_of(model: ShapeModel) -> Gaussians:
 
 
 def _linearised(
-    result: AlignResult, view: View, loss: int, loss_scale: float
+    result: Result, view: View, loss: int, loss_scale: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Whitened and weighted: derivatives by shape (2 n, d) and pose (2 n, 6), residuals (2 n,)."""
-    kept = result.inliers[0]
+    kept = result.inliers
     ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
     names = prior_of(result.model).rows_of(ids, "view.ids")
     pixels = np.require(cast(FloatArray, view.points_2d), requirements="W")

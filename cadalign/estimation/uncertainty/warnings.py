@@ -19,7 +19,7 @@ from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import search_joint
 
 if TYPE_CHECKING:
-    from cadalign.estimation.align_result import AlignAlternative
+    from cadalign.estimation.result import Alternative
 
 _WRONG_UNIT = 100.0  # factor of depths, or of the size that they give the object
 _LIKELY = 0.1  # probability of an alternative that is worth a warning
@@ -65,7 +65,7 @@ def weaknesses(pose: Alignment, covariance: FloatArray) -> list[str]:
     return warnings
 
 
-def another_pose(best: Alignment, others: Sequence[AlignAlternative]) -> tuple[str, ...]:
+def another_pose(best: Alignment, others: Sequence[Alternative]) -> tuple[str, ...]:
     """Warning about the likeliest alternative, if it has a share of the probability."""
     if not others:
         return ()

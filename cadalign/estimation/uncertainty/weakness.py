@@ -41,25 +41,16 @@ class Uncertainty:
     focal: float
 
 
-def uncertainty_of(covariance: FloatArray, known_axis: str) -> Uncertainty:
-    """Standard deviations from a covariance (8, 8) or (9, 9)."""
+def uncertainty_of(covariance: FloatArray) -> Uncertainty:
+    """Standard deviations from a covariance (9, 9) or (10, 10)."""
     variance = np.maximum(covariance.diagonal(), 0.0)
-    scale = [0.0, 0.0, 0.0]
-    for place, axis in enumerate(unknown_axes(known_axis)):
-        scale[axis] = float(np.sqrt(variance[6 + place]))
-    x, y, z = np.sqrt(variance[3:6]).tolist()
+    x, y, z, sx, sy, sz = np.sqrt(variance[3:9]).tolist()
     return Uncertainty(
         rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),
         translation=(x, y, z),
-        scale=(scale[0], scale[1], scale[2]),
-        focal=float(np.sqrt(variance[8:].sum())),
+        scale=(sx, sy, sz),
+        focal=float(np.sqrt(variance[9:].sum())),
     )
-
-
-def unknown_axes(known_axis: str) -> tuple[int, int]:
-    """The two axes, in order, whose scale is unknown."""
-    first, second = (axis for axis in range(3) if "xyz"[axis] != known_axis)
-    return first, second
 
 
 @np.errstate(all="ignore")  # lengths that overflow are of translations known well enough

@@ -8,7 +8,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.focal_search import focal_slopes
 from cadalign.estimation.options import Sigma
-from cadalign.estimation.problems import whitening_of
+from cadalign.estimation.problems import full_covariance, whitening_of
 from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -20,6 +20,8 @@ from cadalign.solvers.covariance import covariance_of, focal_covariance
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
+_FOCAL = 9  # row of the focal length
+_OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1
 
 
 def cramer_rao_bound(
@@ -33,8 +35,8 @@ def cramer_rao_bound(
     """The least covariance that any unbiased estimate of an alignment can have.
 
     The inverse of the Fisher information (J' W J)^-1 at the truth, which has the scale 1 along x,
-    for independent Gaussian noise of the keypoints; in the order of `FitResult.covariance`, (8, 8)
-    or (9, 9). ``sigma`` and ``focal`` are as for `cadalign.fit`.
+    for independent Gaussian noise of the keypoints; as `cadalign.Result.covariance`, (9, 9) or
+    (10, 10). ``sigma`` and ``focal`` are as for `cadalign.fit`.
     """
     in_camera = gt.apply(points_3d)
     rays = perspective(in_camera)
@@ -48,7 +50,7 @@ def cramer_rao_bound(
         undetermined = focal_covariance(objective, slopes, 0.0, gt.packed, covariance)
     if undetermined >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
-    return covariance
+    return full_covariance(covariance, "x")
 
 
 def sample_limit(
@@ -59,13 +61,16 @@ def sample_limit(
     By name, each (draws,) float in the units of `cadalign.metrics`; ``focal_error``, relative, only
     if the focal length is unknown.
     """
-    errors = rng.multivariate_normal(np.zeros(len(bound)), bound, size=draws, method="eigh")
-    focal = {"focal_error": np.abs(np.expm1(errors[:, 8]))} if len(bound) > UNKNOWNS else {}
+    errors = np.zeros((draws, len(bound)))
+    free = np.flatnonzero(bound.diagonal())
+    own, mean = bound[np.ix_(free, free)], np.zeros(len(free))
+    errors[:, free] = rng.multivariate_normal(mean, own, size=draws, method="eigh")
+    focal = {"focal_error": np.abs(np.expm1(errors[:, _FOCAL]))} if len(bound) > _FOCAL else {}
     return focal | {
         "rotation_error_deg": np.degrees(np.linalg.norm(errors[:, :3], axis=1)),
         "translation_error": np.linalg.norm(errors[:, 3:6], axis=1),
-        "scale_y_error": np.abs(np.expm1(errors[:, 6])),
-        "scale_z_error": np.abs(np.expm1(errors[:, 7])),
+        "scale_y_error": np.abs(np.expm1(errors[:, 7])),
+        "scale_z_error": np.abs(np.expm1(errors[:, 8])),
     }
 
 
@@ -79,7 +84,7 @@ def limit_estimate(
     the compared methods, so that no chance enters the comparison. The truth has the scale 1 along
     x, the camera no lens distortion.
     """
-    jacobian = projection_jacobian(points_3d, camera, gt, known_axis="x", unknowns=UNKNOWNS)
+    jacobian = projection_jacobian(points_3d, camera, gt)[:, :, _OF_STRETCHED]
     jacobian = jacobian.reshape(-1, UNKNOWNS)
     noise = (points_2d - camera.project(gt.apply(points_3d))).ravel()
     norms = np.linalg.norm(jacobian, axis=0)

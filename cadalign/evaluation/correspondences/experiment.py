@@ -37,7 +37,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.evaluation.accuracy.methods import fit_options, is_robust
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
@@ -119,7 +119,7 @@ class CorrespondenceExperiment:
         return Rows.of(outcomes)
 
 
-def errors_of(result: FitResult, truth: Problem, *, method: str) -> Row:
+def errors_of(result: Result, truth: Problem, *, method: str) -> Row:
     """Errors of a fit by column."""
     distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
     errors = alignment_errors(est=result.alignment, gt=truth.alignment, length=float(distance))

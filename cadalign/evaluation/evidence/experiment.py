@@ -35,8 +35,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.model import Model
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.evidence.methods import bound_of, evidence_for
 from cadalign.evaluation.evidence.options import EvidenceOptions
@@ -128,7 +128,7 @@ class EvidenceExperiment:
         return dict(zip(BOUNDS, (float(np.median(each)) for each in values), strict=True))
 
 
-def _errors(result: AlignResult, scene: ObjectScene) -> Row:
+def _errors(result: Result, scene: ObjectScene) -> Row:
     est, gt = result.alignment, scene.gt
     bounds = np.asarray(scene.model.bounds)
     boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Size
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.evidence.options import (
@@ -31,7 +31,6 @@ from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 
 _LEAST_FREE = 3  # keypoints of a view that moved in an unknown way
-_OF_FIT = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns of keypoints in one view: x has the scale 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,19 +68,17 @@ def evidence_for(method: str, scene: ObjectScene, options: EvidenceOptions) -> G
     return Given(views, shots, size)
 
 
-def bound_of(result: AlignResult, given: Given, scene: ObjectScene) -> FloatArray:
-    """The Cramer-Rao bound (9, 9) of an estimate from such evidence, as `AlignResult.covariance`.
+def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
+    """The Cramer-Rao bound (9, 9) of an estimate from such evidence, as `Result.covariance`.
 
     Contours have the deviation that was measured.
     """
-    if result.basis is None:
+    basis = result.statistics.basis
+    if basis is None:
         (view,), (shot,) = given.views, given.shots
         points = np.asarray(scene.model.points_3d)[shot.rows]
-        small = cramer_rao_bound(points, view.camera, scene.gt, sigma=view.sigma, focal="known")
-        bound = np.zeros((9, 9))
-        bound[np.ix_(_OF_FIT, _OF_FIT)] = small
-        return bound
-    evidence, state = result.basis.evidence, result.basis.state
+        return cramer_rao_bound(points, view.camera, scene.gt, sigma=view.sigma, focal="known")
+    evidence, state = basis.evidence, basis.state
     loss = np.full_like(evidence.sightings.loss, LINEAR)
     evidence = evidence._replace(sightings=evidence.sightings._replace(loss=loss))
     truths = [truth_in(shot, scene.gt) for shot in given.shots[: len(state.poses)]]

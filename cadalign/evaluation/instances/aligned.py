@@ -14,7 +14,7 @@ from cadalign.evaluation.instances.instance import Instance
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
-    from cadalign.estimation.align_result import AlignAlternative, AlignResult
+    from cadalign.estimation.result import Alternative, Result
     from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCALE = 1e-6
@@ -121,7 +121,7 @@ def align_instance(
             bounds = np.stack([points[rows].min(axis=0), points[rows].max(axis=0)])
         return box_alignment(alignment, bounds, model_bounds=instance.bounds)
 
-    def found(each: AlignResult | AlignAlternative) -> tuple[Alignment, Warp]:
+    def found(each: Result | Alternative) -> tuple[Alignment, Warp]:
         alignment = in_terms_of_the_model(each.alignment, each.points_3d, each.bounds)
         target = alignment.inverse(each.alignment.apply(each.points_3d[order]))
         return alignment, Warp(given, target)
@@ -163,7 +163,6 @@ def box_alignment(
     return Alignment(alignment.rotation, center - shift, scale)
 
 
-def _rms(result: AlignResult) -> float:
+def _rms(result: Result) -> float:
     """Root mean square residual [px], outliers included, as of the other methods."""
-    (residuals,) = result.residuals
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    return float(np.sqrt((result.residuals**2).sum(axis=1).mean()))

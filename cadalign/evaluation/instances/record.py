@@ -39,7 +39,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.evaluation.instances.aligned import AlignedAlternative, AlignedShape
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.outcome import Outcome
@@ -63,12 +63,12 @@ _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 
 
-Estimate = FitResult | AlignedShape | Alignment | CadalignError
+Estimate = Result | AlignedShape | Alignment | CadalignError
 """A fit, the estimate of the object's own shape, the alignment of a method that tells no more, or
 the reason why there is none."""
 
 
-def pose_of(estimate: FitResult | AlignedShape | Alignment) -> Alignment:
+def pose_of(estimate: Result | AlignedShape | Alignment) -> Alignment:
     """The alignment of an estimate."""
     return estimate if isinstance(estimate, Alignment) else estimate.alignment
 

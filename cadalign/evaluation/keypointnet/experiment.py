@@ -46,7 +46,7 @@ import numpy as np
 
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.fit import fit, fit_batch
-from cadalign.estimation.result import FitResult
+from cadalign.estimation.result import Result
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.accuracy.methods import LIMIT, SHAPE, fit_options, has_statistics
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
@@ -261,7 +261,7 @@ class KeypointNetExperiment:
     ) -> list[Row | Exception]:
         """Metrics by column of each estimate, or why there are none; pictures, if ``drawn``."""
         results: dict[int, Row | Exception] = {}
-        found: dict[int, FitResult | AlignedShape | Alignment] = {}
+        found: dict[int, Result | AlignedShape | Alignment] = {}
         for k, ((task, instance), estimate) in enumerate(zip(usable, estimates, strict=True)):
             if isinstance(estimate, CadalignError):
                 results[k] = estimate
@@ -318,7 +318,7 @@ def _with_mesh(task: KeypointTask, model: AnnotatedModel, **how: Any) -> Instanc
 
 
 def _overlap_up_to_scale(
-    instance: Instance, estimate: FitResult | AlignedShape | Alignment
+    instance: Instance, estimate: Result | AlignedShape | Alignment
 ) -> float | None:
     box = Box.from_model(instance.bounds, pose_of(estimate))
     return overlap_up_to_scale(est=box, gt=instance.gt_box)

@@ -186,7 +186,7 @@ def _without(error: Exception, names: Row, **facts: object) -> Outcome:
 def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
     """Root mean square residual of the given keypoints [px]; None behind the camera."""
     if found.result is not None:
-        (residuals,) = found.result.residuals
+        residuals = found.result.residuals
     else:
         points = found.alignment.apply(sighting.points_3d)
         residuals = sighting.camera.project_where_ahead(points) - sighting.points_2d

@@ -10,10 +10,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.fit import fit
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.aligned import box_alignment
 from cadalign.evaluation.photos.names import (
@@ -48,13 +48,13 @@ class PhotoEstimate:
         Of the data set's model, in its own unit: takes its box to the estimated one.
     box : Box
         The object's box in the camera's frame.
-    result : AlignResult, optional
+    result : Result, optional
         With shape and covariances.
     """
 
     alignment: Alignment
     box: Box
-    result: AlignResult | None = None
+    result: Result | None = None
 
 
 def estimate_object(
@@ -154,9 +154,7 @@ def _view(
     return View(sighting.camera, pixels, ids=names, sigma=sighting.sigma, **given)
 
 
-def _of_model(
-    found: Alignment, sighting: Sighting, result: AlignResult | None = None
-) -> PhotoEstimate:
+def _of_model(found: Alignment, sighting: Sighting, result: Result | None = None) -> PhotoEstimate:
     """The estimate of the data set's model, from that of the model with the object's width."""
     bounds = sighting.bounds * sighting.width if result is None else result.bounds
     box = Box.from_model(bounds, found)

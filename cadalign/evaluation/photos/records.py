@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.errors import CadalignError
-from cadalign.estimation.align_result import AlignAlternative, AlignResult
+from cadalign.estimation.result import Alternative, Result
 from cadalign.evaluation.instances.aligned import (
     AlignedAlternative,
     AlignedShape,
@@ -64,12 +64,12 @@ def _described(estimate: PhotoEstimate | CadalignError, sighting: Sighting) -> E
     )
 
 
-def _of_box(found: AlignResult | AlignAlternative, sighting: Sighting) -> Alignment:
+def _of_box(found: Result | Alternative, sighting: Sighting) -> Alignment:
     """The alignment of the model's box with an estimated one."""
     return box_alignment(found.alignment, found.bounds, model_bounds=sighting.bounds)
 
 
-def _warp(result: AlignResult, found: AlignResult | AlignAlternative, sighting: Sighting) -> Warp:
+def _warp(result: Result, found: Result | Alternative, sighting: Sighting) -> Warp:
     """The places of the model's keypoints on the estimated object, in the model's coordinates."""
     row_of = {str(name): row for row, name in enumerate(result.ids)}
     known = [row for row, name in enumerate(sighting.model.names) if name in row_of]

@@ -39,14 +39,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.model import Model
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
@@ -179,7 +180,7 @@ def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
     return float(np.sqrt(((factor * est - gt) ** 2).sum(axis=1).mean()))
 
 
-def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:
+def _coverage(result: Result, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:
     """Place of the truth in the stated probabilities; metrics by column.
 
     ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the
@@ -187,21 +188,23 @@ def _coverage(result: AlignResult, sighting: Sighting, known: IntArray, rows: In
     """
     est = result.alignment
     turn = vector_from_rotation(est.rotation @ sighting.gt.rotation.T)
+    covariance = cast(FloatArray, result.covariance)
+    of_points = cast(FloatArray, result.points_covariance)
     lengths = np.ptp(result.bounds, axis=0) * est.scale
     true_lengths = np.ptp(sighting.bounds, axis=0)
     level, freedom = None, result.degrees_of_freedom
     if (lengths > 0).all() and (true_lengths > 0).all():
         ratios = _RATIOS @ np.log(lengths / true_lengths)
-        spread = _RATIOS @ result.covariance[6:, 6:] @ _RATIOS.T
+        spread = _RATIOS @ covariance[6:, 6:] @ _RATIOS.T
         level = probability_level(ratios, spread, freedom)
     gaps = result.points_3d[rows] * est.scale - sighting.xyz[known]
     levels = [
         found
-        for gap, covariance in zip(gaps, result.points_covariance[rows], strict=True)
-        if (found := probability_level(gap, covariance, freedom)) is not None
+        for gap, own in zip(gaps, of_points[rows], strict=True)
+        if (found := probability_level(gap, own, freedom)) is not None
     ]
     return {
-        "rotation_level": probability_level(turn, result.covariance[:3, :3], freedom),
+        "rotation_level": probability_level(turn, covariance[:3, :3], freedom),
         "stretch_level": level,
         "keypoints_within_68": _share(levels, 0.68),
         "keypoints_within_95": _share(levels, 0.95),

@@ -9,9 +9,9 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.align import align
-from cadalign.estimation.align_result import AlignResult
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -50,7 +50,7 @@ class ShapeEstimate:
     ids : (m,) int
     points_3d : (m, 3) float
         Keypoints before the stretch.
-    result : AlignResult, optional
+    result : Result, optional
         With the covariances; None for methods that have none.
     """
 
@@ -58,7 +58,7 @@ class ShapeEstimate:
     bounds: FloatArray
     ids: IntArray
     points_3d: FloatArray
-    result: AlignResult | None = None
+    result: Result | None = None
 
     @property
     def poses(self) -> tuple[Alignment, ...]:

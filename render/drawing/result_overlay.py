@@ -1,29 +1,28 @@
-"""Draw an estimated shape, and its uncertainty, over the photo of its observation."""
+"""Draw a result, and its uncertainty, over the photo of its observation."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.datasets import load_mesh
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
-from cadalign.estimation.align_result import AlignResult
-from cadalign.estimation.view import View
+from cadalign.estimation.result import Result
 from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.projection import projected_covariances
+from cadalign.io.images import read_image
+from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
-from cadalign.render import Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.drawing.fit_overlay import photo_of
 from cadalign.render.drawing.keypoint_layer import confidence_regions
-from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.warp import warp_mesh
+from cadalign.render.drawing.overlay import draw_overlay
+from cadalign.render.frame import LIGHT_GREY, check_image_size
 
 logger = logging.getLogger("cadalign")
 
@@ -31,51 +30,74 @@ _INSIDE = 0.5  # least probability of a pixel of the object
 _CONTOUR_COLOR = (70, 190, 250)
 
 
-def draw_aligned(
-    image: ObservedImage, view: View, result: AlignResult, *, mesh: Mesh | None, number: int = 0
+def draw_result(
+    image: ObservedImage,
+    result: Result,
+    *,
+    mesh: Mesh | None = None,
+    bounds: FloatArray | None = None,
+    mask: npt.NDArray[Any] | None = None,
+    number: int = 0,
 ) -> ByteImage:
     """Draw the estimated box, keypoints with their uncertainty, and mesh over the photo of a view.
 
-    The contour of the view's mask is drawn, too. Where the views have a pose each, the uncertainty
-    is drawn in the first one alone.
+    Keypoints that the view does not show are drawn with the regions that hold them; where the views
+    have a pose each, regions are drawn in the first one alone.
 
     Parameters
     ----------
     image : ObservedImage
         Its photo is drawn on, or grey where there is none.
-    view : View
-        The view that the image became.
-    result : AlignResult
+    result : Result
     mesh : Mesh, optional
         The object's, in the model's frame before the stretch; see `mesh_of`.
+    bounds : (2, 3) float, optional
+        The box to draw, in the model's frame; by default the result's.
+    mask : (h, w), optional
+        The view's mask, whose contour is drawn.
     number : int
         The view's number in the result.
     """
-    camera, alignment = view.camera, result.poses[number]
+    view = result.views[number]
+    camera, alignment = view.camera, view.alignment
+    photo = photo_of(image, camera)
     in_camera = alignment.apply(result.points_3d)
     ahead = in_camera[:, 2] > 0
+    seen = set(view.ids)
+    unseen = ahead & np.array([label not in seen for label in result.ids], dtype=bool)
     row_of = {label: row for row, label in enumerate(result.ids)}
-    rows = [row_of[label] for label in view.keypoint_ids]
-    unseen = ahead.copy()
-    unseen[rows] = False
-    regions = None
-    if number == 0 or view.cam_from_rig is not None:
+    own = in_camera[[row_of[label] for label in view.ids]]
+    covariances, regions = result.points_cam_covariance, None
+    is_first = number == 0 or result.rig_from_model is not None
+    if result.model is not None and covariances is not None and is_first:
         turn = alignment.rotation @ result.alignment.rotation.T
-        covariances = turn @ result.points_cam_covariance[ahead] @ turn.T
-        covariances = projected_covariances(in_camera[ahead], covariances, camera)
-        regions = confidence_regions(camera.project(in_camera[ahead]), covariances)
-    frame = None if mesh is None else cast_geometry(Scene(mesh), camera, alignment)
-    photo = photo_of(image, camera)
+        projected = projected_covariances(
+            in_camera[ahead], turn @ covariances[ahead] @ turn.T, camera
+        )
+        regions = confidence_regions(camera.project(in_camera[ahead]), projected)
+    frame = None
+    if mesh is not None:
+        from cadalign.render import Scene, cast_geometry  # takes time to import
+
+        frame = cast_geometry(Scene(mesh), camera, alignment)
     return draw_overlay(
-        photo if view.mask is None else draw_contour(photo, np.asarray(view.mask)),
+        photo if mask is None else draw_contour(photo, np.asarray(mask)),
         camera,
-        est_box=Box.from_model(result.bounds, alignment),
+        est_box=Box.from_model(result.bounds if bounds is None else bounds, alignment),
         est_frame=frame,
         observed=view.points_2d,
-        reprojected=np.asarray(view.points_2d) + result.residuals[number],
-        unseen=camera.project(in_camera[unseen]),
+        reprojected=camera.project_where_ahead(own),
+        unseen=camera.project(in_camera[unseen]) if unseen.any() else None,
         regions=regions,
     )
+
+
+def photo_of(observation: ObservedImage, camera: Camera) -> ByteImage:
+    """The photo (h, w, 3), grey where there is none; refuses images that are too large."""
+    check_image_size(camera)
+    if observation.image is None:
+        return np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
+    return read_image(observation.image, camera)
 
 
 def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
@@ -89,19 +111,22 @@ def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
     return drawn
 
 
-def mesh_of(observation: Observation, views: Sequence[View], result: AlignResult) -> Mesh | None:
+def mesh_of(observation: Observation, result: Result) -> Mesh | None:
     """The object's mesh, warped from the observation's model or the nearest training model.
 
     In the model's frame, before the stretch. None where no mesh is known; a training mesh that
     cannot be read is warned of (logger "cadalign").
     """
+    from cadalign.shapes.model import ShapeModel  # takes time to import
+    from cadalign.shapes.warp import warp_mesh
+
     if not isinstance(result.model, ShapeModel):
         known = result.model is not None and result.model.mesh is not None
         return result.mesh() if known else None
     sources = {
         label: xyz
-        for image, view in zip(observation.views, views, strict=True)
-        for label, xyz in zip(view.keypoint_ids, image.points_3d, strict=True)
+        for image, view in zip(observation.views, result.views, strict=True)
+        for label, xyz in zip(view.ids, image.points_3d, strict=True)
     }
     if observation.model is not None and np.any(list(sources.values())):
         row_of = {label: row for row, label in enumerate(result.ids)}

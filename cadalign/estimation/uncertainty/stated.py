@@ -1,0 +1,194 @@
+"""Statements of a result about its uncertainty: stored, or computed when they are asked for.
+
+Covariances are those of the rotation vector in the camera frame [rad], the translation, the
+logarithms of the lengths along x, y, z, and, where it was estimated, of the focal length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.focal import focal_doubt
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.symmetry import held_axes, without_free_turns
+from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.weakness import uncertainty_of, warnings_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
+
+if TYPE_CHECKING:
+    from cadalign.estimation.uncertainty.evidence import AnyBasis
+    from cadalign.estimation.uncertainty.misfit import Misfit
+
+
+class Statistics(Protocol):
+    """What is stated, by whatever door a result came."""
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """The calibrated covariance (9, 9) or (10, 10)."""
+
+    @property
+    def fisher_covariance(self) -> FloatArray | None:
+        """The inverse Fisher information, in the same form."""
+
+    @property
+    def points_covariance(self) -> FloatArray | None:
+        """Of the keypoints (m, 3, 3) in the model's frame; None where it follows."""
+
+    @property
+    def points_cam_covariance(self) -> FloatArray | None:
+        """Of the keypoints (m, 3, 3) in the first camera; None where it follows."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about the evidence."""
+
+    @property
+    def misfit(self) -> Misfit | None:
+        """The test that the residuals fail."""
+
+    @property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of the pieces of evidence."""
+
+    @property
+    def degrees_of_freedom(self) -> float | None:
+        """Of the t distribution of the errors."""
+
+    @property
+    def basis(self) -> AnyBasis | None:
+        """What contributions are computed from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """Statements that are known; see `Statistics`."""
+
+    covariance: FloatArray | None
+    fisher_covariance: FloatArray | None = None
+    points_covariance: FloatArray | None = None
+    points_cam_covariance: FloatArray | None = None
+    warnings: tuple[str, ...] = ()
+    misfit: Misfit | None = None
+    evidence: tuple[EvidenceSummary, ...] = ()
+    degrees_of_freedom: float | None = None
+    basis: AnyBasis | None = None
+
+    @classmethod
+    def of(cls, statistics: Statistics) -> Stated:
+        """All statements, computed now."""
+        return cls(**{name: getattr(statistics, name) for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointStatistics:
+    """Statements about an exact or stretched model's keypoints in one view.
+
+    Parameters
+    ----------
+    points_3d : (n, 3) float
+        The keypoints that the view shows, on the model.
+    residuals, inliers, alignment, camera, sigma, symmetry
+        As of `cadalign.Result`.
+    options : FitOptions
+    fisher_covariance : (9, 9) or (10, 10) float, optional
+    """
+
+    points_3d: FloatArray
+    residuals: FloatArray
+    inliers: BoolArray
+    alignment: Alignment
+    camera: Camera
+    options: FitOptions
+    sigma: float | None = None
+    fisher_covariance: FloatArray | None = None
+    symmetry: Symmetry | None = None
+
+    points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
+
+    @cached_property
+    def covariance(self) -> FloatArray | None:
+        """See `cadalign.Result.covariance`."""
+        if self.fisher_covariance is None:
+            return None
+        from cadalign.estimation.uncertainty.posterior import posterior_covariance  # compiles
+
+        covariance = posterior_covariance(self)
+        if self.symmetry is None:
+            return covariance
+        held = held_axes(self.options.stretched_axes)
+        best = group_of(self.symmetry).canonical(self.alignment, held=held)
+        return without_free_turns(covariance, best)
+
+    @cached_property
+    def misfit(self) -> Misfit | None:
+        """See `cadalign.Result.misfit`."""
+        if self.fisher_covariance is None:
+            return None
+        from cadalign.estimation.uncertainty.misfit import find_misfit
+
+        return find_misfit(self)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about a misfit, and about what the keypoints do not determine."""
+        if self.covariance is None:
+            return ()
+        kept, options = self.points_3d[self.inliers], self.options
+        is_estimated = options.focal == "estimate"
+        return self._contradictions() + warnings_of(
+            kept,
+            self.alignment,
+            uncertainty_of(self.covariance),
+            redundancy=2 * len(kept) - options.unknowns,
+            doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
+        )
+
+    def _contradictions(self) -> tuple[str, ...]:
+        """Warnings about a misfit, or about a constraint that cannot be tested."""
+        if self.misfit is not None:
+            return (str(self.misfit),)
+        from cadalign.estimation.uncertainty.misfit import unverified_stretch
+
+        doubt = unverified_stretch(self)
+        return () if doubt is None else (doubt,)
+
+    @cached_property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of the keypoints that the estimate rests on."""
+        from cadalign.estimation.problems import pixel_information  # takes the compiler along
+
+        residuals = self.residuals[self.inliers]
+        squares = (residuals * residuals).sum()
+        sigma: Any = self.sigma if self.options.sigma is None else self.options.sigma
+        if np.ndim(sigma) == 0:
+            whitened = squares / (1.0 if sigma is None else float(sigma)) ** 2
+        else:
+            information = pixel_information(sigma, len(self.residuals))[self.inliers]
+            whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
+        count = max(len(residuals), 1)
+        in_sigmas, rms = np.sqrt([whitened / (2 * count), squares / count]).tolist()
+        return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
+
+
+def points_covariances(
+    points: FloatArray, alignment: Alignment, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
+    covariance = covariance[:9, :9]
+    stretched = points * alignment.scale
+    by_logs = stretched[:, :, None] * np.eye(3)
+    of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
+    turned = stretched @ alignment.rotation.T
+    by_turn = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)  # columns: axis x turned
+    shifts = np.broadcast_to(np.eye(3), by_turn.shape)
+    rows = np.concatenate([by_turn, shifts, alignment.rotation @ by_logs], axis=2)
+    return of_points, rows @ covariance @ rows.swapaxes(1, 2)

@@ -10,18 +10,18 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, worker_count
+from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.assemble import Minimum, assemble
-from cadalign.estimation.joint_robust import Consensus, find_consensus
+from cadalign.estimation.assemble import assemble
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model, Size
-from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
-from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import FitStats, Result
 from cadalign.estimation.results import Results
+from cadalign.estimation.search import Problem, find_minima
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
-from cadalign.estimation.starts import Start, starts_of
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (
     check_first,
@@ -31,8 +31,6 @@ from cadalign.estimation.weak_views import (
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.evidence import Evidence
-from cadalign.solvers.joint.search import search_joint
 
 T = TypeVar("T")
 
@@ -47,6 +45,8 @@ def align(
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
@@ -69,6 +69,11 @@ def align(
     ransac : RansacOptions, optional
         Search for the keypoints that agree, for views with outliers; of its options,
         ``max_reproj_error`` and ``seed`` count where the shape is not exact.
+    focal : {"known", "estimate"}
+        Take the focal lengths of the views' cameras as right, or estimate them: views of equal
+        cameras share one. ``result.cameras`` have the estimates.
+    focal_prior : FocalPrior, optional
+        Prior on focal lengths to be estimated.
 
     Returns
     -------
@@ -98,11 +103,12 @@ def align(
     given = [views] if isinstance(views, View) else list(views)
     _check_views(given)
     _check_start(size, init)
-    options = FitOptions(loss=loss, loss_scale=loss_scale)
+    options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
+    lenses = Lenses.of(given, focal, focal_prior)
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
-        return align_plain(exact, given[0], loss=loss, loss_scale=loss_scale, ransac=ransac)
-    if size is None and ransac is None and is_single(model, given):
+        return align_plain(exact, given[0], options=options, ransac=ransac)
+    if size is None and ransac is None and not lenses.count and is_single(model, given):
         return align_single(cast(ShapeModel, model), given[0], options=options, init=init)
     prior = prior_of(model)
     left_out = views_without_pose(prior, given, is_started=init is not None)
@@ -118,33 +124,18 @@ def align(
                 loss=loss,
                 loss_scale=loss_scale,
                 ransac=ransac,
+                focal=focal,
+                focal_prior=focal_prior,
             )
         return with_views_left_out(found_by_used, prior, given, left_out)
-    minima: list[Minimum] = []
-    iterations = hypotheses = 0
-    everything = evidence_of(
-        prior, given, size, loss=LOSSES[options.loss], loss_scale=options.loss_scale
-    )
-    first = None if init is None else _start(init, everything)
-    for number, shape in enumerate(prior.components):
-        evidence = everything._replace(shape=shape)
-        if ransac is None:
-            found, used, tried = _search(evidence, first)
-        else:
-            threshold = _thresholds(evidence, given, ransac.max_reproj_error)
-            found, used, tried = find_consensus(evidence, threshold, int(ransac.seed), first)
-        iterations, hypotheses = iterations + used, hypotheses + tried
-        prior_score = -2 * float(np.log(prior.weights[number]))
-        minima.extend(
-            Minimum(number, *each._replace(score=each.score + prior_score)) for each in found
-        )
+    problem = Problem(prior, given, size, options, lenses)
+    minima, iterations, hypotheses = find_minima(problem, init, ransac)
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    minima.sort(key=lambda minimum: minimum.score)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     if all(view.mask is None for view in given):
         return assemble(model, prior, given, minima, stats)
@@ -247,28 +238,6 @@ def _one_each(
     return given
 
 
-def _search(evidence: Evidence, init: Start | None) -> tuple[list[Consensus], int, int]:
-    """Minima of all sightings together, and the effort they took."""
-    starts = starts_of(evidence, init)
-    if not len(starts.poses):
-        return [], 0, 0
-    minima, iterations = search_joint(evidence, *starts)
-    all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
-    found = [
-        Consensus(all_of_them, evidence, state, float(cost), float(score))
-        for state, cost, score in zip(*minima, strict=True)
-    ]
-    return found, iterations, len(starts.poses)
-
-
-def _thresholds(evidence: Evidence, views: Sequence[View], max_reproj_error: float) -> FloatArray:
-    """Largest whitened residuals (N,) of inliers."""
-    sightings = evidence.sightings
-    focal = np.array([np.sqrt(view.camera.fx * view.camera.fy) for view in views])
-    root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
-    return max_reproj_error / focal[sightings.image] * root
-
-
 def _check_views(views: Sequence[object]) -> None:
     if not views:
         raise InputError("none is given", where="views")
@@ -276,16 +245,6 @@ def _check_views(views: Sequence[object]) -> None:
         if not isinstance(view, View):
             what = f"expected a cadalign.View, got {type(view).__name__}"
             raise InputError(what, where=f"views[{number}]")
-
-
-def _start(init: Alignment, evidence: Evidence) -> Start:
-    """A given alignment as a start; where the size is held, it shrinks about the origin."""
-    rotation, translation, scale = init.rotation, init.translation, np.array(init.scale)
-    held = evidence.scales.free == 0
-    if held.any():
-        size = scale[held].mean()
-        scale, translation = np.where(held, 1.0, scale / size), translation / size
-    return Start(np.concatenate([rotation.ravel(), translation]), np.log(scale))
 
 
 def _check_start(size: object, init: object) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from cadalign.estimation.estimates import (
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
+from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import stretched_axes
 from cadalign.estimation.uncertainty.evidence import Basis, summaries_of
@@ -36,18 +37,7 @@ from cadalign.geometry.rotations import nearest_rotation
 from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import joint_covariance
-from cadalign.solvers.joint.evidence import Evidence, State, points_of
-
-
-class Minimum(NamedTuple):
-    """An estimate under one component of the prior; ``score`` is -2 log of its probability."""
-
-    component: int
-    inliers: BoolArray
-    evidence: Evidence
-    state: State
-    cost: float
-    score: float
+from cadalign.solvers.joint.evidence import points_of
 
 
 def assemble(
@@ -95,9 +85,10 @@ def assemble(
     if symmetry is None and not is_exact(minimum.evidence):
         for covariance in covariances:
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    camera = views[0].camera
     alternatives = tuple(
-        Alternative(each.poses[0], each.likelihood, camera, each.points[:-2], each.points[-2:])
+        Alternative(
+            each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
+        )
         for k, each in enumerate(likely)
         if is_other(moments, k)
     )
@@ -112,19 +103,20 @@ def assemble(
             ),
             *another_pose(best.poses[0], alternatives),
         ),
-        evidence=summaries_of(minimum.evidence, minimum.state, [view.camera for view in views]),
+        evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
         degrees_of_freedom=prior.degrees_of_freedom,
         basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
     )
     of_views: list[ViewResult] = []
-    kept = zip(views, best.poses, covariances, _inliers(prior, views, minimum), strict=True)
-    for view, pose, covariance, inliers in kept:
+    inliers_of = _inliers(prior, views, minimum)
+    kept = zip(views, best.cameras, best.poses, covariances, inliers_of, strict=True)
+    for view, camera, pose, covariance, inliers in kept:
         rows = prior.rows_of(view.keypoint_ids, "ids")
         observed = cast(FloatArray, view.points_2d)
-        residuals = view.camera.project(pose.apply(best.points[rows])) - observed
+        residuals = camera.project(pose.apply(best.points[rows])) - observed
         stated = Stated(covariance) if of_views else statistics
         of_views.append(
-            ViewResult(view.camera, pose, view.keypoint_ids, observed, residuals, inliers, stated)
+            ViewResult(camera, pose, view.keypoint_ids, observed, residuals, inliers, stated)
         )
     known_axis = getattr(model, "known_axis", None)
     return Result(
@@ -143,6 +135,8 @@ def assemble(
         component=minimum.component,
         rig_from_model=_in_rig(views, minimum, best),
         own_bounds=best.points[-2:],
+        focal="estimate" if minimum.lenses.count else "known",
+        focal_prior=minimum.lenses.prior,
         own_stretch=stretch_of(best.lengths, prior.lengths),
     )
 
@@ -181,6 +175,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
         found.points[rows],
         found.seen[rows],
         likelihood,
+        tuple(minimum.lenses.cameras_at(minimum.state.log_focals)),
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.symmetry import SAME_SQUARES, carried, is_same, without_free_turns
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, group_of
 from cadalign.shapes.box_margins import BoxMargins
@@ -43,6 +44,7 @@ class Estimate(NamedTuple):
     of_points: FloatArray
     of_seen: FloatArray
     likelihood: float
+    cameras: tuple[Camera, ...]
 
     @property
     def covariance(self) -> FloatArray:
@@ -66,13 +68,19 @@ def moments_of_estimates(estimates: Sequence[Estimate], view: int = 0) -> Moment
         Likely(
             np.array(poses),
             np.array([each.points * each.scale for each in estimates]),
-            np.array([each.lengths for each in estimates]),
+            np.array([_lengths_and_focal(each, view) for each in estimates]),
             np.array([each.covariances[view] for each in estimates]),
             np.array([each.of_points for each in estimates]),
             np.array([each.of_seen for each in estimates]),
             np.array([each.likelihood for each in estimates]),
         )
     )
+
+
+def _lengths_and_focal(estimate: Estimate, view: int) -> FloatArray:
+    """Lengths (3,) of the box and, where its covariance has it, the focal length of a view."""
+    focal = [estimate.cameras[view].fx]
+    return np.append(estimate.lengths, focal[: len(estimate.covariances[view]) - 9])
 
 
 def is_other(moments: Moments, k: int) -> bool:

@@ -33,51 +33,50 @@ class Consensus(NamedTuple):
     score: float
 
 
-def find_consensus(
-    evidence: Evidence, threshold: FloatArray, seed: int, init: Start | None = None
-) -> tuple[list[Consensus], int, int]:
-    """Estimates that most keypoints support, the best first, with the effort they took.
+def robust_starts(evidence: Evidence, seed: int, init: Start | None = None) -> Starts:
+    """Starts for keypoints with outliers: poses under a robust loss, and those of small samples."""
+    starts = starts_of(with_loss(evidence, CAUCHY), init)
+    if evidence.rig.pose.max() > 0:
+        return starts
+    samples = np.array(
+        [
+            in_rig(pose, camera)
+            for view, camera in enumerate(evidence.rig.cam_from_rig)
+            for pose in _hypotheses(evidence, view, seed)
+        ]
+    ).reshape(-1, 12)
+    count, focals = len(samples), starts.log_focals.shape[1]
+    return Starts(
+        np.concatenate([starts.poses, samples[:, None]]),
+        np.concatenate([starts.log_focals, np.zeros((count, focals))]),
+        np.concatenate([starts.log_scales, np.zeros((count, 3))]),
+    )
 
-    Starts are the poses under a robust loss and those of small samples. Each is refined under the
-    robust loss, then on its inliers alone until these don't change. A keypoint that is left out
-    costs as much as one at its threshold, and the logarithm that one more keypoint would add.
+
+def find_consensus(
+    evidence: Evidence, starts: Starts, threshold: FloatArray
+) -> tuple[list[Consensus], int]:
+    """Estimates that most keypoints support, the best first, with the iterations they took.
+
+    Each of the starts is refined under a robust loss, then on its inliers alone until these don't
+    change. A keypoint that is left out costs as much as one at its threshold, and the logarithm
+    that one more keypoint would add.
 
     Parameters
     ----------
     evidence : Evidence
+    starts : Starts
     threshold : (N,) float
         Largest whitened residual of an inlier.
-    seed : int
-        Seed of the samples.
-    init : Start, optional
-        One more start.
     """
-    robust = with_loss(evidence, CAUCHY)
-    starts = starts_of(robust, init)
-    if evidence.rig.pose.max() == 0:
-        samples = np.array(
-            [
-                in_rig(pose, camera)
-                for view, camera in enumerate(evidence.rig.cam_from_rig)
-                for pose in _hypotheses(evidence, view, seed)
-            ]
-        ).reshape(-1, 12)
-        count, focals = len(samples), starts.log_focals.shape[1]
-        starts = Starts(
-            np.concatenate([starts.poses, samples[:, None]]),
-            np.concatenate([starts.log_focals, np.zeros((count, focals))]),
-            np.concatenate([starts.log_scales, np.zeros((count, 3))]),
-        )
-    if not len(starts.poses):
-        return [], 0, 0
-    minima, iterations = search_joint(robust, *starts)
+    minima, iterations = search_joint(with_loss(evidence, CAUCHY), *starts)
     found = []
     for state in minima.states[:_KEPT]:
         refined = _settle(evidence, state, threshold)
         if refined is not None:
             found.append(refined)
     found.sort(key=lambda consensus: consensus.score)
-    return found, iterations, len(starts.poses)
+    return found, iterations
 
 
 def _settle(evidence: Evidence, state: State, threshold: FloatArray) -> Consensus | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Size
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import ShapePrior, prior_of, rows_among, scale_priors
@@ -22,7 +23,6 @@ from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
-    Focals,
     Heights,
     Lengths,
     Planes,
@@ -47,13 +47,11 @@ def evidence_of(
     *,
     loss: int,
     loss_scale: float,
-    focals: Focals | None = None,
-    cameras: Sequence[Camera] = (),
+    lenses: Lenses | None = None,
 ) -> Evidence:
     """All that the views, the size and the first component of the prior tell.
 
-    Focal lengths that are to be estimated are ``focals`` times those of ``cameras``, which are the
-    views' own by default.
+    By default the views' focal lengths are known.
 
     Raises
     ------
@@ -61,6 +59,8 @@ def evidence_of(
         If a view names a keypoint that the model lacks, tells nothing, or tells of an up axis that
         the model lacks, or if only some views have a known pose.
     """
+    if lenses is None:
+        lenses = Lenses.of(views, "known", None)
     rows = [
         prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
         for number, view in enumerate(views)
@@ -69,29 +69,15 @@ def evidence_of(
         _check_view(prior, view, number)
     return Evidence(
         prior.components[0],
-        _sightings(rows, views, cameras or [view.camera for view in views], loss, loss_scale),
+        _sightings(rows, views, lenses.cameras, loss, loss_scale),
         _rig(views),
-        known_focals(len(views)) if focals is None else focals,
+        lenses.focals(),
         _directions(prior, views),
         _lengths(prior, size),
         _heights(prior, views),
         sampled_planes(prior.components[0], rows, views),
         scale_priors(prior, is_metric(views, size)),
     )
-
-
-def known_focals(views: int) -> Focals:
-    """No focal length to estimate, of so many views."""
-    none = np.empty(0)
-    return Focals(np.full(views, -1), none, none, none, none)
-
-
-def cameras_at(cameras: Sequence[Camera], focals: Focals, log_focals: FloatArray) -> list[Camera]:
-    """The cameras of all views, with focal lengths that are estimated."""
-    return [
-        camera if group < 0 else camera.with_focal(camera.fx * float(np.exp(log_focals[group])))
-        for camera, group in zip(cameras, focals.group.tolist(), strict=True)
-    ]
 
 
 def is_metric(views: Sequence[View], size: Size | None) -> bool:

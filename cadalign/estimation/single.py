@@ -52,7 +52,7 @@ def is_plain(model: object, views: Sequence[View]) -> bool:
 
 
 def align_plain(
-    model: Model, view: View, *, loss: str, loss_scale: float, ransac: RansacOptions | None
+    model: Model, view: View, *, options: FitOptions, ransac: RansacOptions | None
 ) -> Result:
     """The result of `fit`, with all keypoints of the model."""
     prior = prior_of(model)
@@ -63,8 +63,10 @@ def align_plain(
         cast(FloatArray, view.points_2d),
         view.camera,
         sigma=view.sigma,
-        loss=loss,
-        loss_scale=loss_scale,
+        loss=options.loss,
+        loss_scale=options.loss_scale,
+        focal=options.focal,
+        focal_prior=options.focal_prior,
         stretch=model.stretch,
         scale_prior_sigma=model.scale_prior_sigma,
         known_axis=model.known_axis,

@@ -38,7 +38,7 @@ class View:
     Parameters
     ----------
     camera : Camera
-        The calibrated camera.
+        The calibrated camera; `Camera.without_focal` where the focal length is to be estimated.
     points_2d : (n, 2) float
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional
@@ -166,9 +166,6 @@ class View:
 def _check_camera(camera: object) -> None:
     if not isinstance(camera, Camera):
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
-    if not camera.focal_known:
-        fix = "give a camera with one, for example from fit(..., focal='estimate').camera"
-        raise InputError("its focal length is unknown", where="camera", fix=fix)
 
 
 def _rigid(pose: npt.ArrayLike) -> FloatArray:

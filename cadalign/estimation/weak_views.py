@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import cast
@@ -18,6 +18,7 @@ from cadalign.estimation.result import Result, ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import refine_joint
@@ -72,15 +73,17 @@ def with_views_left_out(
     used = [number for number in range(len(views)) if number not in left_out]
     of_views = dict(zip(used, result.views, strict=True))
     masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
+    estimated = dict(zip((views[n].camera for n in used), result.cameras, strict=True))
     for number in left_out:
         view = views[number]
-        pose = _explaining(prior, view, result)
+        camera = _camera_of(view, estimated)
+        pose = _explaining(prior, view, camera, result)
         rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
         observed = cast(FloatArray, view.points_2d)
-        residuals = view.camera.project(pose.apply(result.points_3d[rows])) - observed
+        residuals = camera.project(pose.apply(result.points_3d[rows])) - observed
         kept, unknown = np.zeros(len(rows), dtype=bool), Stated(None)
         of_views[number] = ViewResult(
-            view.camera, pose, view.keypoint_ids, observed, residuals, kept, unknown
+            camera, pose, view.keypoint_ids, observed, residuals, kept, unknown
         )
     numbers = range(len(views))
     warnings = [
@@ -128,10 +131,19 @@ def _is_on_a_line(points: FloatArray) -> bool:
     return bool(extents[1] <= _ON_A_LINE * extents[0])
 
 
-def _explaining(prior: ShapePrior, view: View, result: Result) -> Alignment:
+def _camera_of(view: View, estimated: Mapping[Camera, Camera]) -> Camera:
+    """The camera of a view; an unknown focal length is that of an equal camera, or of the first."""
+    if view.camera in estimated or view.camera.focal_known:
+        return estimated.get(view.camera, view.camera)
+    first = next(iter(estimated.values()))
+    side = max(view.camera.width, view.camera.height) / max(first.width, first.height)
+    return view.camera.with_focal(first.fx * side)
+
+
+def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -> Alignment:
     """A pose near that of the first view under which a view's keypoints fit."""
     scale = result.alignment.scale
-    alone = replace(view, depth=None, mask=None, mask_sigma=None, camera_height=None)
+    alone = replace(view, camera=camera, depth=None, mask=None, mask_sigma=None, camera_height=None)
     if not len(view.keypoint_ids) and view.up is None:
         return result.alignment
     evidence = evidence_of(prior, [alone], None, loss=LINEAR, loss_scale=1.0)

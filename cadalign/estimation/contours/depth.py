@@ -13,7 +13,6 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.assemble import Minimum
 from cadalign.estimation.contours.contour import robust_deviation
 from cadalign.estimation.contours.loop import (
     poses_of,
@@ -24,13 +23,15 @@ from cadalign.estimation.contours.loop import (
 from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.evidence import kept_rows
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, points_of
+from cadalign.solvers.joint.evidence import Evidence, Planes, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border
@@ -74,7 +75,7 @@ def fit_depths(
 ) -> list[Minimum]:
     """Refine the likely minima with the depths of the object's surface, the likeliest first."""
     samples = [
-        _samples(number, view)
+        _samples(number, view, minima[0].lenses.cameras[number])
         for number, view in enumerate(views)
         if view.mask_image is not None and view.depth_image is not None
     ]
@@ -91,7 +92,7 @@ def fit_depths(
     return found
 
 
-def _samples(number: int, view: View) -> _Samples:
+def _samples(number: int, view: View, camera: Camera) -> _Samples:
     """Pixels of a grid inside the mask whose depth is known."""
     import cv2  # takes longer to import than all the rest
 
@@ -105,7 +106,7 @@ def _samples(number: int, view: View) -> _Samples:
     grid = np.zeros_like(usable)
     grid[spacing // 2 :: spacing, spacing // 2 :: spacing] = True
     rows, columns = np.nonzero(usable & grid)
-    rays, valid = view.camera.normalize_where_valid(np.stack([columns, rows], 1).astype(float))
+    rays, valid = camera.normalize_where_valid(np.stack([columns, rows], 1).astype(float))
     rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     sigma = float(cast(float, view.depth_sigma))
     return _Samples(number, rays[valid], depth[rows, columns][valid], sigma)
@@ -123,7 +124,13 @@ def _settled(
         posed = surface.at(start.evidence.shape, state)
         poses = poses_of(bare, state)
         rows = [
-            _rows(posed, poses[each.image], each, is_exact=surface.is_exact) for each in samples
+            _rows(
+                posed,
+                poses[each.image],
+                _at_focal(each, bare, state),
+                is_exact=surface.is_exact,
+            )
+            for each in samples
         ]
         full = _with_rows(bare, keypoints, rows)
         total = sum(len(each.mean) for each in rows)
@@ -138,6 +145,15 @@ def _settled(
             break
         last = cost
     return result
+
+
+def _at_focal(samples: _Samples, evidence: Evidence, state: State) -> _Samples:
+    """The samples with the rays that they have at the focal length of a state."""
+    group = int(evidence.focals.group[samples.image])
+    if group < 0:
+        return samples
+    ratio = float(np.exp(state.log_focals[group]))
+    return samples._replace(rays=samples.rays / [ratio, ratio, 1.0])
 
 
 def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:

@@ -15,7 +15,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.assemble import Minimum
 from cadalign.estimation.contours.loop import (
     ContourFit,
     Noise,
@@ -39,6 +38,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, prior_of
 from cadalign.estimation.result import Result
+from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
@@ -131,7 +131,7 @@ def fit_masks(
         If there is no estimate without the masks and no rim near them.
     """
     contours = [
-        contour_view(number, view, f"views[{number}].mask")
+        contour_view(number, view, f"views[{number}].mask", minima[0].lenses.cameras[number])
         for number, view in enumerate(views)
         if view.mask_image is not None
     ]
@@ -348,7 +348,7 @@ def hull_contour(contour: ViewContour, view: View) -> ViewContour | None:
     if inside.sum() > inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER].sum():
         return None
     hull = replace(view, mask=_hull_of(inside))
-    return contour_view(contour.image, hull, f"views[{contour.image}].mask")
+    return contour_view(contour.image, hull, f"views[{contour.image}].mask", contour.camera)
 
 
 def _hull_of(inside: BoolArray) -> BoolArray:

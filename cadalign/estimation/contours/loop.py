@@ -102,7 +102,7 @@ class Settled(NamedTuple):
     rounds: int
 
 
-def contour_view(image: int, view: View, where: str) -> ViewContour:
+def contour_view(image: int, view: View, where: str, camera: Camera | None = None) -> ViewContour:
     """The contour of a view's mask, with what the sightings need of the camera.
 
     Samples outside of its lens are dropped.
@@ -112,7 +112,8 @@ def contour_view(image: int, view: View, where: str) -> ViewContour:
     InputError
         If the mask ``where`` has no contour.
     """
-    camera, mask = view.camera, cast("FloatArray | BoolArray", view.mask_image)
+    camera = view.camera if camera is None else camera
+    mask = cast("FloatArray | BoolArray", view.mask_image)
     contour = mask_contour(mask, where)
     rays, valid = camera.normalize_where_valid(contour.points)
     kept = contour.taken(valid)
@@ -148,9 +149,10 @@ def settle(
     for number in range(_COARSE_ROUNDS):
         posed = surface.at(evidence.shape, state)
         poses = poses_of(evidence, state)
+        cameras = [camera_at(view, evidence, state) for view in views]
         rims = [
-            find_rims(posed.caster, view.camera, poses[view.image], view.contour, reach)
-            for view in views
+            find_rims(posed.caster, camera, poses[view.image], view.contour, reach)
+            for view, camera in zip(views, cameras, strict=True)
         ]
         moved = _change(last, rims)
         widest = max(noise.sigma for noise in current)
@@ -160,9 +162,9 @@ def settle(
         if fine and surface.is_exact:
             biases = [
                 extraction_bias(
-                    posed.caster, view.camera, poses[view.image], view.mask, view.contour, each
+                    posed.caster, camera, poses[view.image], view.mask, view.contour, each
                 )
-                for view, each in zip(views, rims, strict=True)
+                for view, camera, each in zip(views, cameras, rims, strict=True)
             ]
         residuals = [
             np.where(each.found, each.offset + offset * noise.offset, np.nan)
@@ -336,6 +338,14 @@ def rim_rows(
         np.full(count, CAUCHY),
         np.full(count, _LOSS_SCALE / np.sqrt(noise.correlation)),
     )
+
+
+def camera_at(view: ViewContour, evidence: Evidence, state: State) -> Camera:
+    """The camera of a view, with the focal length that a state has."""
+    group = int(evidence.focals.group[view.image])
+    if group < 0:
+        return view.camera
+    return view.camera.with_focal(view.camera.fx * float(np.exp(state.log_focals[group])))
 
 
 def poses_of(evidence: Evidence, state: State) -> list[Alignment]:

@@ -165,8 +165,12 @@ def _of_keypoints(
     if not rows.any():
         return []
     seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
-    errors = seen[:, :2] / seen[:, 2:] - sightings.rays[rows]
-    return [summary_of_keypoints(errors, sightings.whitening[rows], view, camera)]
+    group = int(evidence.focals.group[view])
+    log_ratio = float(state.log_focals[group]) if group >= 0 else 0.0
+    ratio = np.exp(log_ratio)
+    seen_rays = seen[:, :2] / seen[:, 2:]
+    errors = seen_rays - (sightings.rays[rows] + log_ratio * sightings.slopes[rows]) / ratio
+    return [summary_of_keypoints(errors, ratio * sightings.whitening[rows], view, camera)]
 
 
 def summary_of_keypoints(

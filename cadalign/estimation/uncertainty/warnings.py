@@ -12,7 +12,12 @@ from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.contradictions import contradictions, count_equations
 from cadalign.estimation.uncertainty.evidence import depth_factor, pieces_of
 from cadalign.estimation.uncertainty.summary import name_of
-from cadalign.estimation.uncertainty.weakness import WEAK_DISTANCE, WEAK_ROTATION_DEG, WEAK_SCALE
+from cadalign.estimation.uncertainty.weakness import (
+    WEAK_DISTANCE,
+    WEAK_ROTATION_DEG,
+    WEAK_SCALE,
+    percent,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.joint.evidence import Evidence, State
@@ -62,6 +67,8 @@ def weaknesses(pose: Alignment, covariance: FloatArray) -> list[str]:
     spread = float(np.linalg.norm(deviations[3:6]))
     if spread > WEAK_DISTANCE * distance > 0:
         warnings.append(f"the distance is known only to +-{100 * spread / distance:.0f} %")
+    if len(deviations) > 9 and deviations[9] > WEAK_SCALE:
+        warnings.append(f"the focal length is known only to +-{percent(deviations[9])}")
     return warnings
 
 

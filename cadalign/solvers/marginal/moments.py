@@ -14,9 +14,9 @@ from cadalign.solvers.linalg import cholesky, solve_cholesky
 class Likely(NamedTuple):
     """Estimates, the best first, with their ``likelihoods`` (L,) relative to it.
 
-    ``poses`` (L, 12) in the camera, stretched ``points`` (L, m, 3), ``lengths`` (L, 3) of the box,
-    ``covariances`` (L, 9, 9) of pose and log lengths, and those of the points in the model's frame
-    and in the camera's (L, m, 3, 3).
+    ``poses`` (L, 12) in the camera, stretched ``points`` (L, m, 3), ``lengths`` (L, 3) of the box
+    or (L, 4) with the focal length, ``covariances`` (L, 9, 9) or (L, 10, 10) of pose and their
+    logarithms, and those of the points in the model's frame and in the camera's (L, m, 3, 3).
     """
 
     poses: FloatArray
@@ -29,7 +29,7 @@ class Likely(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Second moments (9, 9) and (m, 3, 3) about the best estimate.
+    """Second moments (9, 9) or (10, 10), and (m, 3, 3), about the best estimate.
 
     ``distances`` (L,) are the squared distances of the rotations from the best one's, in its
     deviations; infinite where these are none.
@@ -56,12 +56,13 @@ def moments_of(likely: Likely) -> Moments:
     is_determined = cholesky(factor, 3, 0.0)
     first = np.empty((m, 3))
     _place(likely.poses[0], likely.points[0], first)
-    placed, step = np.empty((m, 3)), np.empty(9)
+    size = likely.covariances.shape[1]
+    placed, step = np.empty((m, 3)), np.empty(size)
     for k in range(1, count):
         weight = share * likely.likelihoods[k]
         _write_step(likely, k, step)
-        for p in range(9):
-            for q in range(9):
+        for p in range(size):
+            for q in range(size):
                 found.covariance[p, q] += weight * (likely.covariances[k, p, q] + step[p] * step[q])
         _place(likely.poses[k], likely.points[k], placed)
         for i in range(m):
@@ -95,12 +96,13 @@ def _place(pose: FloatArray, points: FloatArray, placed: FloatArray) -> None:
 
 @kernel
 def _write_step(likely: Likely, k: int, step: FloatArray) -> None:
-    """Write rotation vector, translation and log lengths (9,) from the best estimate to another."""
+    """Write rotation vector, translation and log lengths from the best estimate to another."""
     turn = np.empty((3, 3))
-    for a in range(3):
-        step[3 + a] = likely.poses[k, 9 + a] - likely.poses[0, 9 + a]
+    for a in range(likely.lengths.shape[1]):
         before, after = likely.lengths[0, a], likely.lengths[k, a]
         step[6 + a] = np.log(after / before) if before > 0 and after > 0 else 0.0
+    for a in range(3):
+        step[3 + a] = likely.poses[k, 9 + a] - likely.poses[0, 9 + a]
         for b in range(3):
             turn[a, b] = 0.0
             for c in range(3):

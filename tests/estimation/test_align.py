@@ -385,8 +385,10 @@ def test_a_damaged_result_is_refused_by_field() -> None:
         (lambda: View(CAMERA, [[1, 2]], depth=[-1.0]), "depth: has values that are not positive"),
         (lambda: View(CAMERA, [[1, 2]], up=[0, 0, 0]), "up: a direction must not be zero"),
         (
-            lambda: View(Camera.without_focal(640, 480), [[1, 2]]),
-            "camera: its focal length is unknown",
+            lambda: align(
+                Model(points_3d=np.eye(3)), View(Camera.without_focal(640, 480), np.eye(3)[:, :2])
+            ),
+            "camera: the focal length is unknown",
         ),
         (
             lambda: align(

@@ -47,6 +47,7 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.reduction import reduced
 from cadalign.solvers.joint.search import score_state
 
 _MOST_STARTS = 4
@@ -194,7 +195,7 @@ def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
 
 def _is_determined(minimum: Minimum) -> bool:
     """True if the evidence without masks determines all unknowns."""
-    _, information = information_of(minimum.evidence, minimum.state)
+    _, information = information_of(*reduced(minimum.evidence, minimum.state))
     sizes = np.sqrt(information.diagonal())
     if not np.isfinite(sizes).all() or not (sizes > 0).all():
         return False
@@ -294,7 +295,7 @@ def _tension(candidate: _Candidate) -> str | None:
 
 
 def _cost(evidence: Evidence, state: State) -> float:
-    return float(information_of(evidence, state)[0])
+    return information_of(*reduced(evidence, state))[0]
 
 
 def _minimum(candidate: _Candidate) -> Minimum:

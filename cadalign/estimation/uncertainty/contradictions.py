@@ -26,7 +26,7 @@ from cadalign.estimation.uncertainty.evidence import (
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, packed
-from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
+from cadalign.solvers.joint.reduction import reduced
 from cadalign.solvers.joint.search import refine_joint
 from cadalign.solvers.joint.system import joint_cost
 
@@ -73,9 +73,7 @@ def contradictions(
     pieces = [each for each in every if not _determines_its_pose(evidence, each)]
     if len(every) < 2 or not pieces:
         return ()
-    reduction = reduce_modes(evidence)
-    state = reduced_state(reduction, evidence.shape, state)
-    evidence = reduction.evidence
+    evidence, state = reduced(evidence, state)
     if len(evidence.planes.point):
         evidence = _without_hidden(evidence, state)
         cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
@@ -217,7 +215,7 @@ def _is_unlikely(trial: _Trial, level: float) -> bool:
 
 def _determined(evidence: Evidence, state: State) -> _Determined:
     """Equations beyond the unknowns that they determine, and the number of these."""
-    _, information = information_of(evidence, state)
+    _, information = information_of(*reduced(evidence, state))
     rank = _rank(information)
     held = int(3 - evidence.scales.free.sum())
     return _Determined(count_equations(evidence) - (rank - held), rank)

@@ -19,6 +19,7 @@ from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, Planes, Rig, Sightings, State, points_of
+from cadalign.solvers.joint.reduction import reduced
 
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
 _OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
@@ -306,6 +307,7 @@ def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
 
 
 def _deviations(evidence: Evidence, state: State) -> Uncertainty:
+    evidence, state = reduced(evidence, state)  # displacements of several views are modes
     _, information = information_of(evidence, state)
     sizes = np.sqrt(information.diagonal())
     sizes[~(sizes > 0)] = _WEAKEST  # nothing is known of it

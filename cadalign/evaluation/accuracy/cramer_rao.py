@@ -17,6 +17,8 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.alignment import keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.covariance import covariance_of, focal_covariance
+from cadalign.solvers.evidence import LogFocalPrior
+from cadalign.solvers.focal import FocalObjective
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
@@ -47,7 +49,9 @@ def cramer_rao_bound(
         undetermined = covariance_of(objective, gt.packed, covariance)
     else:
         slopes = focal_slopes(camera.project(in_camera), camera, rays)
-        undetermined = focal_covariance(objective, slopes, 0.0, gt.packed, covariance)
+        prior = LogFocalPrior(-np.inf, np.inf, 0.0, 0.0)
+        system = FocalObjective(objective, slopes, prior)
+        undetermined = focal_covariance(system, gt.packed, covariance)
     if undetermined >= 0:
         raise DegenerateError("the points do not determine the alignment", where="points_3d")
     return full_covariance(covariance, "x")

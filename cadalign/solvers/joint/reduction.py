@@ -86,6 +86,12 @@ def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:
     )
 
 
+def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The evidence in reduced modes, and a state of it."""
+    reduction = reduce_modes(evidence)
+    return reduction.evidence, reduced_state(reduction, evidence.shape, state)
+
+
 def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
     """The state in the coefficients and displacements of the shape that was reduced."""
     modes, displaced = len(whole.modes), reduction.displaced

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,8 @@ from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.raycast.normals import corner_normals
 from cadalign.render.raycast.surface import Surface
+
+T = TypeVar("T")
 
 
 class Scene:
@@ -43,6 +46,7 @@ class Scene:
     def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
         self.mesh = mesh
         self.crease_angle = float(crease_angle)
+        self._derived: dict[Callable[[Scene], Any], Any] = {}
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
@@ -74,12 +78,12 @@ class Scene:
 
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
-    @cached_property
-    def gl_meshes(self) -> tuple[Any, Any]:
-        """The front and back sides for OpenGL, both a `pyrender.Mesh`."""
-        from cadalign.render.opengl.mesh import gl_meshes
-
-        return gl_meshes(self)
+    def derived(self, make: Callable[[Scene], T]) -> T:
+        """What a renderer makes of the scene by a function of its own, made once."""
+        if make not in self._derived:
+            self._derived[make] = make(self)
+        made: T = self._derived[make]
+        return made
 
     @cached_property
     def used_vertices(self) -> FloatArray:

@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.camera_form import PixelOrigin, shift_of
+from cadalign.geometry.pixels import PixelOrigin, shift_of
 from cadalign.io.documents import (
     Document,
     Finite,

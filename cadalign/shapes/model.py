@@ -30,8 +30,9 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
 )
+from cadalign.shapes.plots import shape_html
 from cadalign.shapes.reflections import symmetric_component
-from cadalign.shapes.shape_file import read_shape, write_shape
+from cadalign.shapes.shape_file import ShapeFields, read_shape, write_shape
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -392,7 +393,11 @@ class ShapeModel:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file atomically; raises DataError on failure."""
-        write_shape(path, self)
+        write_shape(path, self._values)
+
+    @property
+    def _values(self) -> ShapeFields:
+        return ShapeFields(**{name: getattr(self, name) for name in ShapeFields._fields})
 
     def __repr__(self) -> str:
         count = len(self.components)
@@ -401,9 +406,7 @@ class ShapeModel:
         return f"ShapeModel({self.category!r}, {text}{models})"
 
     def _repr_html_(self) -> str:
-        from cadalign.shapes.plots import shape_html
-
-        return shape_html(self)
+        return shape_html(self._values)
 
     @property
     def mean(self) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from cadalign.cli.options import JsonOption, named_as_flags
-from cadalign.cli.runs import conclude, run_progress
+from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 
@@ -38,8 +38,6 @@ class RunCommand(JsonOption, RunOptions):
 
     def run(self) -> int:
         """Do the run and say what came out; returns the exit code."""
-        from cadalign.cli.report import write_run_report
-
         spec, run = self.do_run()
         code = conclude(spec, run, json=self.json)
         write_run_report(run.folder)

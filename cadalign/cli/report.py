@@ -5,15 +5,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from cadalign.cli.output import new_console
 from cadalign.errors import InputError
-
-if TYPE_CHECKING:
-    from cadalign.evaluation.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -95,11 +92,3 @@ class Report:
 
 def _page(runs: tuple[Path, ...]) -> Path:
     return runs[0] / "report.html" if len(runs) == 1 else Path("report.html")
-
-
-def write_run_report(folder: RunFolder) -> None:
-    """Write a run's page at its end, and say where it is."""
-    from cadalign.report import write_report
-
-    report = write_report([folder.path], folder.report)
-    new_console().print(f"Report: {report.path}", markup=False)

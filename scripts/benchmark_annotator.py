@@ -46,6 +46,7 @@ from support.panels import (
 from support.web import axe_script
 
 from cadalign import Camera, Mesh
+from cadalign.annotate.actions import perform
 from cadalign.annotate.masks import encode_runs
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -145,9 +146,9 @@ def measure_times(arguments: Arguments, browser: Browser, folder: Path) -> dict[
         if kind == "mask":
             pose = own.instance.cam_from_model
             mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
-            session.act(0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+            perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
         last = session.photos[0].document.pairs[-1]
-        session.act(0, {"do": "delete", "pair": last.number})
+        perform(session, 0, {"do": "delete", "pair": last.number})
         with served(session) as access:
             page = open_page(
                 browser, access.url, width=1366, height=768, scheme="light", scripts=(WATCH_PAINT,)
@@ -411,7 +412,7 @@ def pictured_session(mesh: Mesh, folder: Path) -> Session:
     session = open_session(
         SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
     )
-    session.act(0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
+    perform(session, 0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
     model = session.model
     seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
     shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.annotate.document import Pixel
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import ForeignDocument
-
-if TYPE_CHECKING:
-    from cadalign.annotate.objects.state import PhotoState
-    from cadalign.annotate.session import Session
 
 
 @dataclass(frozen=True)

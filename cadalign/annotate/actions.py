@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 from cadalign.annotate.action import Action, Outcome, inside
 from cadalign.annotate.choosing.switching import ChooseModel
-from cadalign.annotate.document import Document, FocalChoice, Pair, Pixel, Priors
+from cadalign.annotate.document import Document, Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
 from cadalign.annotate.image_corners import nearest_corner
 from cadalign.annotate.objects.actions import OBJECT_ACTIONS, bring_back
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.annotate.worklist import Mark
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import (
-    Finite,
     Index,
     NotNegative,
     Point2,
     Point3,
     Text,
+    convert,
 )
 
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
-
-_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
-_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
 _LONGEST_REACH = 200.0  # of a corner of the photo [px]
 _SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
 _MISSED = "That click missed the model."
@@ -217,46 +215,6 @@ class Identify(Action):
         return Outcome(self.pair)
 
 
-class Focal(Action):
-    """Choose a known or an estimated focal length."""
-
-    known: bool
-    pixels: Finite | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        if self.pixels is not None:
-            low, high = (bound * state.photo.width for bound in _FOCAL_RANGE)
-            if not low <= self.pixels <= high:
-                raise InputError(
-                    f"{self.pixels:g} px is no focal length of this photo",
-                    where="pixels",
-                    fix=f"give {low:.0f} to {high:.0f} px",
-                )
-        focal = FocalChoice(self.known, self.pixels)
-        state.history.record(replace(state.document, focal=focal))
-        return Outcome()
-
-
-class Prior(Action):
-    """Choose the prior on the stretch, and whether an estimated focal length has one."""
-
-    stretch: Finite | None = None
-    focal: bool = True
-
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        low, high = _STRETCH_RANGE
-        if self.stretch is not None and not low <= self.stretch <= high:
-            raise InputError(
-                f"{100 * self.stretch:g} % is no weak prior on the stretch",
-                where="stretch",
-                fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
-            )
-        kept = state.document.priors.focal or state.intrinsics.likely_focal
-        priors = Priors(self.stretch, kept if self.focal else None)
-        state.history.record(replace(state.document, priors=priors))
-        return Outcome()
-
-
 class Accept(Action):
     """Place pairs as a detector proposes: those of some keypoints, or all that are left."""
 
@@ -323,8 +281,6 @@ ACTIONS: dict[str, type[Action]] = {
     "delete": Delete,
     "rename": Rename,
     "identify": Identify,
-    "focal": Focal,
-    "prior": Prior,
     **EVIDENCE_ACTIONS,
     **OBJECT_ACTIONS,
     "accept": Accept,
@@ -340,6 +296,44 @@ DELETING = ("delete_object", "undo", "redo")
 
 RENAMING = ("rename", "identify")
 """Those that may change the names of keypoints instead of the document."""
+
+
+def perform(
+    session: Session, number: int, action: Mapping[str, Any], *, slot: int | None = None
+) -> Outcome:
+    """Do an action of the page, its name ``do`` and its arguments, and save its changes.
+
+    It is done on an object of the photo of a number; see `Session.photo_state`.
+    """
+    with session.lock:
+        state = session.photo_state(number, slot)
+        if slot == 0 and session.objects[number][0].is_shown:
+            state = session.objects[number][0]  # which is not listed while nothing is marked
+        elif slot not in (None, session.place_of(state)[1]):
+            raise InputError(
+                "this object was deleted, or the photo is no longer one of its photos",
+                where="object",
+                fix="reload the page",
+            )
+        name = action.get("do")
+        kind = ACTIONS.get(name) if isinstance(name, str) else None
+        if kind is None:
+            raise InputError(
+                f"{quote(name)} is not an action",
+                where="do",
+                fix=f"known are {', '.join(ACTIONS)}",
+            )
+        before = {id(each): each.object_document for each in session.states}
+        outcome: Outcome = convert(action, kind).apply(session, state)
+        owners = [each for each in session.states if each.lead is None]
+        changed = [each for each in owners if before.get(id(each)) is not each.document]
+        for each in changed:
+            session.save(each)
+        if changed and name not in DELETING:
+            session.deletions.note_change(number)
+        if name in RENAMING:
+            session.save(state)
+        return outcome
 
 
 def _gone_through(state: PhotoState, before: Document, nothing: str) -> Outcome:

@@ -1,13 +1,13 @@
-"""Actions of the page on evidence beside the pairs: mask, vertical edges, known lengths."""
+"""Actions of the page on what is known beside the pairs: mask, edges, lengths, focal length."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.annotate.action import Action, Outcome, inside
+from cadalign.annotate.document import FocalChoice, Priors
 from cadalign.annotate.evidence import (
     Evidence,
     Lengths,
@@ -17,13 +17,54 @@ from cadalign.annotate.evidence import (
     find_up,
 )
 from cadalign.annotate.masks import cut_out, decode_runs, encode_runs
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Finite, Point2, Positive
 
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
-
+_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
+_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
 _LEAST_VERTICAL = 5.0  # [px]
+
+
+class Focal(Action):
+    """Choose a known or an estimated focal length."""
+
+    known: bool
+    pixels: Finite | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        if self.pixels is not None:
+            low, high = (bound * state.photo.width for bound in _FOCAL_RANGE)
+            if not low <= self.pixels <= high:
+                raise InputError(
+                    f"{self.pixels:g} px is no focal length of this photo",
+                    where="pixels",
+                    fix=f"give {low:.0f} to {high:.0f} px",
+                )
+        focal = FocalChoice(self.known, self.pixels)
+        state.history.record(replace(state.document, focal=focal))
+        return Outcome()
+
+
+class Prior(Action):
+    """Choose the prior on the stretch, and whether an estimated focal length has one."""
+
+    stretch: Finite | None = None
+    focal: bool = True
+
+    def apply(self, session: Session, state: PhotoState) -> Outcome:
+        low, high = _STRETCH_RANGE
+        if self.stretch is not None and not low <= self.stretch <= high:
+            raise InputError(
+                f"{100 * self.stretch:g} % is no weak prior on the stretch",
+                where="stretch",
+                fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
+            )
+        kept = state.document.priors.focal or state.intrinsics.likely_focal
+        priors = Priors(self.stretch, kept if self.focal else None)
+        state.history.record(replace(state.document, priors=priors))
+        return Outcome()
 
 
 class PaintMask(Action):
@@ -119,6 +160,8 @@ class KnownLengths(Action):
 
 
 EVIDENCE_ACTIONS: dict[str, type[Action]] = {
+    "focal": Focal,
+    "prior": Prior,
     "mask_paint": PaintMask,
     "mask_load": LoadMask,
     "mask_cut": CutOut,

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from cadalign.annotate.action import Action, Outcome
 from cadalign.annotate.document import Document, FurtherView, History, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.objects.state import PhotoState
 from cadalign.annotate.objects.view_history import ViewHistory
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import Text
 from cadalign.retrieval.models import ModelKey
-
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
 
 
 class ChooseModel(Action):

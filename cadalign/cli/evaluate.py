@@ -15,6 +15,7 @@ from cadalign.cli.options import JsonOption, named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
+from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.opened import Run
@@ -45,7 +46,6 @@ class RunCommand(JsonOption, RunOptions):
 
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
-        from cadalign.evaluation.registry import spec_named
         from cadalign.evaluation.runs.folder import RunFolder
         from cadalign.evaluation.runs.run import execute, workers_of
 
@@ -99,7 +99,6 @@ class EvaluateShow(JsonOption):
 
     def run(self) -> int:
         """Show the run; returns the exit code, that of the run."""
-        from cadalign.evaluation.registry import spec_of_config
         from cadalign.evaluation.runs.folder import RunFolder
 
         folder = RunFolder(self.run_folder)
@@ -118,8 +117,6 @@ class EvaluateShow(JsonOption):
 
 def _commands() -> Any:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
-    from cadalign.evaluation.registry import known_options
-
     commands = {
         options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -15,12 +15,19 @@ import tyro
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.output import make_folder, new_console
+from cadalign.datasets import (
+    ImageKeypoints,
+    ModelKeypoints,
+    choose_object,
+    join_keypoints,
+    read_image_keypoints,
+)
+from cadalign.datasets.detections.coco_masks import decode_segmentation
 from cadalign.errors import CadalignError, DataError, InputError
-
-if TYPE_CHECKING:
-    from cadalign.datasets import ImageKeypoints, ModelKeypoints
-    from cadalign.geometry.camera import Camera
-    from cadalign.io.observation import Observation
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import in_file
+from cadalign.io.images import photo_size, write_image
+from cadalign.io.observation import Observation
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -63,8 +70,6 @@ class Observe(CameraOptions, EvidenceOptions):
 
     def run(self) -> int:
         """Write the observation, or those of all objects; returns the exit code."""
-        from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
-
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
         if self.every:
@@ -84,8 +89,6 @@ class Observe(CameraOptions, EvidenceOptions):
         self, found: ImageKeypoints, model: ModelKeypoints, image: Path | None, out: Path
     ) -> Observation:
         """Write the observation of one object in a photo."""
-        from cadalign.datasets import join_keypoints
-
         with named_as_flags(self, others=_FLAGS):
             observation = join_keypoints(
                 found,
@@ -108,10 +111,6 @@ class Observe(CameraOptions, EvidenceOptions):
         self, observation: Observation, found: ImageKeypoints, out: Path
     ) -> Path | None:
         """Write the mask beside the keypoints, if there is one that a fit can use; its path."""
-        from cadalign.datasets.detections.coco_masks import decode_segmentation
-        from cadalign.io.documents import in_file
-        from cadalign.io.images import write_image
-
         if found.segmentation is None or not self.segmentation:
             return None
         camera = observation.camera
@@ -128,9 +127,6 @@ class Observe(CameraOptions, EvidenceOptions):
 
     def _camera(self, found: ImageKeypoints, image: Path | None) -> Camera:
         """Read the camera, or make one of the photo's size without focal length."""
-        from cadalign.geometry.camera import Camera
-        from cadalign.io.images import photo_size
-
         paths = [path for path in (image, self.mask, self.depth) if path is not None]
         sizes = {str(path): photo_size(path) for path in paths}
         if found.size is not None:

@@ -9,8 +9,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cadalign.cli.evaluate import command_of
 from cadalign.cli.output import new_console
+from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
+from cadalign.evaluation.estimates.options import EstimatesOptions
+from cadalign.io.files import write_text
 
 
 @dataclass(frozen=True)
@@ -68,17 +72,11 @@ class Report:
         if self.out is None:
             sys.stdout.write(text)
         else:
-            from cadalign.io.files import write_text
-
             write_text(self.out, text)
         return code
 
     def _score(self) -> int:
         """Score the estimates and print the table; returns the exit code."""
-        from cadalign.cli.evaluate import command_of
-        from cadalign.cli.runs import conclude
-        from cadalign.evaluation.estimates.options import EstimatesOptions
-
         if self.data is None:
             fix = "give --data, the folder of the data set"
             raise InputError(

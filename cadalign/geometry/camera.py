@@ -15,6 +15,8 @@ from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.camera_form import read_form, read_matrix, write_form
 from cadalign.geometry.distortion import distort, perspective, undistort
 from cadalign.geometry.pixels import PixelOrigin
+from cadalign.notebook.axes import photo_axes
+from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -355,9 +357,6 @@ class Camera:
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=1))
 
     def _repr_html_(self) -> str:
-        from cadalign.notebook.axes import photo_axes
-        from cadalign.notebook.html import card, draw_picture
-
         focal, angle = "unknown", "unknown"
         if self.focal_known:
             angles = np.degrees(2 * np.arctan(0.5 * np.array([self.width, self.height])

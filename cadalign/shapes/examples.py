@@ -6,16 +6,14 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids
-
-if TYPE_CHECKING:
-    from cadalign.geometry.mesh import Mesh
 
 logger = logging.getLogger("cadalign")
 

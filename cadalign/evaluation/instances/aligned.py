@@ -12,10 +12,10 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
     from cadalign.estimation.align_result import AlignAlternative, AlignResult
-    from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCALE = 1e-6
 

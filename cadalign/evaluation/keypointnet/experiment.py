@@ -40,10 +40,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from cadalign.datasets import AnnotatedModel
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.fit import fit, fit_batch
 from cadalign.estimation.result import FitResult
@@ -70,9 +71,6 @@ from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-
-if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (

@@ -6,19 +6,17 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from cadalign.arrays import IntArray
+from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import RAYS
 from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
 from cadalign.evaluation.runs.tables import Row
-
-if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel, KeypointNet
 
 AUTO = "auto"
 """Rays where there is a mesh, the hull's rule elsewhere."""

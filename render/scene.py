@@ -15,7 +15,7 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.raycast.normals import corner_normals
-from cadalign.render.raycast.surface import Surface
+from cadalign.render.raycast.surface import SurfaceColors
 
 T = TypeVar("T")
 
@@ -142,6 +142,6 @@ class Scene:
         return np.asarray(np.stack([first, second], axis=1) * inverse[:, None, None])
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> SurfaceColors:
         """The colours of the mesh."""
-        return Surface(self.mesh)
+        return SurfaceColors(self.mesh)

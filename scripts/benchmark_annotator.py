@@ -93,7 +93,7 @@ THUMBNAILS = """[...document.querySelectorAll(".thumbs img")].filter((image) => 
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class AnnotatorArguments(SeededBenchmark):
     """Arguments of the benchmark."""
 
     parts: tuple[str, ...] = PARTS
@@ -110,9 +110,9 @@ class Arguments(SeededBenchmark):
     """Annotators to kill."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: AnnotatorArguments) -> None:
     """Measure, print and write."""
-    measures: dict[str, Callable[[Arguments, Browser, Path], dict[str, Any]]] = {
+    measures: dict[str, Callable[[AnnotatorArguments, Browser, Path], dict[str, Any]]] = {
         "times": measure_times,
         "list": measure_list,
         "panels": measure_panels,
@@ -135,7 +135,7 @@ def main(arguments: Arguments) -> None:
 # --- times -----------------------------------------------------------------------------------
 
 
-def measure_times(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_times(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Clicks that complete the twentieth pair, without and with a mask [ms]."""
     case = case_of(arguments, folder)
     found: dict[str, Any] = {}
@@ -191,7 +191,7 @@ def _timed_clicks(
     return times
 
 
-def case_of(arguments: Arguments, folder: Path) -> Case:
+def case_of(arguments: AnnotatorArguments, folder: Path) -> Case:
     """A photo of a chair: ShapeNet's if it is here, else the sample's."""
     root = arguments.keypointnet
     if root is None:
@@ -208,7 +208,7 @@ def _new(folder: Path) -> Path:
 # --- list ------------------------------------------------------------------------------------
 
 
-def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_list(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """The list of a folder of photos, and going from one to the next."""
     case = case_of(arguments, folder)
     with Image.open(case.photo) as image:
@@ -268,7 +268,7 @@ def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[s
 # --- panels ----------------------------------------------------------------------------------
 
 
-def measure_panels(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_panels(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Layout shifts and what axe-core finds, over a session through every panel."""
     root = write_sample_dataset(folder / "sample", per_category=3)
     original = make_case(root, _new(folder / "case"))
@@ -313,7 +313,7 @@ def _serious(page: Page) -> set[str]:
 # --- kills -----------------------------------------------------------------------------------
 
 
-def measure_kills(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_kills(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Annotators killed at random moments."""
     case = case_of(arguments, folder)
     rounds = []
@@ -334,7 +334,7 @@ def measure_kills(arguments: Arguments, browser: Browser, folder: Path) -> dict[
 # --- pictures --------------------------------------------------------------------------------
 
 
-def take_pictures(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def take_pictures(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Contact sheets of ten models on every screen, light and dark."""
     sessions = {
         name: pictured_session(mesh, _new(folder / name))
@@ -449,4 +449,4 @@ def write_sheet(path: Path, shots: list[tuple[str, Path]], *, columns: int = 2) 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(AnnotatorArguments))

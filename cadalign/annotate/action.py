@@ -14,7 +14,7 @@ from cadalign.io.documents import ForeignDocument
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ActionOutcome:
     """Outcome of an action beside the changed document, for the user."""
 
     selected: int | None = None  # number of the pair that was placed or changed
@@ -25,7 +25,7 @@ class Outcome:
 class Action(ForeignDocument):
     """Base of the actions; ``pair`` fields are numbers of pairs."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         """Record the changed document, or raise a CadalignError."""
         raise NotImplementedError
 

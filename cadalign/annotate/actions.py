@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from cadalign.annotate.action import Action, Outcome, inside
+from cadalign.annotate.action import Action, ActionOutcome, inside
 from cadalign.annotate.choosing.switching import ChooseModel
-from cadalign.annotate.document import Document, Pair, Pixel
+from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
 from cadalign.annotate.image_corners import nearest_corner
 from cadalign.annotate.objects.actions import OBJECT_ACTIONS, bring_back
@@ -44,11 +44,11 @@ class PlaceUv(_Placing):
     uv: Point2
     snap: NotNegative = 0.0  # farthest corner of the photo that it goes to [px]
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         uv = _snapped(self.uv, self.snap, session, state)
         document, pair = state.document.place_uv(uv, self.pair)
         state.history.record(document)
-        return Outcome(pair, _no_corner(self.snap, moved=uv != self.uv))
+        return ActionOutcome(pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class PlaceKeypoint(_Placing):
@@ -56,7 +56,7 @@ class PlaceKeypoint(_Placing):
 
     keypoint: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.model.registry[self.keypoint]  # refuses an unknown one
         return _place(self.keypoint, self.pair, state)
 
@@ -87,10 +87,10 @@ class Pick(_Aiming):
 
     pair: Index | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = self.target(state)
         if keypoint is None:
-            return Outcome(message=_MISSED)
+            return ActionOutcome(message=_MISSED)
         return _place(keypoint, self.pair, state)
 
 
@@ -99,12 +99,12 @@ class Repick(_Aiming):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = self.target(state)
         if keypoint is None:
-            return Outcome(self.pair, _MISSED)
+            return ActionOutcome(self.pair, _MISSED)
         state.history.record(state.document.exchange_keypoint(self.pair, keypoint))
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class PlaceMirrored(Action):
@@ -112,7 +112,7 @@ class PlaceMirrored(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         registry, model = state.model.registry, state.model.cad
         point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
@@ -127,7 +127,7 @@ class PlaceMirrored(Action):
 class PlaceSuggested(_Placing):
     """Place the suggested keypoint."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         _, suggestion = session.live(state)
         if suggestion is None:
             raise InputError(
@@ -147,12 +147,12 @@ class Move(Action):
     gesture: Index | None = None
     snap: NotNegative = 0.0  # as of `PlaceUv`
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         uv = _snapped(self.uv, self.snap, session, state)
         moved = state.document.move(self.pair, uv)
         step = None if self.gesture is None else (self.pair, self.gesture)
         state.history.record(moved, step=step)
-        return Outcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
+        return ActionOutcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class Release(Action):
@@ -160,9 +160,9 @@ class Release(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.history.record(state.document.release_keypoint(self.pair))
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class Delete(Action):
@@ -170,9 +170,9 @@ class Delete(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.history.record(state.document.delete(self.pair))
-        return Outcome()
+        return ActionOutcome()
 
 
 class Rename(Action):
@@ -181,14 +181,14 @@ class Rename(Action):
     pair: Index
     name: Text
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         if keypoint is None:
             raise InputError(
                 "this pair has no model point yet", where="pair", fix="click on the model first"
             )
         state.model.registry.rename(keypoint, self.name)
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class Identify(Action):
@@ -197,7 +197,7 @@ class Identify(Action):
     pair: Index
     label: Index | Text
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         shape = session.shape
         if keypoint is None or shape is None or self.label not in shape.ids:
@@ -207,12 +207,12 @@ class Identify(Action):
         registry = state.model.registry
         if shape.is_named:
             registry.rename(keypoint, str(self.label))
-            return Outcome(self.pair)
+            return ActionOutcome(self.pair)
         point = registry[keypoint]
         own = point.name if point.name != f"point {keypoint}" else f"keypoint {self.label}"
         known = registry.add_as(int(self.label), replace(point, name=own))
         state.history.record(state.document.exchange_keypoint(self.pair, known))
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class Accept(Action):
@@ -220,7 +220,7 @@ class Accept(Action):
 
     keypoints: list[Index] | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         document, number = state.document, None
         for proposal in state.proposals:
             keypoint = proposal.keypoint
@@ -230,9 +230,9 @@ class Accept(Action):
                 number = document.next_number
                 document = document.append(Pair(number, proposal.uv, keypoint))
         if number is None:
-            return Outcome(message="Nothing is proposed that is not placed.")
+            return ActionOutcome(message="Nothing is proposed that is not placed.")
         state.history.record(document)
-        return Outcome(number)
+        return ActionOutcome(number)
 
 
 class MarkPhoto(Action):
@@ -240,16 +240,16 @@ class MarkPhoto(Action):
 
     mark: Mark | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         session.before_saving()
         session.worklist = session.worklist.marked(state.photo.path.name, self.mark)
-        return Outcome()
+        return ActionOutcome()
 
 
 class Undo(Action):
     """Undo the last change."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
         if deleted is not None:
             return bring_back(deleted)
@@ -261,7 +261,7 @@ class Undo(Action):
 class Redo(Action):
     """Redo the last undone change."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         before = state.marked
         is_done = state.history.redo()
         if state.owner.document.is_gone:
@@ -300,7 +300,7 @@ RENAMING = ("rename", "identify")
 
 def perform(
     session: Session, number: int, action: Mapping[str, Any], *, slot: int | None = None
-) -> Outcome:
+) -> ActionOutcome:
     """Do an action of the page, its name ``do`` and its arguments, and save its changes.
 
     It is done on an object of the photo of a number; see `Session.photo_state`.
@@ -324,7 +324,7 @@ def perform(
                 fix=f"known are {', '.join(ACTIONS)}",
             )
         before = {id(each): each.object_document for each in session.states}
-        outcome: Outcome = convert(action, kind).apply(session, state)
+        outcome: ActionOutcome = convert(action, kind).apply(session, state)
         owners = [each for each in session.states if each.lead is None]
         changed = [each for each in owners if before.get(id(each)) is not each.document]
         for each in changed:
@@ -336,24 +336,24 @@ def perform(
         return outcome
 
 
-def _gone_through(state: PhotoState, before: Document, nothing: str) -> Outcome:
+def _gone_through(state: PhotoState, before: AnnotationDocument, nothing: str) -> ActionOutcome:
     """The outcome of undoing or redoing, which may concern another photo of the object.
 
     ``nothing`` says that nothing was done, if so; ``before`` is what was marked in the photo.
     """
     if nothing:
-        return Outcome(message=nothing)
+        return ActionOutcome(message=nothing)
     if not state.is_shown:
-        return Outcome(message="This photo is no longer one of the object's.")
+        return ActionOutcome(message="This photo is no longer one of the object's.")
     if len(state.all_views) > 1 and state.marked == before:
-        return Outcome(message="That was a change in another photo of this object.")
-    return Outcome()
+        return ActionOutcome(message="That was a change in another photo of this object.")
+    return ActionOutcome()
 
 
-def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:
+def _place(keypoint: int, pair: int | None, state: PhotoState) -> ActionOutcome:
     document, number = state.document.place_keypoint(keypoint, pair)
     state.history.record(document)
-    return Outcome(number)
+    return ActionOutcome(number)
 
 
 def _snapped(uv: Pixel, reach: float, session: Session, state: PhotoState) -> Pixel:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.document import Document, Pair, Priors
+from cadalign.annotate.document import AnnotationDocument, Pair, Priors
 from cadalign.annotate.further import FurtherEvidence, known_depths
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.names import unfinished_file
@@ -69,7 +69,7 @@ SAME_PLACE = 1e-6
 class Stored:
     """An earlier session's annotation; ``camera`` is None without an observation file."""
 
-    document: Document
+    document: AnnotationDocument
     camera: Camera | None
     further: FurtherEvidence
     fit_options: Mapping[str, Any]
@@ -119,7 +119,7 @@ class AnnotationFiles:
 
         New model points are added to the registry; ``diagonal`` is that of the model's box.
         """
-        document, camera, further = Document(), None, FurtherEvidence()
+        document, camera, further = AnnotationDocument(), None, FurtherEvidence()
         fit_options: Mapping[str, Any] = {}
         views: list[StoredView] = []
         if self.observation.exists():
@@ -179,7 +179,7 @@ class AnnotationFiles:
 
     def write(
         self,
-        document: Document,
+        document: AnnotationDocument,
         registry: KeypointRegistry,
         camera: Camera,
         fit_options: Mapping[str, Any],
@@ -221,7 +221,7 @@ class AnnotationFiles:
 
     def unfinished_view(
         self,
-        document: Document,
+        document: AnnotationDocument,
         registry: KeypointRegistry,
         camera: Camera,
         shape: ObjectShape | None,
@@ -300,7 +300,7 @@ class AnnotationFiles:
 
 
 def known_pairs(
-    document: Document, registry: KeypointRegistry, shape: ObjectShape | None
+    document: AnnotationDocument, registry: KeypointRegistry, shape: ObjectShape | None
 ) -> tuple[Pair, ...]:
     """Complete pairs whose keypoints the shape knows; all of them without a shape."""
     return tuple(
@@ -349,8 +349,8 @@ def write_keypoints(
 
 def _document_of(
     observation: ObservedImage, registry: KeypointRegistry, diagonal: float
-) -> Document:
-    document = Document()
+) -> AnnotationDocument:
+    document = AnnotationDocument()
     ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)

@@ -21,7 +21,7 @@ from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.history_file import history_path, write_history
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.masks import draw_mask
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects.deletions import Deletions
 from cadalign.annotate.objects.joint import tells_something, with_other_views
@@ -36,7 +36,7 @@ from cadalign.annotate.shape_alignment import (
     align_shape,
     warm_up_joint,
 )
-from cadalign.annotate.suggestion import Estimate, Suggestion, suggest, suggest_of_shape
+from cadalign.annotate.suggestion import Suggestion, UncertainPose, suggest, suggest_of_shape
 from cadalign.annotate.worklist import State, WorkList
 from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.simulation.problems import simulate_problem
@@ -84,7 +84,7 @@ class Session:
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     @property
-    def model(self) -> CadModel:
+    def model(self) -> ClickableModel:
         """The first model."""
         return self.models[0].cad
 
@@ -208,7 +208,7 @@ class Session:
             document.focal,
             document.priors,
         )
-        estimate = Estimate.of(plain)
+        estimate = UncertainPose.of(plain)
         if estimate is None:
             return plain, None
         return plain, suggest(state.model.cad, registry, document.keypoints, estimate)
@@ -254,7 +254,7 @@ class Session:
         if result is None or camera is None or live.place or result.covariance[6, 6] > 0:
             return None  # of a size that is estimated, too, nothing is predicted
         covariance = np.delete(np.delete(result.covariance, 6, axis=0), 6, axis=1)
-        estimate = Estimate(camera, live.alignment, covariance, live.sigma)
+        estimate = UncertainPose(camera, live.alignment, covariance, live.sigma)
         return suggest(state.model.cad, registry, used, estimate)
 
     def further(self, state: PhotoState, *, to_write: bool = False) -> FurtherEvidence:

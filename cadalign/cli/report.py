@@ -18,7 +18,7 @@ from cadalign.io.files import write_text
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportCommand:
     """Show the result of one or more runs.
 
     The page holds the headline table, plots, and a gallery whose instances open with their numbers

@@ -66,7 +66,7 @@ class Example:
 
 
 class AnnotatedKeypoints(Protocol):
-    """Keypoints of an `AnnotatedModel`."""
+    """Keypoints of a `DatasetModel`."""
 
     @property
     def xyz(self) -> FloatArray: ...
@@ -74,7 +74,7 @@ class AnnotatedKeypoints(Protocol):
     def semantic_ids(self) -> IntArray: ...
 
 
-class AnnotatedModel(Protocol):
+class DatasetModel(Protocol):
     """A data set's model, such as `cadalign.datasets.AnnotatedModel`."""
 
     @property
@@ -94,7 +94,7 @@ class Dataset(Protocol):
 
 
 def examples_of(
-    models: Sequence[AnnotatedModel], *, meshes: bool, on_progress: Callable[[int, int], object]
+    models: Sequence[DatasetModel], *, meshes: bool, on_progress: Callable[[int, int], object]
 ) -> list[Example]:
     """Convert a data set's models; boxes are those of the meshes if at least half have one."""
     with_mesh = sum(model.mesh_path is not None for model in models)

@@ -1,4 +1,4 @@
-"""`cadalign.ShapeModel`: the shapes of a category as a mixture of Gaussians."""
+"""`cadalign.ShapeModel`: the shapes of a category as a mixture of ShapeGaussians."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
-    Gaussians,
     KeypointId,
     NearestShape,
     Reflection,
     ShapeComponent,
+    ShapeGaussians,
     TrainingShapes,
     check_axis,
     check_ids,
@@ -170,7 +170,7 @@ class ShapeModel:
         category, up_axis, unit
             See `ShapeModel`.
         components : int, optional
-            Number of Gaussians.
+            Number of ShapeGaussians.
         modes : int, optional
             Number of modes of each.
         reflection : bool
@@ -414,9 +414,9 @@ class ShapeModel:
         return np.asarray(sum(each.weight * each.mean for each in self.components))
 
     @cached_property
-    def gaussians(self) -> Gaussians:
+    def gaussians(self) -> ShapeGaussians:
         """The components as arrays, computed once."""
-        return Gaussians(
+        return ShapeGaussians(
             np.array([each.mean for each in self.components]),
             np.array([each.covariance for each in self.components]),
             np.array([each.weight for each in self.components]),

@@ -15,7 +15,7 @@ from cadalign.annotate.actions import perform
 from cadalign.annotate.history_file import history_path
 from cadalign.annotate.image_corners import nearest_corner
 from cadalign.annotate.mirror import MirrorPlanes
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
@@ -43,7 +43,7 @@ def sphere() -> Mesh:
 
 
 def test_click_near_a_corner_snaps_to_it() -> None:
-    model = CadModel(cube())
+    model = ClickableModel(cube())
     eye = np.array([0.4, 0.3, 6.0])
     beside = np.array([0.97, 0.96, 1.0]) - eye
     plain = model.pick(eye, beside)
@@ -63,7 +63,7 @@ def test_click_near_a_corner_snaps_to_it() -> None:
 
 @pytest.mark.parametrize("radius", [0.985, 1.015])
 def test_click_near_the_silhouette_snaps_to_it(radius: float) -> None:
-    model = CadModel(sphere())
+    model = ClickableModel(sphere())
     eye = np.array([0, 0, 50.0])
     direction = np.array([radius * np.cos(0.3), radius * np.sin(0.3), 0]) - eye
     snapped = model.pick(eye, direction, snap=0.001)
@@ -104,17 +104,17 @@ def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
 
 def test_mirror_planes_are_those_of_the_surface() -> None:
     mesh = cube()
-    assert CadModel(mesh).mirror_planes.axes == (0, 2)
+    assert ClickableModel(mesh).mirror_planes.axes == (0, 2)
     vertices = mesh.vertices.copy()
     vertices[vertices[:, 2] > 0, 0] *= 0.5  # tapers to the front: left and right alone are alike
-    model = CadModel(Mesh(vertices, mesh.faces))
+    model = ClickableModel(Mesh(vertices, mesh.faces))
     assert model.mirror_planes.axes == (0,)
     image = model.mirrored([-0.5, 0.2, 1])
     assert image is not None
     np.testing.assert_allclose(image.xyz, [0.5, 0.2, 1], atol=1e-9)
     assert model.mirrored([0, 1, 0.3]) is None  # on the plane
     vertices[-1] += 0.6
-    lopsided = CadModel(Mesh(vertices, mesh.faces))
+    lopsided = ClickableModel(Mesh(vertices, mesh.faces))
     assert lopsided.mirror_planes.axes == ()
     flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     assert MirrorPlanes.of_mesh(flat, np.zeros(3), 1.0).axes == ()

@@ -19,7 +19,7 @@ from cadalign.annotate.actions import perform
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.photos import PhotoFile, find_photos
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
@@ -414,7 +414,7 @@ def test_exif_focal_length_of_zero_is_ignored(case: Case) -> None:
 def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> None:
     path = case.folder / "turned.jpg"
     exif_photo(path, orientation=orientation)
-    photo = Photo.open(path)
+    photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
     kind, data = photo.encoded()
     assert kind == "image/jpeg"
@@ -435,7 +435,7 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
 def test_orientation_that_does_not_exist_is_ignored(case: Case) -> None:
     path = case.folder / "odd.jpg"
     exif_photo(path, orientation=99)
-    photo = Photo.open(path)
+    photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
     assert photo.encoded() == ("image/jpeg", path.read_bytes())
 

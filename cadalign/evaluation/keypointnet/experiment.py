@@ -60,7 +60,7 @@ from cadalign.evaluation.instances.instance import (
     make_instance,
 )
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
-from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
@@ -123,7 +123,7 @@ class KeypointNetExperiment:
             view=0,
             hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
             semantic_ids=np.arange(12),
-            symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+            symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
             model=None,
         )
         self.evaluate([task])

@@ -15,7 +15,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import RAYS
-from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry, symmetry_group
 from cadalign.evaluation.runs.tables import Row
 
 AUTO = "auto"
@@ -41,7 +41,7 @@ class KeypointTask:
     view: int
     hull: KeypointHull
     semantic_ids: IntArray
-    symmetry: SymmetryGroup
+    symmetry: InstanceSymmetry
     model: AnnotatedModel | None
     problem: str = ""
 
@@ -64,7 +64,7 @@ class KeypointTask:
                 view=0,
                 hull=KeypointHull(np.empty((0, 3))),
                 semantic_ids=np.empty(0, dtype=np.int64),
-                symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+                symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
                 model=None,
                 problem=str(error),
             )

@@ -79,7 +79,7 @@ class Scene:
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     def derived(self, make: Callable[[Scene], T]) -> T:
-        """What a renderer makes of the scene by a function of its own, made once."""
+        """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""
         if make not in self._derived:
             self._derived[make] = make(self)
         made: T = self._derived[make]

@@ -8,7 +8,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
 
-from cadalign.estimation.options import METHODS
+from cadalign.estimation.options import METHODS, RansacOptions
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -44,7 +45,6 @@ def _points() -> tuple[np.ndarray, np.ndarray]:
 
 def _fits() -> None:
     from cadalign.estimation.fit import fit
-    from cadalign.estimation.options import RansacOptions
 
     points, pixels = _points()
     for method in METHODS:
@@ -63,7 +63,6 @@ def _shapes_in_several_views() -> None:
 
 def _align_shape(*, views: int) -> None:
     from cadalign.estimation.align import align
-    from cadalign.estimation.view import View
 
     points, pixels = _points()
     directions = np.random.default_rng(0).normal(size=(2, 12, 3))

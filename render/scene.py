@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,9 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.raycast.normals import corner_normals
-from cadalign.render.raycast.surface import Surface
+from cadalign.render.raycast.surface import SurfaceColors
+
+T = TypeVar("T")
 
 
 class Scene:
@@ -43,6 +46,7 @@ class Scene:
     def __init__(self, mesh: Mesh, *, crease_angle: float = 40.0) -> None:
         self.mesh = mesh
         self.crease_angle = float(crease_angle)
+        self._derived: dict[Callable[[Scene], Any], Any] = {}
 
     def __reduce__(self) -> tuple[object, ...]:
         # The ray hierarchy cannot be pickled; worker processes build their own.
@@ -74,12 +78,12 @@ class Scene:
 
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
-    @cached_property
-    def gl_meshes(self) -> tuple[Any, Any]:
-        """The front and back sides for OpenGL, both a `pyrender.Mesh`."""
-        from cadalign.render.opengl.mesh import gl_meshes
-
-        return gl_meshes(self)
+    def derived(self, make: Callable[[Scene], T]) -> T:
+        """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""
+        if make not in self._derived:
+            self._derived[make] = make(self)
+        made: T = self._derived[make]
+        return made
 
     @cached_property
     def used_vertices(self) -> FloatArray:
@@ -138,6 +142,6 @@ class Scene:
         return np.asarray(np.stack([first, second], axis=1) * inverse[:, None, None])
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> SurfaceColors:
         """The colours of the mesh."""
-        return Surface(self.mesh)
+        return SurfaceColors(self.mesh)

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from common import Picture, write_row
 
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.estimation.fit import fit
@@ -42,7 +42,7 @@ LINE = (35, 208, 255)
 
 
 @dataclass(kw_only=True)
-class Arguments(Picture):
+class AlignOtherChairArguments(Picture):
     """Align one sample chair to a photo of another."""
 
     photo_of: str = "006"
@@ -55,7 +55,7 @@ class Arguments(Picture):
     """Width of the picture in pixels."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: AlignOtherChairArguments) -> None:
     """Render, align, print and draw."""
     with tempfile.TemporaryDirectory() as folder:
         root = arguments.files or Path(folder)
@@ -72,7 +72,7 @@ def main(arguments: Arguments) -> None:
         scene = Scene(model.load_mesh())
         image = read_image(photo, CAMERA)
         aligned = draw_overlay(
-            with_wireframe(image, CadModel(scene.mesh), result.alignment),
+            with_wireframe(image, ClickableModel(scene.mesh), result.alignment),
             CAMERA,
             est_box=Box.from_model(scene.bounds, result.alignment),
             observed=observation.points_2d,
@@ -110,7 +110,7 @@ def still(scene: Scene) -> ByteImage:
     return composite(color, PHOTO_GROUND)
 
 
-def with_wireframe(image: ByteImage, model: CadModel, alignment: Alignment) -> ByteImage:
+def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:
     """The photo with the lines of the stretched model."""
     drawn = image.copy()
     for start, end in Wireframe.of_model(model).seen_in(CAMERA, alignment):
@@ -120,4 +120,4 @@ def with_wireframe(image: ByteImage, model: CadModel, alignment: Alignment) -> B
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(AlignOtherChairArguments))

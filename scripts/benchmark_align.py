@@ -28,7 +28,7 @@ SECOND_VIEW = rotation_from_vector(np.array([0.0, np.radians(25.0), 0.0]))
 
 
 @dataclass
-class Arguments(Benchmark):
+class AlignArguments(Benchmark):
     """Measure the time of `align` with learned shapes."""
 
     root: tyro.conf.Positional[Path] = Path("KEYPOINTNET")
@@ -47,7 +47,7 @@ class Arguments(Benchmark):
     """Threads of the batch."""
 
 
-def pairs_of_views(arguments: Arguments, category: str, shape: ShapeModel) -> list[list[View]]:
+def pairs_of_views(arguments: AlignArguments, category: str, shape: ShapeModel) -> list[list[View]]:
     """Two views of every object."""
     options = UnseenOptions(
         root=arguments.root,
@@ -82,7 +82,7 @@ def milliseconds(shape: ShapeModel, objects: Sequence[Sequence[View]]) -> list[f
     return times
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: AlignArguments) -> None:
     """Measure all categories."""
     results = {}
     columns = "category", "components", "one view ms", "90th pct.", "two views ms", "batch 1/s"
@@ -107,4 +107,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(AlignArguments))

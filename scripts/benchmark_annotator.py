@@ -46,6 +46,7 @@ from support.panels import (
 from support.web import axe_script
 
 from cadalign import Camera, Mesh
+from cadalign.annotate.actions import perform
 from cadalign.annotate.masks import encode_runs
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -92,7 +93,7 @@ THUMBNAILS = """[...document.querySelectorAll(".thumbs img")].filter((image) => 
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class AnnotatorArguments(SeededBenchmark):
     """Arguments of the benchmark."""
 
     parts: tuple[str, ...] = PARTS
@@ -109,9 +110,9 @@ class Arguments(SeededBenchmark):
     """Annotators to kill."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: AnnotatorArguments) -> None:
     """Measure, print and write."""
-    measures: dict[str, Callable[[Arguments, Browser, Path], dict[str, Any]]] = {
+    measures: dict[str, Callable[[AnnotatorArguments, Browser, Path], dict[str, Any]]] = {
         "times": measure_times,
         "list": measure_list,
         "panels": measure_panels,
@@ -134,7 +135,7 @@ def main(arguments: Arguments) -> None:
 # --- times -----------------------------------------------------------------------------------
 
 
-def measure_times(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_times(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Clicks that complete the twentieth pair, without and with a mask [ms]."""
     case = case_of(arguments, folder)
     found: dict[str, Any] = {}
@@ -145,9 +146,9 @@ def measure_times(arguments: Arguments, browser: Browser, folder: Path) -> dict[
         if kind == "mask":
             pose = own.instance.cam_from_model
             mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
-            session.act(0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+            perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
         last = session.photos[0].document.pairs[-1]
-        session.act(0, {"do": "delete", "pair": last.number})
+        perform(session, 0, {"do": "delete", "pair": last.number})
         with served(session) as access:
             page = open_page(
                 browser, access.url, width=1366, height=768, scheme="light", scripts=(WATCH_PAINT,)
@@ -190,7 +191,7 @@ def _timed_clicks(
     return times
 
 
-def case_of(arguments: Arguments, folder: Path) -> Case:
+def case_of(arguments: AnnotatorArguments, folder: Path) -> Case:
     """A photo of a chair: ShapeNet's if it is here, else the sample's."""
     root = arguments.keypointnet
     if root is None:
@@ -207,7 +208,7 @@ def _new(folder: Path) -> Path:
 # --- list ------------------------------------------------------------------------------------
 
 
-def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_list(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """The list of a folder of photos, and going from one to the next."""
     case = case_of(arguments, folder)
     with Image.open(case.photo) as image:
@@ -267,7 +268,7 @@ def measure_list(arguments: Arguments, browser: Browser, folder: Path) -> dict[s
 # --- panels ----------------------------------------------------------------------------------
 
 
-def measure_panels(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_panels(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Layout shifts and what axe-core finds, over a session through every panel."""
     root = write_sample_dataset(folder / "sample", per_category=3)
     original = make_case(root, _new(folder / "case"))
@@ -312,7 +313,7 @@ def _serious(page: Page) -> set[str]:
 # --- kills -----------------------------------------------------------------------------------
 
 
-def measure_kills(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def measure_kills(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Annotators killed at random moments."""
     case = case_of(arguments, folder)
     rounds = []
@@ -333,7 +334,7 @@ def measure_kills(arguments: Arguments, browser: Browser, folder: Path) -> dict[
 # --- pictures --------------------------------------------------------------------------------
 
 
-def take_pictures(arguments: Arguments, browser: Browser, folder: Path) -> dict[str, Any]:
+def take_pictures(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """Contact sheets of ten models on every screen, light and dark."""
     sessions = {
         name: pictured_session(mesh, _new(folder / name))
@@ -411,7 +412,7 @@ def pictured_session(mesh: Mesh, folder: Path) -> Session:
     session = open_session(
         SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
     )
-    session.act(0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
+    perform(session, 0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
     model = session.model
     seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
     shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]
@@ -448,4 +449,4 @@ def write_sheet(path: Path, shots: list[tuple[str, Path]], *, columns: int = 2) 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(AnnotatorArguments))

@@ -30,7 +30,7 @@ Draw = Callable[[np.random.Generator], Problem]
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class CalibrationArguments(SeededBenchmark):
     """Measure the calibration of uncertainties and warnings."""
 
     problems: int = 1000
@@ -39,14 +39,14 @@ class Arguments(SeededBenchmark):
     """Standard deviation of the noise [px], which sigma states."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: CalibrationArguments) -> None:
     """Measure and write the figures."""
     console = Console()
     results = {"coverage": _coverage(arguments, console), "warnings": _warnings(arguments, console)}
     write_results(arguments.out, results)
 
 
-def _coverage(arguments: Arguments, console: Console) -> list[dict[str, Any]]:
+def _coverage(arguments: CalibrationArguments, console: Console) -> list[dict[str, Any]]:
     columns = ("sigma", "loss", "keypoints", "inverse Fisher", "stated", "no alternative")
     table = new_table("Errors within the 95 % ellipsoid [%]", *columns)
     rows = []
@@ -70,7 +70,7 @@ def _coverage(arguments: Arguments, console: Console) -> list[dict[str, Any]]:
     return rows
 
 
-def _warnings(arguments: Arguments, console: Console) -> list[dict[str, Any]]:
+def _warnings(arguments: CalibrationArguments, console: Console) -> list[dict[str, Any]]:
     columns = ("data", "fits", "large errors", "silent", "silent %", "misfits %")
     table = new_table("Large errors without a warning, and misfits found", *columns)
     rows = []
@@ -131,7 +131,9 @@ def _shuffle(rng: np.random.Generator, points_2d: np.ndarray) -> None:
     rng.shuffle(points_2d)
 
 
-def _fits(arguments: Arguments, draw: Draw, **options: Any) -> list[tuple[Problem, Result]]:
+def _fits(
+    arguments: CalibrationArguments, draw: Draw, **options: Any
+) -> list[tuple[Problem, Result]]:
     """Problems with their fits; those that are refused are left out."""
     fits = []
     for number in range(arguments.problems):
@@ -162,4 +164,4 @@ def _holds(result: Result, gt: Alignment, covariance: np.ndarray | None) -> bool
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(CalibrationArguments))

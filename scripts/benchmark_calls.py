@@ -31,7 +31,7 @@ LIBRARIES = [sys.executable, "-c", "import numpy, numba"]
 
 
 @dataclass
-class Arguments(Benchmark):
+class CallsArguments(Benchmark):
     """Measure what calls cost beside their solving."""
 
     json: Path | None = None
@@ -52,7 +52,7 @@ class Figure:
     to: str
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: CallsArguments) -> None:
     """Run all measurements."""
     with tempfile.TemporaryDirectory() as folder:
         figures = _commands(Path(folder), arguments.runs)
@@ -150,4 +150,4 @@ def _in_turns(
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(CallsArguments))

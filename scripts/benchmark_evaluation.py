@@ -29,7 +29,7 @@ CHUNK = 100
 
 
 @dataclass
-class Arguments:
+class EvaluationArguments:
     """Measure evaluation."""
 
     root: tyro.conf.Positional[Path]
@@ -120,7 +120,7 @@ def whole_runs(root: Path, samples: Path) -> dict[str, Any]:
     return figures
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: EvaluationArguments) -> None:
     """Measure all, print and write the figures."""
     figures = {}
     for method in ("aepnp", "optimal"):
@@ -135,4 +135,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(EvaluationArguments))

@@ -32,7 +32,7 @@ ROBUST_POINTS = 100
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class FocalArguments(SeededBenchmark):
     """Measure fits with an unknown focal length."""
 
     problems: int = 1000
@@ -41,7 +41,7 @@ class Arguments(SeededBenchmark):
     """Random problems per share of outliers."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: FocalArguments) -> None:
     """Run all measurements."""
     console = Console(width=130)
     title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
@@ -61,7 +61,7 @@ def main(arguments: Arguments) -> None:
     write_results(arguments.out, {"accuracy": accuracy, "robust": robust})
 
 
-def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
+def _accuracy(arguments: FocalArguments, points: int) -> dict[str, object]:
     """Median errors over those of an ideal estimator."""
     rng = np.random.default_rng(arguments.seed)
     problems = [
@@ -94,7 +94,7 @@ def _accuracy(arguments: Arguments, points: int) -> dict[str, object]:
     }
 
 
-def _robust(arguments: Arguments, share: float) -> dict[str, float]:
+def _robust(arguments: FocalArguments, share: float) -> dict[str, float]:
     """Rate at which outliers are told from inliers."""
     rng = np.random.default_rng(arguments.seed)
     found = 0
@@ -118,4 +118,4 @@ def _robust(arguments: Arguments, share: float) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(FocalArguments))

@@ -39,7 +39,7 @@ BOUND_DRAWS = 20
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class MasksArguments(SeededBenchmark):
     """Arguments of the benchmark."""
 
     keypointnet: Path | None = None
@@ -76,7 +76,7 @@ class Case:
         return View(self.camera, self.points_2d, ids=self.ids, sigma=NOISE_PX, mask=mask)
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: MasksArguments) -> None:
     """Measure, print and write."""
     with tempfile.TemporaryDirectory() as folder:
         sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
@@ -183,7 +183,7 @@ def errors(est: Alignment, case: Case) -> list[float]:
     return [rotation_error(est=est, gt=gt), stretch, iou]
 
 
-def measure(cases: list[Case], kind: str, arguments: Arguments) -> dict[str, float]:
+def measure(cases: list[Case], kind: str, arguments: MasksArguments) -> dict[str, float]:
     """Medians over all views for one kind of mask."""
     alone, joint, bounds, seconds, sigmas, left_out, bottles = [], [], [], [], [], 0, []
     for number, each in enumerate(cases):
@@ -253,7 +253,7 @@ def ideal(bound: np.ndarray, case: Case, rng: np.random.Generator) -> np.ndarray
     return np.array(found).T
 
 
-def neighbours(cases: list[Case], arguments: Arguments) -> dict[str, float]:
+def neighbours(cases: list[Case], arguments: MasksArguments) -> dict[str, float]:
     """Rate at which the mask of a neighbouring object is named, and its effect on the estimate."""
     named, ratios = [], []
     for number in range(arguments.neighbours):
@@ -289,4 +289,4 @@ def beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.n
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(MasksArguments))

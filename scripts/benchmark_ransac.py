@@ -29,7 +29,7 @@ OPENCV_DRAWS = 2  # it takes the better part of a second
 
 
 @dataclass(kw_only=True)
-class Arguments(Benchmark):
+class RansacArguments(Benchmark):
     """Measure the robust search on real correspondences."""
 
     colmap: Path
@@ -44,7 +44,7 @@ class Arguments(Benchmark):
     """Shares of outliers among the image points."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: RansacArguments) -> None:
     """Run all measurements."""
     console = Console(width=110)
     title = "Robust search: success (R < 0.5 deg, scales within 1 %), median times"
@@ -150,4 +150,4 @@ def _opencv(image: Correspondences, points_2d: np.ndarray) -> object:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(RansacArguments))

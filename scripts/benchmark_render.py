@@ -43,14 +43,14 @@ LIMITS = {
 
 
 @dataclass
-class Arguments(Benchmark):
+class RenderArguments(Benchmark):
     """Measure the renderers' speed at 640 x 480 px on 20,480 triangles."""
 
     repetitions: int = 15
     """Timed frames per figure; the median counts."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: RenderArguments) -> None:
     """Run all measurements."""
     camera = Camera.from_fov(640, 480, fov_x=50.0)
     scene = Scene(ball(5))
@@ -109,4 +109,4 @@ def timed(name: str, task: Callable[[], object], repetitions: int) -> dict[str, 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(RenderArguments))

@@ -33,7 +33,7 @@ CALLS = 3
 
 
 @dataclass
-class Arguments:
+class RetrievalArguments:
     """Measure retrieval: time of a query and memory."""
 
     root: tyro.conf.Positional[Path]
@@ -106,7 +106,7 @@ def measure(
     }
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: RetrievalArguments) -> None:
     """Measure all libraries."""
     real = list(Library.from_dataset(KeypointNet(arguments.root)))
     rng = np.random.default_rng(0)
@@ -138,4 +138,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(RetrievalArguments))

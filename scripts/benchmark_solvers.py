@@ -25,9 +25,9 @@ from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.outcome import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
+from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
-from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.refine import refine
 
 ACCURACY_ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))
@@ -41,7 +41,7 @@ Source = tuple[str, float, Callable[[np.random.Generator], Problem]]
 
 
 @dataclass
-class Arguments(SeededBenchmark):
+class SolversArguments(SeededBenchmark):
     """Measure the solvers' accuracy and speed."""
 
     problems: int = 2000
@@ -52,7 +52,7 @@ class Arguments(SeededBenchmark):
     """Folder with KeypointNet's annotations, for rows on real keypoints."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: SolversArguments) -> None:
     """Run all measurements."""
     console = Console(width=130)
     results = {
@@ -63,7 +63,7 @@ def main(arguments: Arguments) -> None:
     write_results(arguments.out, results)
 
 
-def _accuracy(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
+def _accuracy(arguments: SolversArguments, console: Console) -> Iterator[dict[str, object]]:
     """Rows of errors over those of the limit."""
     title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
     columns = ("problems", "limit R deg", "method", "R", "t", "s_y", "s_z", "failed", "missed")
@@ -160,7 +160,7 @@ def _is_missed(problem: Problem, noise: float, est: cadalign.Alignment) -> bool:
     return bool(cost < evaluate_cost(objective, est.packed) * (1 - 1e-6) - 1e-9)
 
 
-def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
+def _minimal(arguments: SolversArguments, console: Console) -> dict[str, float]:
     """Rate of the truth among the minimal solver's solutions, and their number."""
     rng = np.random.default_rng(arguments.seed)
     found = solutions = 0
@@ -182,7 +182,7 @@ def _minimal(arguments: Arguments, console: Console) -> dict[str, float]:
     return result
 
 
-def _speed(arguments: Arguments, console: Console) -> Iterator[dict[str, object]]:
+def _speed(arguments: SolversArguments, console: Console) -> Iterator[dict[str, object]]:
     """Medians of running times as ratios to OpenCV's."""
     title = "Time over OpenCV's (which does not stretch): ratios of medians"
     table = new_table(title, "points", "what", "microseconds", "over", "ratio")
@@ -251,4 +251,4 @@ def _interleaved_medians(
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(SolversArguments))

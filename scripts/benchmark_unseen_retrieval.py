@@ -24,7 +24,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.unseen.options import UnseenOptions
-from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask, UnseenTasks, observe_object
+from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTask, UnseenTasks, observe_object
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.models import ModelKey
@@ -34,7 +34,7 @@ LEAST_SHARED = 4
 
 
 @dataclass
-class Arguments(Benchmark):
+class UnseenRetrievalArguments(Benchmark):
     """Measure retrieval of objects that are not in the library."""
 
     root: tyro.conf.Positional[Path] = Path("KEYPOINTNET")
@@ -59,7 +59,9 @@ def rankings(shape: ShapeModel) -> dict[str, dict[str, Any]]:
     return found
 
 
-def sightings(arguments: Arguments, category: str, count: int) -> Iterator[tuple[str, Sighting]]:
+def sightings(
+    arguments: UnseenRetrievalArguments, category: str, count: int
+) -> Iterator[tuple[str, UnseenSighting]]:
     """Ids and views of a category's objects."""
     options = UnseenOptions(
         root=arguments.root,
@@ -91,7 +93,9 @@ def alike(library: Library, key: ModelKey) -> list[ModelKey]:
     ]
 
 
-def measure(arguments: Arguments, category: str, count: int, shape: ShapeModel) -> dict[str, Any]:
+def measure(
+    arguments: UnseenRetrievalArguments, category: str, count: int, shape: ShapeModel
+) -> dict[str, Any]:
     """IoU and milliseconds of every query, by ranking."""
     dataset = KeypointNet(arguments.root).subset(categories=[category])
     models = [LibraryModel.of_annotated(model, with_mesh=False) for model in dataset[category]]
@@ -128,7 +132,7 @@ def measure(arguments: Arguments, category: str, count: int, shape: ShapeModel) 
     return found
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: UnseenRetrievalArguments) -> None:
     """Measure all categories and numbers of keypoints."""
     console, results = Console(), {}
     for category in arguments.categories:
@@ -148,4 +152,4 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(UnseenRetrievalArguments))

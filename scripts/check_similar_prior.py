@@ -30,7 +30,7 @@ LEAST_KEYPOINTS = 6
 
 
 @dataclass
-class Arguments:
+class SimilarPriorArguments:
     """Measure which prior on the stretch helps with a model that is only similar."""
 
     root: tyro.conf.Positional[Path]
@@ -44,7 +44,7 @@ class Arguments:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class SimilarProblem:
     """Keypoints (n, 3) of a model, those of the object, their image (n, 2), and the true pose."""
 
     model: FloatArray
@@ -53,7 +53,9 @@ class Problem:
     truth: Alignment
 
 
-def problem_of(seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise: float) -> Problem:
+def problem_of(
+    seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise: float
+) -> SimilarProblem:
     """A random view of an object, and a random other model."""
     rng = instance_rng(0, seen.category, seen.model_id, "similar")
     other = others[int(rng.integers(len(others)))]
@@ -64,10 +66,10 @@ def problem_of(seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise: fl
         azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=rng.uniform(1.5, 3)
     )
     pixels = KEYPOINT_CAMERA.project(pose.apply(points))
-    return Problem(model, points, pixels + noise * rng.standard_normal(pixels.shape), pose)
+    return SimilarProblem(model, points, pixels + noise * rng.standard_normal(pixels.shape), pose)
 
 
-def errors(problem: Problem, sigma: float) -> tuple[float, float]:
+def errors(problem: SimilarProblem, sigma: float) -> tuple[float, float]:
     """Rotation error [degrees] and IoU of the keypoints' boxes at equal depths of their centres."""
     try:
         est = fit(
@@ -90,7 +92,7 @@ def errors(problem: Problem, sigma: float) -> tuple[float, float]:
     return rotation_error(est=est, gt=problem.truth), iou
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: SimilarPriorArguments) -> None:
     """Print the median errors of every category and prior."""
     names = ["none" if np.isinf(sigma) else f"{sigma:g}" for sigma in arguments.sigmas]
     table = new_table("Median rotation error in degrees / box IoU, by prior", "category", *names)
@@ -117,4 +119,4 @@ def _keypoints(model: AnnotatedModel) -> tuple[FloatArray, FloatArray]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(SimilarPriorArguments))

@@ -28,14 +28,14 @@ READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.me
 
 
 @dataclass(kw_only=True)
-class Arguments(Picture):
+class AnnotatorPictureArguments(Picture):
     """Make the README's picture of the annotator."""
 
     files: Path
     """Where `align_other_chair.py` has written its files."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: AnnotatorPictureArguments) -> None:
     """Serve, open the page, and take its picture."""
     observation = arguments.files / "photo.json"
     model = Observation.load(observation).model
@@ -65,4 +65,4 @@ def wait(page: Page) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(AnnotatorPictureArguments))

@@ -20,14 +20,14 @@ MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003")
 
 
 @dataclass(kw_only=True)
-class Arguments(Picture):
+class OverviewArguments(Picture):
     """Make the README's picture."""
 
     width: int = 1600
     """Width in pixels."""
 
 
-def main(arguments: Arguments) -> None:
+def main(arguments: OverviewArguments) -> None:
     """Render, align and draw the models."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
@@ -54,4 +54,4 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    main(tyro.cli(OverviewArguments))

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.annotate.document import Pixel
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import ForeignDocument
 
-if TYPE_CHECKING:
-    from cadalign.annotate.objects.state import PhotoState
-    from cadalign.annotate.session import Session
-
 
 @dataclass(frozen=True)
-class Outcome:
+class ActionOutcome:
     """Outcome of an action beside the changed document, for the user."""
 
     selected: int | None = None  # number of the pair that was placed or changed
@@ -28,7 +25,7 @@ class Outcome:
 class Action(ForeignDocument):
     """Base of the actions; ``pair`` fields are numbers of pairs."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         """Record the changed document, or raise a CadalignError."""
         raise NotImplementedError
 

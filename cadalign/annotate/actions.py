@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
-from cadalign.annotate.action import Action, Outcome, inside
+from cadalign.annotate.action import Action, ActionOutcome, inside
 from cadalign.annotate.choosing.switching import ChooseModel
-from cadalign.annotate.document import Document, FocalChoice, Pair, Pixel, Priors
+from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
 from cadalign.annotate.image_corners import nearest_corner
 from cadalign.annotate.objects.actions import OBJECT_ACTIONS, bring_back
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.annotate.worklist import Mark
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import (
-    Finite,
     Index,
     NotNegative,
     Point2,
     Point3,
     Text,
+    convert,
 )
 
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
-
-_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
-_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
 _LONGEST_REACH = 200.0  # of a corner of the photo [px]
 _SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
 _MISSED = "That click missed the model."
@@ -46,11 +44,11 @@ class PlaceUv(_Placing):
     uv: Point2
     snap: NotNegative = 0.0  # farthest corner of the photo that it goes to [px]
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         uv = _snapped(self.uv, self.snap, session, state)
         document, pair = state.document.place_uv(uv, self.pair)
         state.history.record(document)
-        return Outcome(pair, _no_corner(self.snap, moved=uv != self.uv))
+        return ActionOutcome(pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class PlaceKeypoint(_Placing):
@@ -58,7 +56,7 @@ class PlaceKeypoint(_Placing):
 
     keypoint: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.model.registry[self.keypoint]  # refuses an unknown one
         return _place(self.keypoint, self.pair, state)
 
@@ -89,10 +87,10 @@ class Pick(_Aiming):
 
     pair: Index | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = self.target(state)
         if keypoint is None:
-            return Outcome(message=_MISSED)
+            return ActionOutcome(message=_MISSED)
         return _place(keypoint, self.pair, state)
 
 
@@ -101,12 +99,12 @@ class Repick(_Aiming):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = self.target(state)
         if keypoint is None:
-            return Outcome(self.pair, _MISSED)
+            return ActionOutcome(self.pair, _MISSED)
         state.history.record(state.document.exchange_keypoint(self.pair, keypoint))
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class PlaceMirrored(Action):
@@ -114,7 +112,7 @@ class PlaceMirrored(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         registry, model = state.model.registry, state.model.cad
         point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
@@ -129,7 +127,7 @@ class PlaceMirrored(Action):
 class PlaceSuggested(_Placing):
     """Place the suggested keypoint."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         _, suggestion = session.live(state)
         if suggestion is None:
             raise InputError(
@@ -149,12 +147,12 @@ class Move(Action):
     gesture: Index | None = None
     snap: NotNegative = 0.0  # as of `PlaceUv`
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         uv = _snapped(self.uv, self.snap, session, state)
         moved = state.document.move(self.pair, uv)
         step = None if self.gesture is None else (self.pair, self.gesture)
         state.history.record(moved, step=step)
-        return Outcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
+        return ActionOutcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
 class Release(Action):
@@ -162,9 +160,9 @@ class Release(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.history.record(state.document.release_keypoint(self.pair))
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class Delete(Action):
@@ -172,9 +170,9 @@ class Delete(Action):
 
     pair: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         state.history.record(state.document.delete(self.pair))
-        return Outcome()
+        return ActionOutcome()
 
 
 class Rename(Action):
@@ -183,14 +181,14 @@ class Rename(Action):
     pair: Index
     name: Text
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         if keypoint is None:
             raise InputError(
                 "this pair has no model point yet", where="pair", fix="click on the model first"
             )
         state.model.registry.rename(keypoint, self.name)
-        return Outcome(self.pair)
+        return ActionOutcome(self.pair)
 
 
 class Identify(Action):
@@ -199,7 +197,7 @@ class Identify(Action):
     pair: Index
     label: Index | Text
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         keypoint = state.document.pair(self.pair).keypoint
         shape = session.shape
         if keypoint is None or shape is None or self.label not in shape.ids:
@@ -209,52 +207,12 @@ class Identify(Action):
         registry = state.model.registry
         if shape.is_named:
             registry.rename(keypoint, str(self.label))
-            return Outcome(self.pair)
+            return ActionOutcome(self.pair)
         point = registry[keypoint]
         own = point.name if point.name != f"point {keypoint}" else f"keypoint {self.label}"
         known = registry.add_as(int(self.label), replace(point, name=own))
         state.history.record(state.document.exchange_keypoint(self.pair, known))
-        return Outcome(self.pair)
-
-
-class Focal(Action):
-    """Choose a known or an estimated focal length."""
-
-    known: bool
-    pixels: Finite | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        if self.pixels is not None:
-            low, high = (bound * state.photo.width for bound in _FOCAL_RANGE)
-            if not low <= self.pixels <= high:
-                raise InputError(
-                    f"{self.pixels:g} px is no focal length of this photo",
-                    where="pixels",
-                    fix=f"give {low:.0f} to {high:.0f} px",
-                )
-        focal = FocalChoice(self.known, self.pixels)
-        state.history.record(replace(state.document, focal=focal))
-        return Outcome()
-
-
-class Prior(Action):
-    """Choose the prior on the stretch, and whether an estimated focal length has one."""
-
-    stretch: Finite | None = None
-    focal: bool = True
-
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
-        low, high = _STRETCH_RANGE
-        if self.stretch is not None and not low <= self.stretch <= high:
-            raise InputError(
-                f"{100 * self.stretch:g} % is no weak prior on the stretch",
-                where="stretch",
-                fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
-            )
-        kept = state.document.priors.focal or state.intrinsics.likely_focal
-        priors = Priors(self.stretch, kept if self.focal else None)
-        state.history.record(replace(state.document, priors=priors))
-        return Outcome()
+        return ActionOutcome(self.pair)
 
 
 class Accept(Action):
@@ -262,7 +220,7 @@ class Accept(Action):
 
     keypoints: list[Index] | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         document, number = state.document, None
         for proposal in state.proposals:
             keypoint = proposal.keypoint
@@ -272,9 +230,9 @@ class Accept(Action):
                 number = document.next_number
                 document = document.append(Pair(number, proposal.uv, keypoint))
         if number is None:
-            return Outcome(message="Nothing is proposed that is not placed.")
+            return ActionOutcome(message="Nothing is proposed that is not placed.")
         state.history.record(document)
-        return Outcome(number)
+        return ActionOutcome(number)
 
 
 class MarkPhoto(Action):
@@ -282,16 +240,16 @@ class MarkPhoto(Action):
 
     mark: Mark | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         session.before_saving()
         session.worklist = session.worklist.marked(state.photo.path.name, self.mark)
-        return Outcome()
+        return ActionOutcome()
 
 
 class Undo(Action):
     """Undo the last change."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
         if deleted is not None:
             return bring_back(deleted)
@@ -303,7 +261,7 @@ class Undo(Action):
 class Redo(Action):
     """Redo the last undone change."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         before = state.marked
         is_done = state.history.redo()
         if state.owner.document.is_gone:
@@ -323,8 +281,6 @@ ACTIONS: dict[str, type[Action]] = {
     "delete": Delete,
     "rename": Rename,
     "identify": Identify,
-    "focal": Focal,
-    "prior": Prior,
     **EVIDENCE_ACTIONS,
     **OBJECT_ACTIONS,
     "accept": Accept,
@@ -342,24 +298,62 @@ RENAMING = ("rename", "identify")
 """Those that may change the names of keypoints instead of the document."""
 
 
-def _gone_through(state: PhotoState, before: Document, nothing: str) -> Outcome:
+def perform(
+    session: Session, number: int, action: Mapping[str, Any], *, slot: int | None = None
+) -> ActionOutcome:
+    """Do an action of the page, its name ``do`` and its arguments, and save its changes.
+
+    It is done on an object of the photo of a number; see `Session.photo_state`.
+    """
+    with session.lock:
+        state = session.photo_state(number, slot)
+        if slot == 0 and session.objects[number][0].is_shown:
+            state = session.objects[number][0]  # which is not listed while nothing is marked
+        elif slot not in (None, session.place_of(state)[1]):
+            raise InputError(
+                "this object was deleted, or the photo is no longer one of its photos",
+                where="object",
+                fix="reload the page",
+            )
+        name = action.get("do")
+        kind = ACTIONS.get(name) if isinstance(name, str) else None
+        if kind is None:
+            raise InputError(
+                f"{quote(name)} is not an action",
+                where="do",
+                fix=f"known are {', '.join(ACTIONS)}",
+            )
+        before = {id(each): each.object_document for each in session.states}
+        outcome: ActionOutcome = convert(action, kind).apply(session, state)
+        owners = [each for each in session.states if each.lead is None]
+        changed = [each for each in owners if before.get(id(each)) is not each.document]
+        for each in changed:
+            session.save(each)
+        if changed and name not in DELETING:
+            session.deletions.note_change(number)
+        if name in RENAMING:
+            session.save(state)
+        return outcome
+
+
+def _gone_through(state: PhotoState, before: AnnotationDocument, nothing: str) -> ActionOutcome:
     """The outcome of undoing or redoing, which may concern another photo of the object.
 
     ``nothing`` says that nothing was done, if so; ``before`` is what was marked in the photo.
     """
     if nothing:
-        return Outcome(message=nothing)
+        return ActionOutcome(message=nothing)
     if not state.is_shown:
-        return Outcome(message="This photo is no longer one of the object's.")
+        return ActionOutcome(message="This photo is no longer one of the object's.")
     if len(state.all_views) > 1 and state.marked == before:
-        return Outcome(message="That was a change in another photo of this object.")
-    return Outcome()
+        return ActionOutcome(message="That was a change in another photo of this object.")
+    return ActionOutcome()
 
 
-def _place(keypoint: int, pair: int | None, state: PhotoState) -> Outcome:
+def _place(keypoint: int, pair: int | None, state: PhotoState) -> ActionOutcome:
     document, number = state.document.place_keypoint(keypoint, pair)
     state.history.record(document)
-    return Outcome(number)
+    return ActionOutcome(number)
 
 
 def _snapped(uv: Pixel, reach: float, session: Session, state: PhotoState) -> Pixel:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
@@ -34,7 +34,7 @@ class Marked:
 
 
 def rank(
-    model: CadModel, marked: Marked, result: Result, suggestion: Suggestion | None
+    model: ClickableModel, marked: Marked, result: Result, suggestion: Suggestion | None
 ) -> tuple[Advice, ...]:
     """Rank the suggested keypoint, a mask, another photo and lengths; empty if nothing is known.
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from cadalign.annotate.evidence import Evidence
+from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 
@@ -74,11 +74,11 @@ class FurtherView:
     """The annotations of an object's further photo, of which ``photo`` is the file."""
 
     photo: str
-    document: Document
+    document: AnnotationDocument
 
 
 @dataclass(frozen=True)
-class Document:
+class AnnotationDocument:
     """All annotations of one object in one photo; ``next_number`` is the number of the next pair.
 
     Prior on the stretch, known lengths and name are the object's: those of its further photos'
@@ -89,7 +89,7 @@ class Document:
     focal: FocalChoice = FocalChoice(known=False)
     priors: Priors = Priors()
     next_number: int = 1
-    evidence: Evidence = field(default_factory=Evidence)
+    evidence: MarkedEvidence = field(default_factory=MarkedEvidence)
     name: str = ""  # of the object, if the user gave one
     is_deleted: bool = False
     further_views: tuple[FurtherView, ...] = ()
@@ -97,14 +97,14 @@ class Document:
     @property
     def is_empty(self) -> bool:
         """True if nothing is marked."""
-        return not (self.pairs or self.further_views) and self.evidence == Evidence()
+        return not (self.pairs or self.further_views) and self.evidence == MarkedEvidence()
 
     @property
     def is_gone(self) -> bool:
         """True if the object was deleted, and nothing was marked since."""
         return self.is_deleted and self.is_empty
 
-    def view(self, photo: str) -> Document | None:
+    def view(self, photo: str) -> AnnotationDocument | None:
         """The document of a further photo, with what is the object's; None if there is none."""
         for view in self.further_views:
             if view.photo == photo:
@@ -117,7 +117,7 @@ class Document:
                 )
         return None
 
-    def with_view(self, photo: str, document: Document) -> Document:
+    def with_view(self, photo: str, document: AnnotationDocument) -> AnnotationDocument:
         """The document with that of a further photo, which is added if it has none."""
         others = [view.photo for view in self.further_views]
         views = [
@@ -134,7 +134,7 @@ class Document:
             name=document.name,
         )
 
-    def without_view(self, photo: str) -> Document:
+    def without_view(self, photo: str) -> AnnotationDocument:
         """The document without that of a further photo."""
         left = tuple(view for view in self.further_views if view.photo != photo)
         return replace(self, further_views=left)
@@ -156,11 +156,11 @@ class Document:
                 return pair
         raise InputError(f"there is no pair {number}", where="pair", fix="reload the page")
 
-    def append(self, pair: Pair) -> Document:
+    def append(self, pair: Pair) -> AnnotationDocument:
         """Append a pair, whose number is `next_number`."""
         return replace(self, pairs=(*self.pairs, pair), next_number=self.next_number + 1)
 
-    def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[Document, int]:
+    def place_uv(self, uv: Pixel, preferred: int | None = None) -> tuple[AnnotationDocument, int]:
         """Place the photo half of a pair that lacks it, by preference of the pair of that number.
 
         If none lacks it, a new pair is begun. The second value is the pair's number.
@@ -168,29 +168,31 @@ class Document:
         pair = self._lacking("uv", preferred)
         return self._with(replace(pair, uv=uv)), pair.number
 
-    def place_keypoint(self, keypoint: int, preferred: int | None = None) -> tuple[Document, int]:
+    def place_keypoint(
+        self, keypoint: int, preferred: int | None = None
+    ) -> tuple[AnnotationDocument, int]:
         """Place the model half of a pair, as `place_uv`; it must not be placed already."""
         self._refuse_second(keypoint)
         pair = self._lacking("keypoint", preferred)
         return self._with(replace(pair, keypoint=keypoint)), pair.number
 
-    def move(self, number: int, uv: Pixel) -> Document:
+    def move(self, number: int, uv: Pixel) -> AnnotationDocument:
         """Move the photo half of a pair."""
         return self._with(replace(self.pair(number), uv=uv))
 
-    def release_keypoint(self, number: int) -> Document:
+    def release_keypoint(self, number: int) -> AnnotationDocument:
         """Remove the model half of a pair, so that another can be placed."""
         pair = self.pair(number)
         if pair.uv is None:
             return self.delete(number)
         return self._with(replace(pair, keypoint=None))
 
-    def exchange_keypoint(self, number: int, keypoint: int) -> Document:
+    def exchange_keypoint(self, number: int, keypoint: int) -> AnnotationDocument:
         """Replace the model half of a pair, of which it keeps the photo half."""
         self._refuse_second(keypoint, number)
         return self._with(replace(self.pair(number), keypoint=keypoint))
 
-    def delete(self, number: int) -> Document:
+    def delete(self, number: int) -> AnnotationDocument:
         """Delete a pair."""
         gone = self.pair(number)
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair is not gone))
@@ -210,7 +212,7 @@ class Document:
         wanted = [pair for pair in lacking if pair.number == preferred]
         return (wanted + lacking + [Pair(self.next_number)])[0]
 
-    def _with(self, changed: Pair) -> Document:
+    def _with(self, changed: Pair) -> AnnotationDocument:
         if changed.number == self.next_number:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
@@ -222,10 +224,10 @@ class History:
 
     def __init__(
         self,
-        document: Document,
+        document: AnnotationDocument,
         *,
-        before: Iterable[Document] = (),
-        after: Iterable[Document] = (),
+        before: Iterable[AnnotationDocument] = (),
+        after: Iterable[AnnotationDocument] = (),
     ) -> None:
         self.document = document
         self.revision = 0  # grows with every change, those by undo and redo included
@@ -234,17 +236,17 @@ class History:
         self._step: object = None
 
     @property
-    def object_document(self) -> Document:
+    def object_document(self) -> AnnotationDocument:
         """The document of the object, which the first photo's is."""
         return self.document
 
     @property
-    def before(self) -> tuple[Document, ...]:
+    def before(self) -> tuple[AnnotationDocument, ...]:
         """Documents that undoing leads to, the last one first reached."""
         return tuple(self._before)
 
     @property
-    def after(self) -> tuple[Document, ...]:
+    def after(self) -> tuple[AnnotationDocument, ...]:
         """Documents that redoing leads to, the last one first reached."""
         return tuple(self._after)
 
@@ -258,7 +260,7 @@ class History:
         """True if there is a change to redo."""
         return bool(self._after)
 
-    def record(self, document: Document, *, step: object = None) -> None:
+    def record(self, document: AnnotationDocument, *, step: object = None) -> None:
         """Go on to another document.
 
         Consecutive changes with the same ``step`` are undone together, such as the positions of a
@@ -280,7 +282,7 @@ class History:
         """Redo the last undone change; returns False if there is none."""
         return self._go(self._after, self._before)
 
-    def _go(self, source: list[Document], target: list[Document]) -> bool:
+    def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
         self._step = None
         if not source:
             return False

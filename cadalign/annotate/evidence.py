@@ -48,7 +48,7 @@ class MaskDrawing:
 
 
 @dataclass(frozen=True)
-class Lengths:
+class MarkedLengths:
     """Known lengths of the object along x, y, z, and relative deviations: of all, or of each."""
 
     width: float | None = None
@@ -57,7 +57,7 @@ class Lengths:
     sigmas: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, size: KnownSize | None) -> Lengths | None:
+    def of(cls, size: KnownSize | None) -> MarkedLengths | None:
         """Those of an observation."""
         if size is None:
             return None
@@ -76,7 +76,7 @@ class Lengths:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MarkedEvidence:
     """Evidence of a photo beside its pairs.
 
     ``up`` is the model's up axis in the camera with its deviation [degrees], from a file; vertical
@@ -87,7 +87,7 @@ class Evidence:
     verticals: tuple[Segment, ...] = ()
     up: tuple[float, float, float] | None = None
     up_sigma_deg: float | None = None
-    lengths: Lengths | None = None
+    lengths: MarkedLengths | None = None
 
     @classmethod
     def of(cls, further: FurtherEvidence) -> Self:
@@ -98,7 +98,7 @@ class Evidence:
             mask=None if image.mask is None else MaskDrawing(str(image.mask), image.mask_sigma),
             up=None if image.up is None else (x, y, z),
             up_sigma_deg=image.up_sigma_deg,
-            lengths=Lengths.of(further.size),
+            lengths=MarkedLengths.of(further.size),
         )
 
     def added_to(
@@ -162,7 +162,7 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
     return up, float(deviation)
 
 
-def check_lengths(lengths: Lengths) -> Lengths | None:
+def check_lengths(lengths: MarkedLengths) -> MarkedLengths | None:
     """The lengths, None if there are none; raises InputError if one is not positive."""
     given = {name: getattr(lengths, name) for name in LENGTHS}
     if all(value is None for value in given.values()):

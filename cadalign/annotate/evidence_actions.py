@@ -1,29 +1,70 @@
-"""Actions of the page on evidence beside the pairs: mask, vertical edges, known lengths."""
+"""Actions of the page on what is known beside the pairs: mask, edges, lengths, focal length."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.annotate.action import Action, Outcome, inside
+from cadalign.annotate.action import Action, ActionOutcome, inside
+from cadalign.annotate.document import FocalChoice, Priors
 from cadalign.annotate.evidence import (
-    Evidence,
-    Lengths,
+    MarkedEvidence,
+    MarkedLengths,
     MaskDrawing,
     Stroke,
     check_lengths,
     find_up,
 )
 from cadalign.annotate.masks import cut_out, decode_runs, encode_runs
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Finite, Point2, Positive
 
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
-
+_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
+_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
 _LEAST_VERTICAL = 5.0  # [px]
+
+
+class Focal(Action):
+    """Choose a known or an estimated focal length."""
+
+    known: bool
+    pixels: Finite | None = None
+
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
+        if self.pixels is not None:
+            low, high = (bound * state.photo.width for bound in _FOCAL_RANGE)
+            if not low <= self.pixels <= high:
+                raise InputError(
+                    f"{self.pixels:g} px is no focal length of this photo",
+                    where="pixels",
+                    fix=f"give {low:.0f} to {high:.0f} px",
+                )
+        focal = FocalChoice(self.known, self.pixels)
+        state.history.record(replace(state.document, focal=focal))
+        return ActionOutcome()
+
+
+class ChoosePriors(Action):
+    """Choose the prior on the stretch, and whether an estimated focal length has one."""
+
+    stretch: Finite | None = None
+    focal: bool = True
+
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
+        low, high = _STRETCH_RANGE
+        if self.stretch is not None and not low <= self.stretch <= high:
+            raise InputError(
+                f"{100 * self.stretch:g} % is no weak prior on the stretch",
+                where="stretch",
+                fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
+            )
+        kept = state.document.priors.focal or state.intrinsics.likely_focal
+        priors = Priors(self.stretch, kept if self.focal else None)
+        state.history.record(replace(state.document, priors=priors))
+        return ActionOutcome()
 
 
 class PaintMask(Action):
@@ -33,7 +74,7 @@ class PaintMask(Action):
     radius: Positive | None = None
     adds: bool = True
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         least = 1 if self.radius is not None else 3
         if len(self.points) < least:
             raise InputError(
@@ -47,7 +88,7 @@ class LoadMask(Action):
 
     runs: list[Count]
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         runs = tuple(self.runs)
         decode_runs(runs, state.photo.width, state.photo.height)
         evidence = state.document.evidence
@@ -60,7 +101,7 @@ class CutOut(Action):
 
     corners: tuple[Point2, Point2]
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         mask = cut_out(session.pixels(state), np.array(self.corners, dtype=float))
         return _add(Stroke(runs=encode_runs(mask)), state)
 
@@ -68,7 +109,7 @@ class CutOut(Action):
 class ClearMask(Action):
     """Remove the mask."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         return _record(replace(state.document.evidence, mask=None), state)
 
 
@@ -77,7 +118,7 @@ class AddVertical(Action):
 
     ends: tuple[Point2, Point2]
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         first, second = (inside(end, state) for end in self.ends)
         if np.hypot(first[0] - second[0], first[1] - second[1]) < _LEAST_VERTICAL:
             raise InputError(
@@ -99,7 +140,7 @@ class AddVertical(Action):
 class ClearGravity(Action):
     """Remove the vertical edges and the direction of gravity."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         evidence = replace(state.document.evidence, verticals=(), up=None, up_sigma_deg=None)
         return _record(evidence, state)
 
@@ -112,13 +153,15 @@ class KnownLengths(Action):
     length: Finite | None = None
     sigma: Finite | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         sigmas = () if self.sigma is None else (self.sigma,)
-        lengths = check_lengths(Lengths(self.width, self.height, self.length, sigmas))
+        lengths = check_lengths(MarkedLengths(self.width, self.height, self.length, sigmas))
         return _record(replace(state.document.evidence, lengths=lengths), state)
 
 
 EVIDENCE_ACTIONS: dict[str, type[Action]] = {
+    "focal": Focal,
+    "prior": ChoosePriors,
     "mask_paint": PaintMask,
     "mask_load": LoadMask,
     "mask_cut": CutOut,
@@ -130,13 +173,13 @@ EVIDENCE_ACTIONS: dict[str, type[Action]] = {
 """Actions by the name that the page sends as ``do``."""
 
 
-def _add(stroke: Stroke, state: PhotoState) -> Outcome:
+def _add(stroke: Stroke, state: PhotoState) -> ActionOutcome:
     evidence = state.document.evidence
     mask = evidence.mask or MaskDrawing()
     drawn = replace(mask, strokes=(*mask.strokes, stroke))
     return _record(replace(evidence, mask=drawn), state)
 
 
-def _record(evidence: Evidence, state: PhotoState) -> Outcome:
+def _record(evidence: MarkedEvidence, state: PhotoState) -> ActionOutcome:
     state.history.record(replace(state.document, evidence=evidence))
-    return Outcome()
+    return ActionOutcome()

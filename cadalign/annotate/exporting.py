@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.objects.listing import shown_objects
-from cadalign.annotate.objects.models import AnnotatedModel
+from cadalign.annotate.objects.models import OpenedModel
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.errors import InputError
@@ -73,7 +73,7 @@ def coco_of(session: Session) -> dict[str, Any]:
         }
 
 
-def _marked(session: Session, model: AnnotatedModel) -> list[int]:
+def _marked(session: Session, model: OpenedModel) -> list[int]:
     """The keypoints of a model that are marked in any photo."""
     return sorted(
         {

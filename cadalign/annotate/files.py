@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.document import Document, Pair, Priors
+from cadalign.annotate.document import AnnotationDocument, Pair, Priors
 from cadalign.annotate.further import FurtherEvidence, known_depths
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.names import unfinished_file
@@ -68,7 +68,7 @@ SAME_PLACE = 1e-6
 class Stored:
     """An earlier session's annotation; ``camera`` is None without an observation file."""
 
-    document: Document
+    document: AnnotationDocument
     camera: Camera | None
     further: FurtherEvidence
     fit_options: Mapping[str, Any]
@@ -118,7 +118,7 @@ class AnnotationFiles:
 
         New model points are added to the registry; ``diagonal`` is that of the model's box.
         """
-        document, camera, further = Document(), None, FurtherEvidence()
+        document, camera, further = AnnotationDocument(), None, FurtherEvidence()
         fit_options: Mapping[str, Any] = {}
         views: list[StoredView] = []
         if self.observation.exists():
@@ -178,7 +178,7 @@ class AnnotationFiles:
 
     def write(
         self,
-        document: Document,
+        document: AnnotationDocument,
         registry: KeypointRegistry,
         camera: Camera,
         fit_options: Mapping[str, Any],
@@ -220,7 +220,7 @@ class AnnotationFiles:
 
     def unfinished_view(
         self,
-        document: Document,
+        document: AnnotationDocument,
         registry: KeypointRegistry,
         camera: Camera,
         shape: ObjectShape | None,
@@ -299,7 +299,7 @@ class AnnotationFiles:
 
 
 def known_pairs(
-    document: Document, registry: KeypointRegistry, shape: ObjectShape | None
+    document: AnnotationDocument, registry: KeypointRegistry, shape: ObjectShape | None
 ) -> tuple[Pair, ...]:
     """Complete pairs whose keypoints the shape knows; all of them without a shape."""
     return tuple(
@@ -348,8 +348,8 @@ def write_keypoints(
 
 def _document_of(
     observation: ObservedImage, registry: KeypointRegistry, diagonal: float
-) -> Document:
-    document = Document()
+) -> AnnotationDocument:
+    document = AnnotationDocument()
     ids, names = observation.semantic_ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)

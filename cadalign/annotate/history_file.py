@@ -16,20 +16,19 @@ import msgspec
 import numpy as np
 from platformdirs import user_state_path
 
-from cadalign.annotate.document import Document, FurtherView, History, Pair
-from cadalign.annotate.evidence import Evidence
+from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair
+from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
-from cadalign.io.documents import Document as JsonDocument
-from cadalign.io.documents import read_document
+from cadalign.io.documents import Document, read_document
 
 logger = logging.getLogger("cadalign")
 
 _MOST = 200  # documents that are kept
 
 
-class _Step(JsonDocument):
+class _Step(Document):
     """One document: its pairs by their numbers in the file, and the number of its other fields."""
 
     pairs: list[int]
@@ -37,9 +36,9 @@ class _Step(JsonDocument):
     rest: int
 
 
-class _File(JsonDocument):
+class _File(Document):
     pairs: list[Pair]
-    rests: list[Document]  # without pairs
+    rests: list[AnnotationDocument]  # without pairs
     steps: list[_Step]
     before: int
     points: list[ModelKeypoint]
@@ -55,7 +54,7 @@ def write_history(path: Path, history: History, registry: KeypointRegistry) -> N
     """Write the last documents; a failure is logged, since nothing of the annotation is lost."""
     before, after = history.before[-_MOST:], history.after[-_MOST:]
     pairs: dict[Pair, int] = {}
-    rests: dict[Document, int] = {}
+    rests: dict[AnnotationDocument, int] = {}
     steps = []
     for document in (*before, history.document, *reversed(after)):
         rest = rests.setdefault(replace(document, pairs=(), next_number=1), len(rests))
@@ -78,11 +77,11 @@ def write_history(path: Path, history: History, registry: KeypointRegistry) -> N
 
 def read_history(
     path: Path,
-    document: Document,
+    document: AnnotationDocument,
     registry: KeypointRegistry,
     *,
     tolerance: float,
-    same_evidence: Callable[[Evidence, str | None], bool],
+    same_evidence: Callable[[MarkedEvidence, str | None], bool],
 ) -> History:
     """The history that led to a document; an empty one if there is none of that document.
 
@@ -98,10 +97,10 @@ def read_history(
 
 def _read(
     path: Path,
-    document: Document,
+    document: AnnotationDocument,
     registry: KeypointRegistry,
     tolerance: float,
-    same_evidence: Callable[[Evidence, str | None], bool],
+    same_evidence: Callable[[MarkedEvidence, str | None], bool],
 ) -> History:
     file = read_document(path, _File)
     documents = [
@@ -144,7 +143,9 @@ def _read(
     return History(kept, before=documents[:at], after=documents[:at:-1])
 
 
-def _places_of(document: Document, documents: Sequence[Document], *, near: int) -> list[int]:
+def _places_of(
+    document: AnnotationDocument, documents: Sequence[AnnotationDocument], *, near: int
+) -> list[int]:
     """The numbers of documents with the same pairs as another: ``near``, or beside it.
 
     A process that was killed, or could not save, left the other files one step behind.
@@ -157,11 +158,11 @@ def _places_of(document: Document, documents: Sequence[Document], *, near: int) 
 
 
 def _kept(
-    current: Document,
-    document: Document,
+    current: AnnotationDocument,
+    document: AnnotationDocument,
     photo: str | None,
-    same_evidence: Callable[[Evidence, str | None], bool],
-) -> Document:
+    same_evidence: Callable[[MarkedEvidence, str | None], bool],
+) -> AnnotationDocument:
     """The document of one photo with the numbers, and with what was drawn, of the history."""
     kept = replace(document, pairs=current.pairs, next_number=current.next_number)
     if same_evidence(current.evidence, photo):
@@ -169,10 +170,10 @@ def _kept(
     return kept
 
 
-def _agree(one: Document, other: Document) -> bool:
+def _agree(one: AnnotationDocument, other: AnnotationDocument) -> bool:
     """True if two documents have the same pairs, whatever their order and numbers."""
 
-    def content(document: Document) -> list[str]:
+    def content(document: AnnotationDocument) -> list[str]:
         return sorted(repr(replace(pair, number=0)) for pair in document.pairs)
 
     views = {view.photo: view.document for view in one.further_views}

@@ -45,7 +45,7 @@ class Displayed:
     is_doubled: BoolArray
 
 
-class CadModel:
+class ClickableModel:
     """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
     def __init__(self, mesh: Mesh) -> None:
@@ -194,7 +194,7 @@ class CadModel:
         return ModelKeypoint(name="", xyz=(x, y, z), face_index=face, barycentric=(a, b, c))
 
 
-def display_bytes(model: CadModel) -> bytes:
+def display_bytes(model: ClickableModel) -> bytes:
     """Encode the model for display, simplified to at most `MOST_FACES` triangles.
 
     First the length of a JSON header (uint32, little-endian, a multiple of 4 with padding), and the
@@ -217,7 +217,7 @@ def display_bytes(model: CadModel) -> bytes:
     )
 
 
-def detail_bytes(model: CadModel, creases: FloatArray) -> bytes:
+def detail_bytes(model: ClickableModel, creases: FloatArray) -> bytes:
     """Encode what `display_bytes` leaves out, of the same triangles.
 
     Creases (k, 2, 3) [model units] as float32 in display coordinates, their number (uint32) before

@@ -23,7 +23,7 @@ from cadalign.annotate.objects.models import Models
 from cadalign.annotate.objects.opening import ModelOpener, open_object
 from cadalign.annotate.objects.state import PhotoState
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.photos import Photo, find_photos, read_camera
+from cadalign.annotate.photos import PhotoFile, find_photos, read_camera
 from cadalign.annotate.proposals import read_proposals
 from cadalign.annotate.session import Session
 from cadalign.annotate.worklist import WorkList
@@ -39,7 +39,7 @@ logger = logging.getLogger("cadalign")
 class SessionFiles:
     """Photos of a session, and the files that it writes."""
 
-    photos: tuple[Photo, ...]
+    photos: tuple[PhotoFile, ...]
     observations: tuple[Path, ...]  # one for each photo, in one folder
     keypoints: Path  # of the model
 
@@ -67,9 +67,11 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
         raise InputError(
             "the name is too long for a file", where="--observation", fix="give a shorter one"
         )
-    photos = _readable(paths) if in_folder else [Photo.open(paths[0])]
+    photos = _readable(paths) if in_folder else [PhotoFile.open(paths[0])]
     listed = {photo.path.resolve() for photo in photos}
-    photos += [Photo.open(path) for path in options.further_photos if path.resolve() not in listed]
+    photos += [
+        PhotoFile.open(path) for path in options.further_photos if path.resolve() not in listed
+    ]
     photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
     out = options.out or paths[0].parent
     if observation is not None:
@@ -134,7 +136,7 @@ def open_session(
 
 
 def _open_objects(
-    photo: Photo,
+    photo: PhotoFile,
     file: Path,
     options: SessionOptions,
     camera: Camera | None,
@@ -181,12 +183,12 @@ def _with_options(further: FurtherEvidence, options: SessionOptions) -> FurtherE
     return further
 
 
-def _readable(paths: list[Path]) -> list[Photo]:
+def _readable(paths: list[Path]) -> list[PhotoFile]:
     """Open the files that are photos, with a warning about the others."""
     photos = []
     for path in paths:
         try:
-            photos.append(Photo.open(path))
+            photos.append(PhotoFile.open(path))
         except DataError as error:
             logger.warning("left out: %s", error)
     if not photos:

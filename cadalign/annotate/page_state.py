@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.action import Outcome
+from cadalign.annotate.action import ActionOutcome
 from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.advice import Marked, present, rank
 from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
-from cadalign.annotate.evidence import LENGTHS, Lengths, MaskDrawing, find_up
+from cadalign.annotate.evidence import LENGTHS, MarkedLengths, MaskDrawing, find_up
 from cadalign.annotate.files import filled
 from cadalign.annotate.masks import draw_mask
 from cadalign.annotate.objects.page import objects_state, with_photo_names
@@ -37,13 +37,13 @@ _FOCAL = "With a known focal length, a mask, another photo and lengths are ranke
 
 
 def page_state(
-    session: Session, number: int, outcome: Outcome | None = None, *, slot: int | None = None
+    session: Session, number: int, outcome: ActionOutcome | None = None, *, slot: int | None = None
 ) -> dict[str, Any]:
     """Collect everything that the page shows of an object, after an action of that outcome.
 
     It is an object of the photo of a number, or the one that the outcome goes on with.
     """
-    outcome = outcome or Outcome()
+    outcome = outcome or ActionOutcome()
     with session.lock:
         state = outcome.shown or session.photo_state(number, slot)
         number, slot = session.place_of(state)
@@ -136,7 +136,7 @@ def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
     camera = state.intrinsics.with_focal(state.document.focal)
     found = find_up(evidence.verticals, camera)
     sigma = evidence.up_sigma_deg if found is None else found[1]
-    lengths = evidence.lengths or Lengths()
+    lengths = evidence.lengths or MarkedLengths()
     return {
         "mask": None if evidence.mask is None else f"{hash(evidence.mask) & 0xFFFFFFFF:x}",
         "verticals": evidence.verticals,

@@ -35,7 +35,7 @@ _DEFAULT_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]
 
 
 @dataclass(frozen=True)
-class Photo:
+class PhotoFile:
     """A photo with its upright size [px]."""
 
     path: Path
@@ -43,7 +43,7 @@ class Photo:
     height: int
 
     @classmethod
-    def open(cls, path: Path) -> Photo:
+    def open(cls, path: Path) -> PhotoFile:
         """Read a photo's size; raises DataError if it is missing or no photo."""
         return cls(path, *photo_size(path))
 
@@ -161,7 +161,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
     return read_camera_views(path)[0].camera
 
 
-def intrinsics_of(photo: Photo, camera: Camera | None) -> Intrinsics:
+def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:
     """Combine a photo's EXIF data with its calibrated camera, which may lack a focal length."""
     if camera is None:
         camera = Camera.without_focal(photo.width, photo.height)

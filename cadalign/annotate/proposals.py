@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.annotate.keypoint_registry import KeypointRegistry
-from cadalign.annotate.photos import Photo
+from cadalign.annotate.photos import PhotoFile
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
@@ -23,7 +23,7 @@ class Proposal:
 
 
 def read_proposals(
-    path: Path, photos: Sequence[Photo], registry: KeypointRegistry
+    path: Path, photos: Sequence[PhotoFile], registry: KeypointRegistry
 ) -> list[tuple[Proposal, ...]]:
     """Read COCO's keypoints or a detector's for each photo, by its file name.
 
@@ -50,7 +50,7 @@ def read_proposals(
 
 
 def _proposals(
-    found: ImageKeypoints, photo: Photo, registry: KeypointRegistry
+    found: ImageKeypoints, photo: PhotoFile, registry: KeypointRegistry
 ) -> tuple[Proposal, ...]:
     by_name = {point.name: number for number, point in registry}
     count = len(found.points_2d)

@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.choosing.ranking import ranking_state, thumbnail_of
 from cadalign.annotate.claims import Claims
 from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
@@ -219,7 +220,7 @@ class _Routes:
                     views = session.photo_state(number, slot).all_views
                     photos = {number, *(session.place_of(view)[0] for view in views)}
                     self._claims.take_all(photos, browser)
-                    outcome = session.act(number, action, slot=slot)
+                    outcome = perform(session, number, action, slot=slot)
                 state = page_state(session, number, outcome, slot=slot)
             return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
 

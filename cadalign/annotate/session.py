@@ -1,10 +1,10 @@
-"""Annotation session: the photos, their annotations, and the actions on them."""
+"""Annotation session: the photos, their annotations, and the files of these."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,24 +12,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.action import Outcome
-from cadalign.annotate.actions import ACTIONS, DELETING, RENAMING
 from cadalign.annotate.advice import warm_up_advice
 from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment, align
 from cadalign.annotate.choosing.choice import ModelChoice
 from cadalign.annotate.document import FocalChoice, History, Pair, Priors
-from cadalign.annotate.files import filled, known_pairs
+from cadalign.annotate.files import filled, known_pairs, write_keypoints
 from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.history_file import history_path, write_history
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.annotate.masks import draw_mask
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects.deletions import Deletions
 from cadalign.annotate.objects.joint import tells_something, with_other_views
 from cadalign.annotate.objects.listing import shown_objects
 from cadalign.annotate.objects.models import Models
-from cadalign.annotate.objects.saving import write_object
 from cadalign.annotate.objects.state import Live, PhotoState
 from cadalign.annotate.photos import Intrinsics
 from cadalign.annotate.shape_alignment import (
@@ -39,11 +36,10 @@ from cadalign.annotate.shape_alignment import (
     align_shape,
     warm_up_joint,
 )
-from cadalign.annotate.suggestion import Estimate, Suggestion, suggest, suggest_of_shape
+from cadalign.annotate.suggestion import Suggestion, UncertainPose, suggest, suggest_of_shape
 from cadalign.annotate.worklist import State, WorkList
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.simulation.problems import simulate_problem
-from cadalign.io.documents import convert
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
@@ -88,7 +84,7 @@ class Session:
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     @property
-    def model(self) -> CadModel:
+    def model(self) -> ClickableModel:
         """The first model."""
         return self.models[0].cad
 
@@ -212,7 +208,7 @@ class Session:
             document.focal,
             document.priors,
         )
-        estimate = Estimate.of(plain)
+        estimate = UncertainPose.of(plain)
         if estimate is None:
             return plain, None
         return plain, suggest(state.model.cad, registry, document.keypoints, estimate)
@@ -259,7 +255,7 @@ class Session:
             return None
         if "x" in result.stretched_axes:
             return None  # of a size that is estimated, too, nothing is predicted
-        estimate = Estimate(camera, live.alignment, result.covariance, live.sigma)
+        estimate = UncertainPose(camera, live.alignment, result.covariance, live.sigma)
         return suggest(state.model.cad, registry, used, estimate)
 
     def further(self, state: PhotoState, *, to_write: bool = False) -> FurtherEvidence:
@@ -301,41 +297,6 @@ class Session:
                 state.drawn = (drawing, drawn, bool(mask.any()))
             drawn = drawn if state.drawn[2] else None
         return evidence.added_to(state.further, state.camera, drawn)
-
-    def act(self, number: int, action: Mapping[str, Any], *, slot: int | None = None) -> Outcome:
-        """Do an action, its name ``do`` and its arguments, and save its changes.
-
-        It is done on an object of the photo of a number; see `photo_state`.
-        """
-        with self.lock:
-            state = self.photo_state(number, slot)
-            if slot == 0 and self.objects[number][0].is_shown:
-                state = self.objects[number][0]  # which is not listed while nothing is marked
-            elif slot not in (None, self.place_of(state)[1]):
-                raise InputError(
-                    "this object was deleted, or the photo is no longer one of its photos",
-                    where="object",
-                    fix="reload the page",
-                )
-            name = action.get("do")
-            kind = ACTIONS.get(name) if isinstance(name, str) else None
-            if kind is None:
-                raise InputError(
-                    f"{quote(name)} is not an action",
-                    where="do",
-                    fix=f"known are {', '.join(ACTIONS)}",
-                )
-            before = {id(each): each.object_document for each in self.states}
-            outcome: Outcome = convert(action, kind).apply(self, state)
-            owners = [each for each in self.states if each.lead is None]
-            changed = [each for each in owners if before.get(id(each)) is not each.document]
-            for each in changed:
-                self.save(each)
-            if changed and name not in DELETING:
-                self.deletions.note_change(number)
-            if name in RENAMING:
-                self.save(state)
-            return outcome
 
     def save(self, state: PhotoState) -> None:
         """Write the files of an object and of its model; an error is kept for the page.
@@ -382,9 +343,50 @@ class Session:
             if state.document.is_gone:
                 state.files.remove()
             else:
-                write_object(self, state, with_fit=ready)
+                self._write_object(state, with_fit=ready)
         except CadalignError as error:
             state.save_error = str(error)
         else:
             state.save_error = ""
             state.saved_at = time.time()
+
+    def _write_object(self, state: PhotoState, *, with_fit: bool) -> None:
+        """Write keypoints, observation and alignment of an object; raises DataError on failure.
+
+        ``state`` is that in its first photo.
+        """
+        document, model = state.document, state.model
+        live, _ = self.live(state)
+        # An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
+        result = None if live.provisional else live.shown
+        used = frozenset[int]().union(
+            *(other.document.keypoints for other in self.states if other.model is model)
+        )
+        # First the keypoints, which the observation names.
+        write_keypoints(model.keypoints_path, model.registry, used, model.path)
+        camera = state.intrinsics.to_write(document.focal)
+        priors = document.priors.fit_options(state.intrinsics.prior)
+        state.unfinished = state.files.write(
+            document,
+            model.registry,
+            camera,
+            {**priors, **live.fit_options},
+            self.further(state, to_write=True),
+            self.shape,
+            self._unfinished_views(state),
+            unfinished=state.unfinished,
+        )
+        if with_fit:
+            state.files.write_fit(result)
+
+    def _unfinished_views(self, owner: PhotoState) -> list[dict[str, Any]]:
+        """The object's further photos as far as the observation lacks them or their pairs."""
+        unfinished = []
+        for view in owner.all_views[1:]:
+            camera = view.intrinsics.to_write(view.document.focal)
+            written = view.files.unfinished_view(
+                view.document, view.model.registry, camera, self.shape
+            )
+            if written["pairs"] or not self.tells(view):
+                unfinished.append(written)
+        return unfinished

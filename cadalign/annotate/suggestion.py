@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.keypoint_registry import KeypointRegistry
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.arrays import FloatArray
@@ -45,7 +45,7 @@ class Unmarked:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class UncertainPose:
     """An estimate as far as a suggestion follows from it, its covariance as of `Result`."""
 
     camera: Camera
@@ -54,7 +54,7 @@ class Estimate:
     sigma: float
 
     @classmethod
-    def of(cls, live: LiveAlignment) -> Estimate | None:
+    def of(cls, live: LiveAlignment) -> UncertainPose | None:
         """That of the pairs; None without one."""
         result = live.cautious
         covariance = None if result is None else result.covariance
@@ -73,7 +73,10 @@ class Suggestion:
 
 
 def suggest(
-    model: CadModel, registry: KeypointRegistry, used: Collection[int], estimate: Estimate
+    model: ClickableModel,
+    registry: KeypointRegistry,
+    used: Collection[int],
+    estimate: UncertainPose,
 ) -> Suggestion | None:
     """Choose among the visible keypoints that are not used; if none is left, among corners."""
     camera, alignment = estimate.camera, estimate.alignment

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
@@ -50,7 +50,7 @@ class Wireframe:
     _piece: float  # length of a line [model units]
 
     @classmethod
-    def of_model(cls, model: CadModel) -> Wireframe:
+    def of_model(cls, model: ClickableModel) -> Wireframe:
         """The lines of a model as it is."""
         small = simplify(model.scene.mesh, max_faces=_MOST_FACES)
         # Faces of real models seldom share vertices: weld those in one place.

@@ -65,7 +65,7 @@ COMMANDS = {
         "Simulate",
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),
-    "report": _Command("report", "Report", "Show the result of one or more runs."),
+    "report": _Command("report", "ReportCommand", "Show the result of one or more runs."),
     "export": _Command("export", "Export", "Write a fit for another tool."),
     "render": _Command(
         "render",

@@ -16,7 +16,7 @@ from rich.console import Console
 from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
 from cadalign.cli.options import UsageError, flag_of
 from cadalign.cli.output import make_folder, new_console
-from cadalign.io.files import writing
+from cadalign.io.files import write_json, writing
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import Session
@@ -143,7 +143,6 @@ def _export(options: SessionOptions, to: Path, form: str, console: Console) -> i
     from cadalign.annotate.exporting import annotated_photos, coco_of
     from cadalign.annotate.opening import open_session
     from cadalign.export.photo_sets import write_photo_set
-    from cadalign.io.files import write_json
 
     session = open_session(options)
     if form == "coco":

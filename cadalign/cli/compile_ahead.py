@@ -8,8 +8,13 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
 
-from cadalign.estimation.options import METHODS
+from cadalign.estimation.options import METHODS, RansacOptions
+from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.metrics import box_iou
+from cadalign.shapes.model import ShapeModel
 
 _CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
 
@@ -40,7 +45,6 @@ def _points() -> tuple[np.ndarray, np.ndarray]:
 
 def _fits() -> None:
     from cadalign.estimation.fit import fit
-    from cadalign.estimation.options import RansacOptions
 
     points, pixels = _points()
     for method in METHODS:
@@ -59,8 +63,6 @@ def _shapes_in_several_views() -> None:
 
 def _align_shape(*, views: int) -> None:
     from cadalign.estimation.align import align
-    from cadalign.estimation.view import View
-    from cadalign.shapes.model import ShapeModel
 
     points, pixels = _points()
     directions = np.random.default_rng(0).normal(size=(2, 12, 3))
@@ -69,9 +71,6 @@ def _align_shape(*, views: int) -> None:
 
 
 def _retrieval_and_boxes() -> None:
-    from cadalign.geometry.alignment import Alignment
-    from cadalign.geometry.box import Box
-    from cadalign.geometry.metrics import box_iou
     from cadalign.retrieval import Library, LibraryModel
 
     points, pixels = _points()

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cadalign.estimation.uncertainty.summary import Contribution
+from cadalign.estimation.uncertainty.weakness import Uncertainty
+
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
-    from cadalign.estimation.uncertainty.summary import Contribution
-    from cadalign.estimation.uncertainty.weakness import Uncertainty
 
 _HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from cadalign.cli.options import JsonOption, named_as_flags
-from cadalign.cli.runs import conclude, run_progress
+from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
+from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.opened import Run
@@ -38,8 +39,6 @@ class RunCommand(JsonOption, RunOptions):
 
     def run(self) -> int:
         """Do the run and say what came out; returns the exit code."""
-        from cadalign.cli.report import write_run_report
-
         spec, run = self.do_run()
         code = conclude(spec, run, json=self.json)
         write_run_report(run.folder)
@@ -47,7 +46,6 @@ class RunCommand(JsonOption, RunOptions):
 
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
-        from cadalign.evaluation.registry import spec_named
         from cadalign.evaluation.runs.folder import RunFolder
         from cadalign.evaluation.runs.run import execute, workers_of
 
@@ -101,7 +99,6 @@ class EvaluateShow(JsonOption):
 
     def run(self) -> int:
         """Show the run; returns the exit code, that of the run."""
-        from cadalign.evaluation.registry import spec_of_config
         from cadalign.evaluation.runs.folder import RunFolder
 
         folder = RunFolder(self.run_folder)
@@ -120,8 +117,6 @@ class EvaluateShow(JsonOption):
 
 def _commands() -> Any:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
-    from cadalign.evaluation.registry import known_options
-
     commands = {
         options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
 from cadalign.cli.options import named_as_flags
-
-if TYPE_CHECKING:
-    from cadalign.geometry.camera import Camera
-    from cadalign.io.observation import Observation
+from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
+from cadalign.io.camera_file import read_camera
+from cadalign.io.documents import convert
+from cadalign.io.observation import Observation
+from cadalign.io.observation_file import SizeFields, read_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +32,6 @@ class CameraOptions:
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera of --camera; ``size`` is the photo's, for a file of a matrix alone."""
-        from cadalign.errors import InputError
-        from cadalign.io.camera_file import read_camera
-
         if self.camera is not None:
             return read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
         if self.pixel_origin is not None:
@@ -66,9 +65,6 @@ class EvidenceOptions:
 
     def add_to(self, observation: Observation) -> Observation:
         """An observation with the evidence of the options, which takes the place of its own."""
-        from cadalign.io.documents import convert
-        from cadalign.io.observation_file import SizeFields, read_size
-
         given: dict[str, Any] = {
             "mask": _absolute(self.mask),
             "mask_sigma": self.mask_sigma,

@@ -10,7 +10,8 @@ import tyro
 
 from cadalign.cli.options import OptionError, named_as_flags
 from cadalign.cli.output import new_console
-from cadalign.export.formats import ExportOptions
+from cadalign.datasets.photos.records import read_matrix
+from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,6 @@ class Export:
     def run(self) -> int:
         """Write the file; returns the exit code."""
         from cadalign.cli.exported import read_exported
-        from cadalign.datasets.photos.records import read_matrix
-        from cadalign.export.formats import FORMATS, export_object, format_of
 
         with named_as_flags(self, self.options):
             name = self.format or format_of(self.to)

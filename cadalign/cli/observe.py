@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -12,11 +15,19 @@ import tyro
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.options import named_as_flags
 from cadalign.cli.output import make_folder, new_console
-
-if TYPE_CHECKING:
-    from cadalign.datasets import ImageKeypoints, ModelKeypoints
-    from cadalign.geometry.camera import Camera
-    from cadalign.io.observation import Observation
+from cadalign.datasets import (
+    ImageKeypoints,
+    ModelKeypoints,
+    choose_object,
+    join_keypoints,
+    read_image_keypoints,
+)
+from cadalign.datasets.detections.coco_masks import decode_segmentation
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import in_file
+from cadalign.io.images import photo_size, write_image
+from cadalign.io.observation import Observation
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -59,13 +70,10 @@ class Observe(CameraOptions, EvidenceOptions):
 
     def run(self) -> int:
         """Write the observation, or those of all objects; returns the exit code."""
-        from cadalign.cli.observe_many import observe_all
-        from cadalign.datasets import ModelKeypoints, choose_object, read_image_keypoints
-
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
         if self.every:
-            return observe_all(self, objects, model)
+            return _observe_all(self, objects, model)
         name = None if self.image is None else self.image.name
         with named_as_flags(self, others=_FLAGS):
             found = choose_object(objects, image=name, number=self.object)
@@ -81,8 +89,6 @@ class Observe(CameraOptions, EvidenceOptions):
         self, found: ImageKeypoints, model: ModelKeypoints, image: Path | None, out: Path
     ) -> Observation:
         """Write the observation of one object in a photo."""
-        from cadalign.datasets import join_keypoints
-
         with named_as_flags(self, others=_FLAGS):
             observation = join_keypoints(
                 found,
@@ -105,10 +111,6 @@ class Observe(CameraOptions, EvidenceOptions):
         self, observation: Observation, found: ImageKeypoints, out: Path
     ) -> Path | None:
         """Write the mask beside the keypoints, if there is one that a fit can use; its path."""
-        from cadalign.datasets.detections.coco_masks import decode_segmentation
-        from cadalign.io.documents import in_file
-        from cadalign.io.images import write_image
-
         if found.segmentation is None or not self.segmentation:
             return None
         camera = observation.camera
@@ -125,10 +127,6 @@ class Observe(CameraOptions, EvidenceOptions):
 
     def _camera(self, found: ImageKeypoints, image: Path | None) -> Camera:
         """Read the camera, or make one of the photo's size without focal length."""
-        from cadalign.errors import DataError
-        from cadalign.geometry.camera import Camera
-        from cadalign.io.images import photo_size
-
         paths = [path for path in (image, self.mask, self.depth) if path is not None]
         sizes = {str(path): photo_size(path) for path in paths}
         if found.size is not None:
@@ -150,3 +148,57 @@ class Observe(CameraOptions, EvidenceOptions):
                     fix="give keypoints, photo and camera of one image",
                 )
         return camera or Camera.without_focal(*size)
+
+
+def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: ModelKeypoints) -> int:
+    """Write an observation of each object; returns the exit code, 3 where some are left out."""
+    from rich.progress import track
+
+    for name in ("object", "mask", "depth"):
+        if getattr(command, name) is not None:
+            raise InputError("is for one photo", where=f"--{name}", fix="leave out --every")
+    if command.image is not None and not command.image.is_dir():
+        what = f"{command.image} is not a folder of photos"
+        raise InputError(what, where="--image", fix="give the photos' folder, or leave out --every")
+    folder = command.out or command.keypoints.with_name(f"{command.keypoints.stem}_observations")
+    make_folder(folder)
+    console = new_console()
+    failed = 0
+    shown = track(
+        list(zip(objects, _names(objects), strict=True)),
+        "observing",
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    for found, name in shown:
+        try:
+            photo = _photo(found, command.image)
+            command.observe(found, model, photo, folder / f"{name}.json")
+        except CadalignError as error:
+            failed += 1
+            console.print(f"left out: {name}: {error}", markup=False)
+    text = f"{len(objects) - failed} of {len(objects)} objects: {folder}"
+    new_console(stderr=False).print(text, markup=False)
+    if failed == len(objects):
+        return 1
+    return 3 if failed else 0
+
+
+def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
+    """The photo of an object in a folder, if it is there."""
+    if folder is None or found.image is None:
+        return None
+    path = folder / Path(found.image).name
+    return path if path.exists() else None
+
+
+def _names(objects: Sequence[ImageKeypoints]) -> list[str]:
+    """File names of objects: the photo's, numbered where it has several."""
+    stems = [re.sub(r"[^\w.-]+", "_", Path(found.image or "").stem) or "photo" for found in objects]
+    counts, seen = Counter(stems), Counter[str]()
+    names = []
+    for stem in stems:
+        names.append(stem if counts[stem] == 1 else f"{stem}_{seen[stem]}")
+        seen[stem] += 1
+    return names

@@ -61,10 +61,22 @@ class Render:
 
         console = new_console()
         with named_as_flags(self):
-            job = RenderJob.prepare(self)
+            job = RenderJob.prepare(
+                model=self.model,
+                out=self.out,
+                views=self.view,
+                size=self.size,
+                style=self.style,
+                background=self.background,
+                keypoints=self.keypoints,
+                scale=self.scale,
+                fov=self.fov,
+                samples=self.samples,
+                renderer=self.renderer,
+            )
         make_folder(self.out.absolute().parent)
         if self.out.suffix.lower() in MOVIES:
-            frames, count = draw_movie(job)
+            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
             shown = track(frames, "drawing", total=count, console=console, transient=True)
             write_movie(self.out, shown, fps=self.fps)
         else:

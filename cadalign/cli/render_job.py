@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.arrays import FloatArray, as_floats, as_points
-from cadalign.cli.render import Render
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
@@ -41,7 +40,8 @@ class RenderJob:
 
     scene: Scene
     renderer: Renderer
-    options: Render
+    style: str
+    samples: int
     views: tuple[LabelledView, ...]
     camera: Camera
     background: tuple[int, int, int] | None
@@ -50,52 +50,67 @@ class RenderJob:
     scale: FloatArray
 
     @classmethod
-    def prepare(cls, options: Render) -> RenderJob:
+    def prepare(
+        cls,
+        *,
+        model: Path,
+        out: Path,
+        views: Sequence[str],
+        size: str,
+        style: str,
+        background: str,
+        keypoints: Path | None,
+        scale: Sequence[float],
+        fov: float,
+        samples: int,
+        renderer: str,
+    ) -> RenderJob:
         """Check the options of the command line and read the files that they name."""
-        width, height = parse_size(options.size)
-        camera = Camera.from_fov(width, height, fov_x=options.fov)
+        width, height = parse_size(size)
+        camera = Camera.from_fov(width, height, fov_x=fov)
         check_image_size(camera)
-        ending = options.out.suffix.lower()
+        ending = out.suffix.lower()
         if ending not in (*STILLS, *MOVIES):
             raise InputError(
-                f"{options.out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
+                f"{out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
                 where="--out",
                 fix=f"give a name that ends in {', '.join((*STILLS, *MOVIES))}",
             )
-        background = parse_background(options.background)
-        scale = as_floats(options.scale, name="--scale", shape=(3,))
-        if (scale <= 0).any():
-            raise InputError(f"{options.scale} is not positive", where="--scale")
-        views = tuple(view for word in options.view for view in _views(word, scale))
-        if not views:
+        color = parse_background(background)
+        stretch = as_floats(scale, name="--scale", shape=(3,))
+        if (stretch <= 0).any():
+            raise InputError(f"{tuple(scale)} is not positive", where="--scale")
+        labelled = tuple(view for word in views for view in _views(word, stretch))
+        if not labelled:
             raise InputError("no view is given", where="--view", fix="give one or more")
-        file = options.keypoints
-        if background is None and (ending != ".png" or len(views) > 1 or file is not None):
+        if color is None and (ending != ".png" or len(labelled) > 1 or keypoints is not None):
             raise InputError(
                 "only a PNG still without keypoints can be transparent", where="--background"
             )
-        mesh = load_mesh(options.model)
+        mesh = load_mesh(model)
         return cls(
             scene=Scene(mesh),
             # Depth, normals, triangles and lines are cast in any case.
-            renderer=make_renderer(options.renderer if options.style == "color" else "raycast"),
-            options=options,
-            views=views,
+            renderer=make_renderer(renderer if style == "color" else "raycast"),
+            style=style,
+            samples=samples,
+            views=labelled,
             camera=camera,
-            background=background,
-            keypoints=None if file is None else read_keypoints(file, options.model, mesh),
-            scale=scale,
+            background=color,
+            keypoints=None if keypoints is None else read_keypoints(keypoints, model, mesh),
+            scale=stretch,
         )
 
     @property
     def drawn_by(self) -> str:
         """Name of the renderer that really draws the model."""
-        return self.renderer.drawn_by(self.scene, samples=self.options.samples)
+        return self.renderer.drawn_by(self.scene, samples=self.samples)
 
     def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
         """One picture, (h, w, 3) uint8, or (h, w, 4) on a transparent background."""
-        style, samples = self.options.style, self.options.samples
-        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
+        color = draw_still(
+            self.renderer, self.scene, camera, pose, style=self.style, samples=self.samples
+        )
         if self.background is None:
             return color
         image = composite(color, self.background)
@@ -121,9 +136,8 @@ def draw_picture(job: RenderJob) -> ByteImage:
     return contact_sheet(images, [label for label, _ in job.views], background=background)
 
 
-def draw_movie(job: RenderJob) -> tuple[Iterator[ByteImage], int]:
+def draw_movie(job: RenderJob, *, seconds: float, fps: int) -> tuple[Iterator[ByteImage], int]:
     """Draw a turntable that starts in the first view: its frames, and their number."""
-    seconds, fps = job.options.seconds, job.options.fps
     frames = seconds * fps
     if not 1 <= frames <= _MAX_FRAMES:
         raise InputError(

@@ -5,19 +5,20 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from cadalign.cli.evaluate import command_of
 from cadalign.cli.output import new_console
+from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
-
-if TYPE_CHECKING:
-    from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.estimates.options import EstimatesOptions
+from cadalign.io.files import write_text
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportCommand:
     """Show the result of one or more runs.
 
     The page holds the headline table, plots, and a gallery whose instances open with their numbers
@@ -71,17 +72,11 @@ class Report:
         if self.out is None:
             sys.stdout.write(text)
         else:
-            from cadalign.io.files import write_text
-
             write_text(self.out, text)
         return code
 
     def _score(self) -> int:
         """Score the estimates and print the table; returns the exit code."""
-        from cadalign.cli.evaluate import command_of
-        from cadalign.cli.runs import conclude
-        from cadalign.evaluation.estimates.options import EstimatesOptions
-
         if self.data is None:
             fix = "give --data, the folder of the data set"
             raise InputError(
@@ -95,11 +90,3 @@ class Report:
 
 def _page(runs: tuple[Path, ...]) -> Path:
     return runs[0] / "report.html" if len(runs) == 1 else Path("report.html")
-
-
-def write_run_report(folder: RunFolder) -> None:
-    """Write a run's page at its end, and say where it is."""
-    from cadalign.report import write_report
-
-    report = write_report([folder.path], folder.report)
-    new_console().print(f"Report: {report.path}", markup=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
@@ -14,11 +14,10 @@ from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
 from cadalign.estimation.options import Sigma
+from cadalign.io.images import read_image
+from cadalign.retrieval import Match
 from cadalign.retrieval.options import RetrievalOptions
-
-if TYPE_CHECKING:
-    from cadalign.retrieval import Match
-    from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.model import ShapeModel
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,6 @@ class Retrieve(ObservationCommand):
 
     def run(self) -> int:
         """Run the retrieval; returns the exit code."""
-        from cadalign.io.images import read_image
         from cadalign.retrieval import Library
         from cadalign.retrieval.page import none_text, write_retrieval
         from cadalign.retrieval.query import read_mask, read_opacity, read_query
@@ -120,8 +118,6 @@ class Retrieve(ObservationCommand):
 
 def _open_shapes(paths: Sequence[Path]) -> ShapeModel | dict[str, ShapeModel] | None:
     """The shape models of files: one, or several by category; None of no file."""
-    from cadalign.shapes.model import ShapeModel
-
     models = [ShapeModel.open(path) for path in paths]
     if len(models) < 2:
         return models[0] if models else None

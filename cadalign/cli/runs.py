@@ -25,6 +25,7 @@ from cadalign.cli.output import new_console
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.spec import Spec
@@ -60,6 +61,14 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
     if found.failed == found.rows:
         return NOTHING_WORKED
     return SOME_FAILED if found.failed else SUCCESS
+
+
+def write_run_report(folder: RunFolder) -> None:
+    """Write a run's page at its end, and say where it is."""
+    from cadalign.report import write_report
+
+    report = write_report([folder.path], folder.report)
+    new_console().print(f"Report: {report.path}", markup=False)
 
 
 def print_table(table: ConsoleTable) -> None:

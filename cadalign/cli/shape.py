@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from cadalign.cli.options import JsonOption
 from cadalign.cli.output import make_folder, new_console
-
-if TYPE_CHECKING:
-    from cadalign.shapes.model import ShapeModel
+from cadalign.datasets import KeypointNet
+from cadalign.render.drawing.shape_picture import draw_shape
+from cadalign.shapes.model import ShapeModel
 
 _MODES = 5  # whose share of the variance is listed
 
@@ -41,9 +41,6 @@ class ShapeLearn:
     def run(self) -> int:
         """Learn the model; returns the exit code."""
         from rich.progress import Progress
-
-        from cadalign.datasets import KeypointNet
-        from cadalign.shapes.model import ShapeModel
 
         console = new_console()
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
@@ -76,9 +73,6 @@ class ShapeShow(JsonOption):
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
-        from cadalign.render.drawing.shape_picture import draw_shape
-        from cadalign.shapes.model import ShapeModel
-
         model = ShapeModel.open(self.shape)
         out = self.shape.with_suffix(".png") if self.out is None else self.out
         make_folder(out.absolute().parent)

@@ -6,18 +6,19 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.errors import DataError, InputError, quote
 from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame
+from cadalign.export.camera_files import CameraView, write_colmap, write_nerf, write_open3d
+from cadalign.export.coco import write_coco
+from cadalign.export.line_set import write_line_set
+from cadalign.export.scan2cad import write_scan2cad
+from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import written_path
 from cadalign.io.files import printable, refuse_nul
-
-if TYPE_CHECKING:
-    from cadalign.export.camera_files import CameraView
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +91,6 @@ def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _usd(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.usd import write_usd
-
     write_usd(path, exported, frame=options.frame)
 
 
@@ -108,8 +107,6 @@ def _ply(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.line_set import write_line_set
-
     write_line_set(path, exported, frame=options.frame)
 
 
@@ -139,8 +136,6 @@ def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _scan2cad(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.scan2cad import write_scan2cad
-
     write_scan2cad(
         path,
         exported,
@@ -151,8 +146,6 @@ def _scan2cad(path: Path, exported: AlignedObject, options: ExportOptions) -> No
 
 
 def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.camera_files import write_nerf
-
     placed = _camera_views(exported, options)
     names = [
         written_path(each.image, folder=path.parent) if isinstance(each.image, Path) else view.name
@@ -162,26 +155,18 @@ def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _colmap(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.camera_files import write_colmap
-
     write_colmap(path, _camera_views(exported, options))
 
 
 def _open3d(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.camera_files import write_open3d
-
     write_open3d(path, _camera_views(exported, options))
 
 
 def _coco(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.coco import write_coco
-
     write_coco(path, exported)
 
 
 def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[CameraView]:
-    from cadalign.export.camera_files import CameraView
-
     views = []
     for number, view in enumerate(exported.views):
         frame_from_cam = exported.frame_from_cam(options.frame, number)

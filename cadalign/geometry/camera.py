@@ -12,9 +12,11 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
-from cadalign.geometry.camera_form import PixelOrigin, read_form, read_matrix, write_form
-from cadalign.geometry.distortion import distort, undistort
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.camera_form import read_form, read_matrix, write_form
+from cadalign.geometry.distortion import distort, perspective, undistort
+from cadalign.geometry.pixels import PixelOrigin
+from cadalign.notebook.axes import photo_axes
+from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -355,9 +357,6 @@ class Camera:
         return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=1))
 
     def _repr_html_(self) -> str:
-        from cadalign.geometry.plots import plot_photo
-        from cadalign.notebook.html import card, draw_picture
-
         focal, angle = "unknown", "unknown"
         if self.focal_known:
             angles = np.degrees(2 * np.arctan(0.5 * np.array([self.width, self.height])
@@ -373,7 +372,7 @@ class Camera:
         ]
 
         def draw(axes: Axes) -> None:
-            plot_photo(self, axes=axes)
+            photo_axes(self.width, self.height, axes=axes)
             axes.axvline((self.width - 1) / 2, color="0.7", linewidth=0.8)
             axes.axhline((self.height - 1) / 2, color="0.7", linewidth=0.8)
             axes.plot(self.cx, self.cy, "+", color="#f03232", markersize=14, markeredgewidth=2)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import as_floats, is_number
 from cadalign.errors import InputError, quote
-from cadalign.geometry.conventions import PIXEL_CENTRE
-
-PixelOrigin = Literal["center", "corner"]
-"""Place of pixel (0, 0): the centre of the top-left pixel, or the image's top-left corner."""
+from cadalign.geometry.pixels import PixelOrigin, shift_of
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
 COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
@@ -41,17 +38,6 @@ class CameraForm(NamedTuple):
     distortion: tuple[float, ...] = ()
     matrix: Any = None
     pixel_origin: PixelOrigin = "center"
-
-
-def shift_of(pixel_origin: object, *, where: str = "pixel_origin") -> float:
-    """Coordinates of the top-left pixel's centre under a convention [px]: 0 or 0.5."""
-    if not isinstance(pixel_origin, str) or pixel_origin not in get_args(PixelOrigin):
-        raise InputError(
-            f"{quote(pixel_origin)} is not a place of pixel (0, 0)",
-            where=where,
-            fix='give "center" (of the top-left pixel) or "corner" (of the image)',
-        )
-    return PIXEL_CENTRE if pixel_origin == "corner" else 0.0
 
 
 def write_form(

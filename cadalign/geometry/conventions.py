@@ -2,41 +2,35 @@
 
 OpenGL's camera (also NeRF's and Bundler's) looks along -z with y up, where cadalign's looks along
 +z with y down. Its image begins at the border of the corner pixel, as COLMAP's does, where
-cadalign's begins at the pixel's centre.
+cadalign's begins at the pixel's centre, `PIXEL_CENTRE` from there in x and y.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 
-if TYPE_CHECKING:
-    from cadalign.geometry.alignment import Alignment
-    from cadalign.geometry.camera import Camera
-
-PIXEL_CENTRE = 0.5
-"""The centre of the top-left pixel, in x and y, in OpenGL, COLMAP and NeRF programs."""
+__all__ = [
+    "OPENGL_AXES",
+    "PIXEL_CENTRE",
+    "alignment_from_opengl",
+    "opengl_from_model",
+    "opengl_projection",
+    "rescaled_pixels",
+    "resized_camera",
+]
 
 OPENGL_AXES = np.array([1.0, -1.0, -1.0])
 """Signs of OpenGL's camera axes in cadalign's: multiply coordinates (n, 3) to go either way."""
 
 _FLIP = np.diag([*OPENGL_AXES, 1.0])
-
-
-def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArray:
-    """Pixels (n, 2) in an image ``factor`` times as large: borders, not centres, stay in place.
-
-    Examples
-    --------
-    >>> rescaled_pixels(np.array([[0.0, 9.5]]), 2).tolist()
-    [[0.5, 19.5]]
-    """
-    return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -74,8 +68,6 @@ def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
     InputError
         If the matrix is not a rotation and a translation.
     """
-    from cadalign.geometry.alignment import Alignment
-
     matrix = _FLIP @ opengl_from_world
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise InputError("the last row is not (0, 0, 0, 1)", where="transform")

@@ -1,4 +1,4 @@
-"""OpenCV's lens model on normalised image coordinates, and its inverse."""
+"""Normalised image coordinates: perspective, and OpenCV's lens model with its inverse."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
+
+
+def perspective(points_cam: FloatArray) -> FloatArray:
+    """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
+    return points_cam[:, :2] / points_cam[:, 2:]
 
 
 def distort(

@@ -8,17 +8,16 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.notebook.axes import photo_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LONGEST_SIDE = 480  # of the grid of rays through a drawn model
-_GREY = 0.9
 _MODEL_COLOR = (0.94, 0.2, 0.2)
 _MODEL_OPACITY = 0.45
 _BOX_COLOR = "#f03232"
@@ -35,22 +34,7 @@ def plot_photo(
     InputError
         If the photo is not of the camera's size.
     """
-    if axes is None:
-        from matplotlib import pyplot
-
-        axes = pyplot.subplots(figsize=(8, 8 * camera.height / camera.width))[1]
-    pixels = np.full((1, 1, 3), _GREY) if image is None else np.asarray(image)
-    if image is not None and pixels.shape[:2] != (camera.height, camera.width):
-        raise InputError(
-            f"shape {pixels.shape}, but the camera has {camera.width} x {camera.height} pixels",
-            where="image",
-            fix="give the photo of this camera",
-        )
-    axes.imshow(pixels, cmap="gray", extent=_extent(camera), interpolation="antialiased")
-    axes.set_xlim(-0.5, camera.width - 0.5)
-    axes.set_ylim(camera.height - 0.5, -0.5)
-    axes.set_axis_off()
-    return axes
+    return photo_axes(camera.width, camera.height, image, axes=axes)
 
 
 def plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> None:

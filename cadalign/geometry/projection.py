@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.distortion import perspective
 
-if TYPE_CHECKING:
-    from cadalign.geometry.camera import Camera  # which imports this module
-
-
-def perspective(points_cam: FloatArray) -> FloatArray:
-    """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
-    return points_cam[:, :2] / points_cam[:, 2:]
+__all__ = ["model_rays", "perspective", "projected_covariances"]
 
 
 def projected_covariances(
@@ -33,7 +27,6 @@ def projected_covariances(
 
     Examples
     --------
-    >>> from cadalign.geometry.camera import Camera
     >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
     >>> projected_covariances(np.array([[0.0, 0.0, 5.0]]), np.eye(3)[None], camera).tolist()
     [[[10000.0, 0.0], [0.0, 10000.0]]]

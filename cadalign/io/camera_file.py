@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.camera_form import PixelOrigin
+from cadalign.geometry.pixels import PixelOrigin
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.files import reading
 

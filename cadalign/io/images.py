@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import DataError, brief
+from cadalign.geometry.camera import Camera
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-    from cadalign.geometry.camera import Camera
 
 ByteImage = npt.NDArray[np.uint8]
 JPEG_ENDING = ".jpg"

@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.camera_form import PixelOrigin, shift_of
+from cadalign.geometry.pixels import PixelOrigin, shift_of
 from cadalign.io.documents import (
     Document,
     Finite,
@@ -39,7 +39,7 @@ _Row4 = tuple[Finite, Finite, Finite, Finite]
 _PATHS = ("mask", "depth")
 
 
-class Keypoint(Labelled, kw_only=True):
+class KeypointFields(Labelled, kw_only=True):
     """One entry of ``keypoints``."""
 
     xyz: Point3
@@ -111,13 +111,13 @@ class _ImageFields(Document, kw_only=True):
 class ViewFields(_ImageFields, kw_only=True):
     """One entry of ``views``."""
 
-    keypoints: list[Keypoint] = msgspec.field(default_factory=list)
+    keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
 
 class OneView(_ImageFields, kw_only=True):
     """A file of one image."""
 
-    keypoints: Annotated[list[Keypoint], Meta(min_length=1)]
+    keypoints: Annotated[list[KeypointFields], Meta(min_length=1)]
     model: PathText | None = None
     shape: PathText | None = None
     size: SizeFields | None = None
@@ -130,7 +130,7 @@ class OneView(_ImageFields, kw_only=True):
 class StartedView(OneView, kw_only=True):
     """A file of one image with a start, which needs no keypoints."""
 
-    keypoints: list[Keypoint] = msgspec.field(default_factory=list)
+    keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
 
 class SeveralViews(Document, kw_only=True):
@@ -282,7 +282,7 @@ def fill_xyz(data: Any) -> Any:
     return {**data, "keypoints": filled}
 
 
-def _column(keypoints: Sequence[Keypoint], name: str) -> Any:
+def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
     """One optional field of all keypoints as a list; None where none has it."""
     values = [getattr(keypoint, name) for keypoint in keypoints]
     missing = [row for row, value in enumerate(values) if value is None]
@@ -297,7 +297,7 @@ def _column(keypoints: Sequence[Keypoint], name: str) -> Any:
     return values
 
 
-def _depths(keypoints: Sequence[Keypoint]) -> FloatArray | None:
+def _depths(keypoints: Sequence[KeypointFields]) -> FloatArray | None:
     """Depths of the keypoints, NaN where unknown; None where all are."""
     depths = [np.nan if each.depth is None else each.depth for each in keypoints]
     return np.array(depths) if np.isfinite(depths).any() else None

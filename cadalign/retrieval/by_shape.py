@@ -28,6 +28,7 @@ from functools import lru_cache
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.align import align
 from cadalign.estimation.result import Result
@@ -93,8 +94,6 @@ def shapes_by_category(
     InputError
         If there is none, a category is not in the library, or an option does not apply.
     """
-    from cadalign.datasets.models.categories import require_category
-
     for name, default in _INAPPLICABLE.items():
         if getattr(options, name) != default:
             fix = f"leave it at {default!r}, or rank without shape"

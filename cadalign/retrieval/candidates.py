@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
+from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
@@ -151,8 +152,6 @@ def _chosen_models(
     table: ModelTable, category: str | None, exclude: Collection[ModelKey]
 ) -> IntArray:
     """Select the rows of the models to compare, in the table's order."""
-    from cadalign.datasets.models.categories import require_category
-
     if not len(table):
         raise InputError("the library is empty", where="library")
     rows = np.arange(len(table))

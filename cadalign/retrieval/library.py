@@ -6,10 +6,11 @@ import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy.typing as npt
 
+from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.absence import none_probability
@@ -20,10 +21,7 @@ from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import make_matches, rank
-
-if TYPE_CHECKING:
-    from cadalign.datasets import KeypointNet
-    from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.model import ShapeModel
 
 logger = logging.getLogger("cadalign")
 

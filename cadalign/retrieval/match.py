@@ -12,6 +12,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.plots import plot_box, plot_keypoints, plot_photo
+from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,9 +95,6 @@ class Match:
         )
 
     def _repr_html_(self) -> str:
-        from cadalign.geometry.plots import plot_box, plot_keypoints, plot_photo
-        from cadalign.notebook.html import card, draw_picture
-
         scale = ", ".join(
             f"{axis} {value:.3g}" for axis, value in zip("xyz", self.alignment.scale, strict=True)
         )

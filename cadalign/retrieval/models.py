@@ -9,19 +9,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.mesh import Mesh
 from cadalign.retrieval.labelings import mirrored_labelings
-
-if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel, Circle, Symmetries
-    from cadalign.geometry.mesh import Mesh
 
 ModelKey = tuple[str, str]
 """Category name and model id."""
@@ -86,8 +84,6 @@ class LibraryModel:
 
         Raises DataError if the mesh cannot be read; see ``with_mesh``.
         """
-        from cadalign.datasets import load_mesh
-
         xyz = model.keypoints.xyz
         bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
         path = model.mesh_path if with_mesh else None
@@ -110,8 +106,6 @@ class LibraryModel:
 
     def load_mesh(self) -> Mesh:
         """Read the mesh; raises DataError if there is none or it cannot be read."""
-        from cadalign.datasets import load_mesh
-
         if self.mesh_path is None:
             raise DataError(
                 "the model has no mesh", where=f"{self.category}, model {self.model_id}"
@@ -268,7 +262,6 @@ def _row(model: LibraryModel) -> dict[str, Any]:
 
 def _symmetries_from(text: str, count: int) -> Symmetries:
     """Read a model's symmetries and check their rows of its ``count`` keypoints."""
-    from cadalign.datasets import Circle, RotationalSymmetry, Symmetries
 
     def read_circle(center: list[float], radius: float, normal: list[float]) -> Circle:
         return Circle(np.array(center), radius, np.array(normal))
@@ -293,8 +286,6 @@ def _symmetries_from(text: str, count: int) -> Symmetries:
 
 
 def _no_symmetries() -> Symmetries:
-    from cadalign.datasets import Symmetries
-
     return Symmetries()
 
 

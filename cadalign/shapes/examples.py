@@ -6,16 +6,14 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids
-
-if TYPE_CHECKING:
-    from cadalign.geometry.mesh import Mesh
 
 logger = logging.getLogger("cadalign")
 
@@ -68,7 +66,7 @@ class Example:
 
 
 class AnnotatedKeypoints(Protocol):
-    """Keypoints of an `AnnotatedModel`."""
+    """Keypoints of a `DatasetModel`."""
 
     @property
     def xyz(self) -> FloatArray: ...
@@ -76,7 +74,7 @@ class AnnotatedKeypoints(Protocol):
     def semantic_ids(self) -> IntArray: ...
 
 
-class AnnotatedModel(Protocol):
+class DatasetModel(Protocol):
     """A data set's model, such as `cadalign.datasets.AnnotatedModel`."""
 
     @property
@@ -96,7 +94,7 @@ class Dataset(Protocol):
 
 
 def examples_of(
-    models: Sequence[AnnotatedModel], *, meshes: bool, on_progress: Callable[[int, int], object]
+    models: Sequence[DatasetModel], *, meshes: bool, on_progress: Callable[[int, int], object]
 ) -> list[Example]:
     """Convert a data set's models; boxes are those of the meshes if at least half have one."""
     with_mesh = sum(model.mesh_path is not None for model in models)

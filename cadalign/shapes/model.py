@@ -1,4 +1,4 @@
-"""`cadalign.ShapeModel`: the shapes of a category as a mixture of Gaussians."""
+"""`cadalign.ShapeModel`: the shapes of a category as a mixture of ShapeGaussians."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
-    Gaussians,
     KeypointId,
     NearestShape,
     Reflection,
     ShapeComponent,
+    ShapeGaussians,
     TrainingShapes,
     check_axis,
     check_ids,
 )
+from cadalign.shapes.plots import shape_html
 from cadalign.shapes.reflections import symmetric_component
-from cadalign.shapes.shape_file import read_shape, write_shape
+from cadalign.shapes.shape_file import ShapeFields, read_shape, write_shape
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -169,7 +170,7 @@ class ShapeModel:
         category, up_axis, unit
             See `ShapeModel`.
         components : int, optional
-            Number of Gaussians.
+            Number of ShapeGaussians.
         modes : int, optional
             Number of modes of each.
         reflection : bool
@@ -392,7 +393,11 @@ class ShapeModel:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file atomically; raises DataError on failure."""
-        write_shape(path, self)
+        write_shape(path, self._values)
+
+    @property
+    def _values(self) -> ShapeFields:
+        return ShapeFields(**{name: getattr(self, name) for name in ShapeFields._fields})
 
     def __repr__(self) -> str:
         count = len(self.components)
@@ -401,9 +406,7 @@ class ShapeModel:
         return f"ShapeModel({self.category!r}, {text}{models})"
 
     def _repr_html_(self) -> str:
-        from cadalign.shapes.plots import shape_html
-
-        return shape_html(self)
+        return shape_html(self._values)
 
     @property
     def mean(self) -> FloatArray:
@@ -411,9 +414,9 @@ class ShapeModel:
         return np.asarray(sum(each.weight * each.mean for each in self.components))
 
     @cached_property
-    def gaussians(self) -> Gaussians:
+    def gaussians(self) -> ShapeGaussians:
         """The components as arrays, computed once."""
-        return Gaussians(
+        return ShapeGaussians(
             np.array([each.mean for each in self.components]),
             np.array([each.covariance for each in self.components]),
             np.array([each.weight for each in self.components]),

@@ -79,7 +79,7 @@ class ShapeComponent:
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
 
 
-class Gaussians(NamedTuple):
+class ShapeGaussians(NamedTuple):
     """A mixture's means (G, m + 2, 3), covariances (G, 3 (m + 2), 3 (m + 2)) and weights (G,)."""
 
     means: FloatArray

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -23,9 +23,6 @@ from cadalign.io.sealed import Seal
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent, TrainingShapes
-
-if TYPE_CHECKING:
-    from cadalign.shapes.model import ShapeModel
 
 SEAL = Seal(
     magic=b"cadalign shape\n\0",
@@ -117,7 +114,7 @@ class ShapeFields(NamedTuple):
     few_keypoints: FewKeypoints | None
 
 
-def write_shape(path: str | os.PathLike[str], model: ShapeModel) -> None:
+def write_shape(path: str | os.PathLike[str], model: ShapeFields) -> None:
     """Write a shape model's file atomically."""
     mirror, training, margins = model.reflection, model.training, model.box_margins
     few = model.few_keypoints

@@ -19,8 +19,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.dataset import PhotoDataset, read_each
 from cadalign.datasets.photos.objectron_files import (
-    Annotation,
     ArCamera,
+    ObjectronAnnotation,
     Sequence,
     WorldObject,
     read_sequence,
@@ -197,7 +197,7 @@ def _is_sequence(path: Path) -> bool:
 def _object(
     number: int, entry: Any, *, sequence: Sequence, camera: Camera, cam_from_world: Alignment
 ) -> PhotoObject:
-    annotation: Annotation = convert(entry, Annotation)
+    annotation: ObjectronAnnotation = convert(entry, ObjectronAnnotation)
     found = _find(sequence, annotation.object_id)
     world_from_model = Alignment(
         nearest_rotation(np.reshape(found.rotation, (3, 3)).astype(float)),
@@ -226,7 +226,7 @@ def _find(sequence: Sequence, object_id: int) -> WorldObject:
     raise InputError(f"there is no object {object_id}", where="object_id")
 
 
-def _keypoints(annotation: Annotation, camera: Camera) -> PhotoKeypoints:
+def _keypoints(annotation: ObjectronAnnotation, camera: Camera) -> PhotoKeypoints:
     if len(annotation.keypoints) != len(_NAMES):
         raise InputError(f"{len(annotation.keypoints)}, expected {len(_NAMES)}", where="keypoints")
     ordered = sorted(annotation.keypoints, key=lambda each: each.id)

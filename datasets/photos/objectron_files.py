@@ -62,17 +62,17 @@ class Point2D(ForeignDocument):
     y: Finite = 0.0
 
 
-class Keypoint(ForeignDocument):
+class ObjectronKeypoint(ForeignDocument):
     """One of the nine keypoints of a box: its centre, id 0, and its corners."""
 
     point_2d: Point2D
     id: int = 0
 
 
-class Annotation(ForeignDocument):
+class ObjectronAnnotation(ForeignDocument):
     """An object in a frame."""
 
-    keypoints: list[Keypoint]
+    keypoints: list[ObjectronKeypoint]
     object_id: int = 0
     visibility: Finite = 1.0
 
@@ -86,7 +86,7 @@ class ArCamera(ForeignDocument):
     view_matrix: _Sixteen
 
 
-class Frame(ForeignDocument):
+class ObjectronFrame(ForeignDocument):
     """A frame of the video."""
 
     camera: ArCamera
@@ -120,7 +120,7 @@ class Sequence:
     objects: tuple[Any, ...]
     frames: tuple[Any, ...]
 
-    def frame(self, number: int) -> Frame:
+    def frame(self, number: int) -> ObjectronFrame:
         """Decode a frame.
 
         Raises
@@ -129,7 +129,7 @@ class Sequence:
             If it is no valid frame.
         """
         where = f"frame_annotations[{number}]"
-        found: Frame = self._convert(self.frames[number], _FRAME, Frame, where)
+        found: ObjectronFrame = self._convert(self.frames[number], _FRAME, ObjectronFrame, where)
         return found
 
     def object(self, number: int) -> WorldObject:

@@ -13,6 +13,7 @@ from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
+from cadalign.render.opengl.mesh import gl_meshes
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
 
@@ -61,7 +62,7 @@ class GlStage:
         if self._shown is None or self._shown() is not scene:
             for node in self._nodes:
                 self.scene.remove_node(node)
-            self._nodes = tuple(self.scene.add(mesh) for mesh in scene.gl_meshes)
+            self._nodes = tuple(self.scene.add(mesh) for mesh in scene.derived(gl_meshes))
             self._shown = ref(scene)
         for node, drawn in zip(self._nodes, sides, strict=True):
             self.scene.set_pose(node, opengl_from_model(cam_from_model))

@@ -10,7 +10,7 @@ from cadalign.geometry.raycaster import FaceArray
 from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
 
 
-class Surface:
+class SurfaceColors:
     """The colours of a mesh, in linear light.
 
     Vertex colours, where there are any, take the place of the materials' plain colour; a texture

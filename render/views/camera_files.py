@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
 from cadalign.export.camera_files import (
     OPEN3D_TRAJECTORY,
@@ -79,9 +80,6 @@ def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     """Read cameras and poses from an Open3D or NeRF JSON file, or the folder of a COLMAP model."""
     path = Path(path)
     if path.is_dir():
-        # The loaders stand above this module, and are not needed for the other formats.
-        from cadalign.datasets.sfm.colmap import Colmap
-
         model = Colmap(path)
         images = (model[name] for name in model.ids)
         return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]

@@ -13,6 +13,7 @@ import pytest
 from support.annotating import Case, place_all, served
 
 from cadalign import Camera, Model, View
+from cadalign.annotate.actions import perform
 from cadalign.annotate.advice import Marked, rank
 from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
@@ -104,7 +105,7 @@ def test_revision_grows_with_every_change(case: Case) -> None:
     session = case.open()
     found = [place_all(session, case, count=4)["revision"]]
     for name in ("undo", "redo"):
-        session.act(0, {"do": name})
+        perform(session, 0, {"do": name})
         found.append(page_state(session, 0)["revision"])
     assert found == sorted(set(found))
 
@@ -137,7 +138,7 @@ def test_a_click_does_not_wait_for_it(case: Case, monkeypatch: pytest.MonkeyPatc
     def meanwhile(*given: object) -> tuple[Advice, ...]:
         # Another thread gets the lock, which is held by none.
         with ThreadPoolExecutor(1) as pool:
-            pool.submit(session.act, 0, {"do": "undo"}).result(timeout=20)
+            pool.submit(perform, session, 0, {"do": "undo"}).result(timeout=20)
         return ()
 
     monkeypatch.setattr("cadalign.annotate.page_state.rank", meanwhile)

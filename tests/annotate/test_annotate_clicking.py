@@ -11,10 +11,11 @@ import pytest
 from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.history_file import history_path
 from cadalign.annotate.image_corners import nearest_corner
 from cadalign.annotate.mirror import MirrorPlanes
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
@@ -42,7 +43,7 @@ def sphere() -> Mesh:
 
 
 def test_click_near_a_corner_snaps_to_it() -> None:
-    model = CadModel(cube())
+    model = ClickableModel(cube())
     eye = np.array([0.4, 0.3, 6.0])
     beside = np.array([0.97, 0.96, 1.0]) - eye
     plain = model.pick(eye, beside)
@@ -62,7 +63,7 @@ def test_click_near_a_corner_snaps_to_it() -> None:
 
 @pytest.mark.parametrize("radius", [0.985, 1.015])
 def test_click_near_the_silhouette_snaps_to_it(radius: float) -> None:
-    model = CadModel(sphere())
+    model = ClickableModel(sphere())
     eye = np.array([0, 0, 50.0])
     direction = np.array([radius * np.cos(0.3), radius * np.sin(0.3), 0]) - eye
     snapped = model.pick(eye, direction, snap=0.001)
@@ -85,17 +86,17 @@ def test_corner_of_a_photo_is_found_to_parts_of_a_pixel() -> None:
 
 def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
     session = case.open()
-    session.act(0, {"do": "place_uv", "uv": [200, 200], "snap": 60})
+    perform(session, 0, {"do": "place_uv", "uv": [200, 200], "snap": 60})
     (pair,) = session.photos[0].document.pairs
     assert pair.uv is not None
     assert pair.uv != (200, 200)
     u, v = pair.uv
-    session.act(0, {"do": "move", "pair": 1, "uv": [u + 1, v - 1], "snap": 3})
+    perform(session, 0, {"do": "move", "pair": 1, "uv": [u + 1, v - 1], "snap": 3})
     moved = session.photos[0].document.pairs[0].uv
     assert moved is not None
     np.testing.assert_allclose(moved, pair.uv, atol=1.5)
     empty = {"do": "place_uv", "uv": [3, 3], "snap": 2}
-    assert "No corner" in session.act(0, empty).message
+    assert "No corner" in perform(session, 0, empty).message
 
 
 # --- mirror images -----------------------------------------------------------------------------
@@ -103,17 +104,17 @@ def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
 
 def test_mirror_planes_are_those_of_the_surface() -> None:
     mesh = cube()
-    assert CadModel(mesh).mirror_planes.axes == (0, 2)
+    assert ClickableModel(mesh).mirror_planes.axes == (0, 2)
     vertices = mesh.vertices.copy()
     vertices[vertices[:, 2] > 0, 0] *= 0.5  # tapers to the front: left and right alone are alike
-    model = CadModel(Mesh(vertices, mesh.faces))
+    model = ClickableModel(Mesh(vertices, mesh.faces))
     assert model.mirror_planes.axes == (0,)
     image = model.mirrored([-0.5, 0.2, 1])
     assert image is not None
     np.testing.assert_allclose(image.xyz, [0.5, 0.2, 1], atol=1e-9)
     assert model.mirrored([0, 1, 0.3]) is None  # on the plane
     vertices[-1] += 0.6
-    lopsided = CadModel(Mesh(vertices, mesh.faces))
+    lopsided = ClickableModel(Mesh(vertices, mesh.faces))
     assert lopsided.mirror_planes.axes == ()
     flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     assert MirrorPlanes.of_mesh(flat, np.zeros(3), 1.0).axes == ()
@@ -126,15 +127,15 @@ def test_mirrored_pair_is_offered_until_it_is_there(case: Case) -> None:
     place(session, keypoint, [100, 100])
     (pair,) = page_state(session, 0)["pairs"]
     assert pair["mirrored"] is not None
-    session.act(0, {"do": "mirrored", "pair": 1})
+    perform(session, 0, {"do": "mirrored", "pair": 1})
     first, second = page_state(session, 0)["pairs"]
     assert second["uv"] is None
     np.testing.assert_allclose(second["xyz"], pair["mirrored"], atol=1e-9)
     assert first["mirrored"] is None
-    session.act(0, {"do": "place_uv", "uv": [100, 120]})  # completes the second
-    session.act(0, {"do": "place_uv", "uv": [120, 120]})
+    perform(session, 0, {"do": "place_uv", "uv": [100, 120]})  # completes the second
+    perform(session, 0, {"do": "place_uv", "uv": [120, 120]})
     with pytest.raises(CadalignError, match="no mirror image"):
-        session.act(0, {"do": "mirrored", "pair": 3})
+        perform(session, 0, {"do": "mirrored", "pair": 3})
 
 
 def aim(session: Session) -> dict[str, Any]:
@@ -153,7 +154,7 @@ def test_alignment_shows_where_a_model_point_is_expected(case: Case) -> None:
     session = case.open()
     place_all(session, case, count=6)
     keypoint, uv = case.clicks[6]
-    session.act(0, {"do": "place_keypoint", "keypoint": keypoint})
+    perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint})
     pair = page_state(session, 0)["pairs"][-1]
     assert pair["uv"] is None
     np.testing.assert_allclose(pair["expected"], uv, atol=12)
@@ -166,14 +167,14 @@ def test_model_point_is_moved_and_refused_where_another_pair_is(case: Case) -> N
     session = case.open()
     place_all(session, case, count=5)
     before = session.photos[0].document.pairs[0]
-    session.act(0, {"do": "repick", "pair": 1, **aim(session)})
+    perform(session, 0, {"do": "repick", "pair": 1, **aim(session)})
     moved = session.photos[0].document.pairs[0]
     assert moved.uv == before.uv
     assert moved.keypoint != before.keypoint
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     assert session.photos[0].document.pairs[0] == before
-    missed = session.act(
-        0, {"do": "repick", "pair": 1, "origin": [9, 9, 9], "direction": [1, 1, 1]}
+    missed = perform(
+        session, 0, {"do": "repick", "pair": 1, "origin": [9, 9, 9], "direction": [1, 1, 1]}
     )
     assert "missed" in missed.message
     assert session.photos[0].document.pairs[0] == before
@@ -188,11 +189,11 @@ def test_model_point_is_moved_and_refused_where_another_pair_is(case: Case) -> N
 def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
     session = case.open()
     place_all(session, case, count=5)
-    session.act(0, {"do": "pick", **aim(session)})
-    session.act(0, {"do": "delete", "pair": 6})
-    session.act(0, {"do": "delete", "pair": 2})
-    session.act(0, {"do": "move", "pair": 3, "uv": [50, 60]})
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "pick", **aim(session)})
+    perform(session, 0, {"do": "delete", "pair": 6})
+    perform(session, 0, {"do": "delete", "pair": 2})
+    perform(session, 0, {"do": "move", "pair": 3, "uv": [50, 60]})
+    perform(session, 0, {"do": "undo"})
     state = page_state(session, 0)
     numbers = [pair["position"] for pair in state["pairs"]]
     assert numbers == [1, 3, 4, 5]
@@ -202,15 +203,15 @@ def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
     assert json.dumps(restored["pairs"]) == json.dumps(state["pairs"])
     assert restored["can_undo"]
     assert restored["can_redo"]
-    again.act(0, {"do": "redo"})
+    perform(again, 0, {"do": "redo"})
     assert again.photos[0].document.pair(3).uv == (50, 60)
     for _ in range(3):
-        again.act(0, {"do": "undo"})
+        perform(again, 0, {"do": "undo"})
     assert [pair.number for pair in again.photos[0].document.pairs] == [1, 2, 3, 4, 5, 6]
     placed = again.registry[again.photos[0].document.pair(6).keypoint or 0]
     assert placed.xyz == session.registry[placed.semantic_id or 0].xyz
     while again.photos[0].history.can_undo:
-        again.act(0, {"do": "undo"})
+        perform(again, 0, {"do": "undo"})
     assert again.photos[0].document.pairs == ()
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.document import Document, FocalChoice, History, Pair
+from cadalign.annotate.document import AnnotationDocument, FocalChoice, History, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 
-EMPTY = Document()
+EMPTY = AnnotationDocument()
 
 
 def test_either_half_may_come_first() -> None:
@@ -74,7 +74,7 @@ def test_unknown_pair_is_refused() -> None:
 EDITS = st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), max_size=25)
 
 
-def edited(document: Document, edit: int, which: int) -> Document:
+def edited(document: AnnotationDocument, edit: int, which: int) -> AnnotationDocument:
     """One of all kinds of edits, on one of the pairs if there are any."""
     numbers = [pair.number for pair in document.pairs]
     if edit == 0 or not numbers:

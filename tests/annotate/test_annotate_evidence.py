@@ -11,6 +11,7 @@ import pytest
 from support.annotating import Case, flat, place_all
 
 from cadalign import Size, Symmetry, View, align
+from cadalign.annotate.actions import perform
 from cadalign.annotate.alignment import LIKELY_STRETCH
 from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.page_state import page_state
@@ -96,8 +97,8 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
     before = stored(case)
     session = case.open(keypoints=None)
     state = session.photos[0]
-    session.act(0, {"do": "move", "pair": 1, "uv": [200, 200]})
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "move", "pair": 1, "uv": [200, 200]})
+    perform(session, 0, {"do": "undo"})
     after = stored(case)
     for data in (before, after):  # what the annotator adds to any file it saves
         data.pop("model", None)
@@ -132,7 +133,7 @@ def test_evidence_outlives_the_last_pair(case: Case) -> None:
     observed(case, "up", "size").save(case.observation)
     session = case.open()
     for pair in session.photos[0].document.pairs:
-        session.act(0, {"do": "delete", "pair": pair.number})
+        perform(session, 0, {"do": "delete", "pair": pair.number})
     again = case.open()
     assert stored(case)["up_sigma_deg"] == 2.0
     place_all(again, case, count=5)
@@ -150,7 +151,7 @@ def test_second_view_is_annotated_in_its_place(case: Case) -> None:
     assert isinstance(live, LiveShape)
     assert live.place == 1
     assert np.abs(live.residuals).max() < 10
-    session.act(0, {"do": "move", "pair": 1, "uv": [200, 200]})
+    perform(session, 0, {"do": "move", "pair": 1, "uv": [200, 200]})
     views = stored(case)["views"]
     assert views[1]["keypoints"][0]["uv"] == [200, 200]
     assert views[1]["image"] == "photo.png"
@@ -210,6 +211,6 @@ def test_unknown_focal_length_is_assumed_beside_evidence(case: Case) -> None:
     session = case.open(camera=None)
     shown = page_state(session, 0)["alignment"]
     assert any("focal length is assumed" in note for note in shown["notes"])
-    session.act(0, {"do": "focal", "known": True, "pixels": camera.fx})
+    perform(session, 0, {"do": "focal", "known": True, "pixels": camera.fx})
     assert "gravity" in page_state(session, 0)["alignment"]["also_used"]
     assert (case.folder / "photo_fit" / "fit.json").exists()

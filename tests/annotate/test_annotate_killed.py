@@ -10,6 +10,7 @@ import pytest
 from support.annotating import Case, place_all
 from support.killing import content, kill_at_random
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.document import Pair
 from cadalign.annotate.objects.unfinished import LeftOut
 from cadalign.annotate.page_state import page_state
@@ -56,7 +57,7 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
             path.unlink()
         session = case.open(prepared=False)
         place_all(session, case, count=4)
-        session.act(0, {"do": "place_uv", "uv": case.clicks[4][1]})
+        perform(session, 0, {"do": "place_uv", "uv": case.clicks[4][1]})
         before = content(page_state(session, 0))
         written[0] = 0
         with monkeypatch.context() as patched:
@@ -67,7 +68,7 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
                 )
             stopped = False
             try:
-                session.act(0, {"do": action, **arguments.get(action, {})})
+                perform(session, 0, {"do": action, **arguments.get(action, {})})
             except Stop:
                 stopped = True
         after = content(page_state(session, 0))

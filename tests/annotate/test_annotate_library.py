@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, expect
 from support.annotating import IDLE, Case, make_case, opened_page, place, place_all, served, wait
 from support.refusals import refusal_line
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.choosing.choice import ModelChoice, starting_model
 from cadalign.annotate.choosing.ranking import ranking_state
 from cadalign.annotate.choosing.switching import carry_keypoints
@@ -86,8 +87,8 @@ def test_ranking_is_that_of_the_command_on_the_saved_file(
 def test_points_that_the_library_lacks_do_not_count(case: Case, library: Path) -> None:
     session = opened(case, library)
     place_all(session, case, count=3)
-    session.act(0, {"do": "place_uv", "uv": [300, 200]})
-    session.act(0, {"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
+    perform(session, 0, {"do": "place_uv", "uv": [300, 200]})
+    perform(session, 0, {"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
     (clicked,) = session.photos[0].document.keypoints - dict(case.clicks[:3]).keys()
     choice = session.choice
     assert choice is not None
@@ -102,12 +103,12 @@ def test_points_that_the_library_lacks_do_not_count(case: Case, library: Path) -
 def test_switch_keeps_pairs_by_name_and_is_saved(case: Case, library: Path) -> None:
     session = opened(case, library)
     place_all(session, case, count=6)
-    session.act(0, {"do": "rename", "pair": 2, "name": "left knee"})
-    session.act(0, {"do": "place_uv", "uv": [300, 200]})
-    session.act(0, {"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
+    perform(session, 0, {"do": "rename", "pair": 2, "name": "left knee"})
+    perform(session, 0, {"do": "place_uv", "uv": [300, 200]})
+    perform(session, 0, {"do": "pick", "origin": [0.02, 3, 0.03], "direction": [0, -1, 0]})
     before = session.photos[0].document.pairs
     other = other_chair(library)
-    outcome = session.act(0, {"do": "model", "category": "chair", "model": "sample_chair_003"})
+    outcome = perform(session, 0, {"do": "model", "category": "chair", "model": "sample_chair_003"})
     pairs = session.photos[0].document.pairs
     registry = session.photos[0].model.registry
     on_both = {number for number, _ in registry}
@@ -132,7 +133,7 @@ def test_switch_keeps_pairs_by_name_and_is_saved(case: Case, library: Path) -> N
         assert xyz == shown.xyz[row].tolist()
 
     # Undo goes on with the new model, and a restart without MODEL finds it.
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     assert len(session.photos[0].document.keypoints) == sum(
         pair.keypoint is not None for pair in pairs
     )
@@ -173,9 +174,9 @@ def test_refusals_name_the_option(
     )
     session = opened(case, library)
     with pytest.raises(CadalignError, match="there is no model 'x' of 'chair'"):
-        session.act(0, {"do": "model", "category": "chair", "model": "x"})
+        perform(session, 0, {"do": "model", "category": "chair", "model": "x"})
     with pytest.raises(CadalignError, match="the session has no library"):
-        case.open().act(0, {"do": "model", "category": "chair", "model": "x"})
+        perform(case.open(), 0, {"do": "model", "category": "chair", "model": "x"})
 
 
 def test_thumbnails_show_the_models(case: Case, library: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 from support.annotating import Case, place
 from support.refusals import refusal_line, refusal_text
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.locks import WriterLocks
 from cadalign.annotate.opening import find_session_files, open_session
 from cadalign.annotate.options import SessionOptions
@@ -195,11 +196,11 @@ def test_removed_locks_are_taken_again_unless_another_was_faster(case: Case) -> 
             session = open_session(
                 SessionOptions(image=case.photo, model=case.model), before_saving=first.confirm
             )
-            session.act(0, {"do": "place_uv", "uv": [10, 20]})
+            perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
             trouble = page_state(session, 0)["saved"]["trouble"]
             assert "another annotator has it open" in trouble
             assert not case.observation.exists()
-        session.act(0, {"do": "place_uv", "uv": [30, 40]})
+        perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
         assert page_state(session, 0)["saved"]["trouble"] == ""
         assert case.observation.exists()
     assert not list(case.folder.glob(LOCK))
@@ -262,7 +263,7 @@ def test_renamed_photo_is_told_and_its_pairs_go_on(case: Case) -> None:
     assert state["saved"]["trouble"] == ""
     again = case.open(image=renamed, observation=case.observation)
     assert len(page_state(again, 0)["pairs"]) == 2
-    again.act(0, {"do": "delete", "pair": 2})
+    perform(again, 0, {"do": "delete", "pair": 2})
     assert Observation.load(case.observation).image == renamed
 
 
@@ -273,11 +274,11 @@ def test_tabs_share_one_annotation(case: Case) -> None:
     assert shown["pairs"] == []
     place(session, 0, [10, 20])
     place(session, 1, [30, 40])
-    session.act(0, {"do": "place_uv", "uv": [50, 60], "pair": None})
-    session.act(0, {"do": "delete", "pair": 2})
-    assert refusal_text(lambda: session.act(0, {"do": "move", "pair": 2, "uv": [1, 2]})) == (
+    perform(session, 0, {"do": "place_uv", "uv": [50, 60], "pair": None})
+    perform(session, 0, {"do": "delete", "pair": 2})
+    assert refusal_text(lambda: perform(session, 0, {"do": "move", "pair": 2, "uv": [1, 2]})) == (
         "pair: there is no pair 2; reload the page"
     )
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     pairs = page_state(case.open(), 0)["pairs"]
     assert [pair["uv"] for pair in pairs] == [(10, 20), (30, 40), (50, 60)]

@@ -10,6 +10,7 @@ import pytest
 from support.annotating import Case, flat, place_all
 
 from cadalign import Camera
+from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import MaskDrawing, Stroke, find_up
 from cadalign.annotate.masks import decode_runs, draw_mask, encode_runs
 from cadalign.annotate.page_state import page_state
@@ -79,19 +80,19 @@ def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture
     session = case.open()
     without = place_all(session, case, count=6)["alignment"]
     runs = encode_runs(true_mask(case))
-    session.act(0, {"do": "mask_load", "runs": list(runs)})
+    perform(session, 0, {"do": "mask_load", "runs": list(runs)})
     shown = agree_with_fit(session, case, capsys)
     assert shown["also_used"] == "mask"
     assert shown["alignment"] != without["alignment"]
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
     # A part is taken away and given back.
-    session.act(0, {"do": "mask_paint", "points": [[320, 240]], "radius": 20, "adds": False})
+    perform(session, 0, {"do": "mask_paint", "points": [[320, 240]], "radius": 20, "adds": False})
     assert not (read_grey(case.folder / "photo.mask.png") != 0)[240, 320]
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
     again = case.open(keypoints=None)
     assert page_state(again, 0)["alignment"]["alignment"] == shown["alignment"]
-    again.act(0, {"do": "undo"})  # the mask, in the session before
+    perform(again, 0, {"do": "undo"})  # the mask, in the session before
     assert page_state(again, 0)["alignment"]["also_used"] == ""
     assert "mask" not in json.loads(case.observation.read_text())
 
@@ -99,14 +100,14 @@ def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture
 def test_mask_of_a_file_is_painted_over_without_changing_it(case: Case) -> None:
     session = case.open()
     place_all(session, case, count=5)
-    session.act(0, {"do": "mask_load", "runs": list(encode_runs(true_mask(case)))})
+    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(true_mask(case)))})
     first = case.folder / "photo.mask.png"
     before = first.read_bytes()
     history = case.folder / "elsewhere"
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("XDG_STATE_HOME", str(history))  # without the undo history
         again = case.open(keypoints=None)
-        again.act(0, {"do": "mask_paint", "points": [[10, 10]], "radius": 5})
+        perform(again, 0, {"do": "mask_paint", "points": [[10, 10]], "radius": 5})
         assert first.read_bytes() == before
         assert json.loads(case.observation.read_text())["mask"] == "photo.mask-2.png"
         assert (read_grey(case.folder / "photo.mask-2.png") != 0)[10, 10]
@@ -124,7 +125,7 @@ def test_box_is_cut_out(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
         [float(columns.min() - 8), float(rows.min() - 8)],
         [float(columns.max() + 8), float(rows.max() + 8)],
     ]
-    session.act(0, {"do": "mask_cut", "corners": corners})
+    perform(session, 0, {"do": "mask_cut", "corners": corners})
     found = read_grey(case.folder / "photo.mask.png") != 0
     box = np.zeros_like(truth)
     box[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
@@ -132,17 +133,17 @@ def test_box_is_cut_out(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     assert overlap > max(0.75, plain + 0.1)
     agree_with_fit(session, case, capsys)
     with pytest.raises(CadalignError, match="too small"):
-        session.act(0, {"do": "mask_cut", "corners": [[1, 1], [2, 2]]})
+        perform(session, 0, {"do": "mask_cut", "corners": [[1, 1], [2, 2]]})
 
 
 def test_vertical_edges_tell_gravity(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     session = case.open()
     place_all(session, case, count=5)
     edges = inside(case, true_verticals(case))
-    assert "another" in session.act(0, {"do": "vertical", "ends": edges[0]}).message
+    assert "another" in perform(session, 0, {"do": "vertical", "ends": edges[0]}).message
     assert page_state(session, 0)["alignment"]["also_used"] == ""
     for edge in edges[1:]:
-        session.act(0, {"do": "vertical", "ends": edge})
+        perform(session, 0, {"do": "vertical", "ends": edge})
     shown = agree_with_fit(session, case, capsys)
     assert shown["also_used"] == "gravity"
     stored = json.loads(case.observation.read_text())
@@ -150,7 +151,7 @@ def test_vertical_edges_tell_gravity(case: Case, capsys: pytest.CaptureFixture[s
     assert np.degrees(np.arccos(np.clip(np.dot(stored["up"], wanted), -1, 1))) < 6
     again = case.open(keypoints=None)
     assert len(page_state(again, 0)["evidence"]["verticals"]) == 3
-    again.act(0, {"do": "gravity_clear"})
+    perform(again, 0, {"do": "gravity_clear"})
     assert "up" not in json.loads(case.observation.read_text())
 
 
@@ -178,12 +179,12 @@ def test_direction_and_deviation_of_vertical_edges() -> None:
 def test_known_length_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     session = case.open()
     place_all(session, case, count=6)
-    session.act(0, {"do": "lengths", "height": 0.91, "sigma": 0.01})
+    perform(session, 0, {"do": "lengths", "height": 0.91, "sigma": 0.01})
     assert agree_with_fit(session, case, capsys)["also_used"] == "known height"
     evidence = page_state(case.open(keypoints=None), 0)["evidence"]
     assert evidence["lengths"] == {"width": None, "height": 0.91, "length": None}
     assert evidence["length_sigma"] == 0.01
     with pytest.raises(CadalignError, match="is no length"):
-        session.act(0, {"do": "lengths", "width": -1})
-    session.act(0, {"do": "lengths"})
+        perform(session, 0, {"do": "lengths", "width": -1})
+    perform(session, 0, {"do": "lengths"})
     assert "size" not in json.loads(case.observation.read_text())

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.annotate.model import CadModel, display_bytes
+from cadalign.annotate.model import ClickableModel, display_bytes
 from cadalign.annotate.wireframe import Wireframe, box_lines
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
@@ -46,7 +46,7 @@ def box_mesh() -> Mesh:
 
 
 def test_pick_gives_point_face_and_barycentrics() -> None:
-    model = CadModel(Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]]))
+    model = ClickableModel(Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]]))
     point = model.pick([1.5, 0.5, 4.0], [0, 0, -2])
     assert point is not None
     np.testing.assert_allclose(point.xyz, [1.5, 0.5, 0], atol=1e-5)
@@ -57,13 +57,13 @@ def test_pick_gives_point_face_and_barycentrics() -> None:
 
 def test_pick_on_a_polygon_counts_its_first_triangle() -> None:
     mesh = Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]], polygon=np.array([7, 7]))
-    point = CadModel(mesh).pick([0.5, 1.5, 4.0], [0, 0, -1])
+    point = ClickableModel(mesh).pick([0.5, 1.5, 4.0], [0, 0, -1])
     assert point is not None
     assert point.face_index == 7
     rebuilt = mesh.surface_points([7], [point.barycentric])[0]
     np.testing.assert_allclose(rebuilt, point.xyz, atol=1e-9)
     bent = [*SQUARE[:3], [0, 2, 1]]
-    point = CadModel(Mesh(bent, [[0, 1, 2], [0, 2, 3]], polygon=np.array([7, 7]))).pick(
+    point = ClickableModel(Mesh(bent, [[0, 1, 2], [0, 2, 3]], polygon=np.array([7, 7]))).pick(
         [0.5, 1.5, 4.0], [0, 0, -1]
     )
     assert point is not None
@@ -75,7 +75,7 @@ def test_pick_on_a_polygon_counts_its_first_triangle() -> None:
 def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mesh = sphere(12, dent=0.2)
-    model = CadModel(mesh)
+    model = ClickableModel(mesh)
     origin = model.center + 6 * (lambda v: v / np.linalg.norm(v))(rng.normal(size=3))
     target = model.center + rng.uniform(-0.5, 0.5, 3)
     point = model.pick(origin, target - origin)
@@ -90,7 +90,7 @@ def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
 
 
 def test_rays_are_checked() -> None:
-    model = CadModel(Mesh(SQUARE, [[0, 1, 2]]))
+    model = ClickableModel(Mesh(SQUARE, [[0, 1, 2]]))
     with pytest.raises(InputError, match=r"^direction: the vector is zero$"):
         model.pick([0, 0, 1], [0, 0, 0])
     with pytest.raises(InputError, match=r"^origin: NaN or infinite"):
@@ -99,11 +99,11 @@ def test_rays_are_checked() -> None:
 
 def test_a_model_without_extent_is_refused() -> None:
     with pytest.raises(InputError, match=r"^dot: all vertices of the mesh coincide$"):
-        CadModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
+        ClickableModel(Mesh([[1, 1, 1]] * 3, [[0, 1, 2]], source="dot"))
 
 
 def test_display_coordinates_are_centred_with_diagonal_1() -> None:
-    model = CadModel(box_mesh())
+    model = ClickableModel(box_mesh())
     shown = model.to_display(model.scene.bounds)
     np.testing.assert_allclose(shown.sum(axis=0), 0, atol=1e-12)
     assert np.linalg.norm(shown[1] - shown[0]) == pytest.approx(1)
@@ -111,13 +111,13 @@ def test_display_coordinates_are_centred_with_diagonal_1() -> None:
 
 
 def test_samples_are_corners_far_from_each_other() -> None:
-    model = CadModel(box_mesh())
+    model = ClickableModel(box_mesh())
     assert len(model.samples) == 8
     for point in model.samples:
         assert point.face_index is not None
         rebuilt = model.scene.mesh.surface_points([point.face_index], [point.barycentric])
         np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-12)
-    assert len(CadModel(sphere(60)).samples) == 96
+    assert len(ClickableModel(sphere(60)).samples) == 96
 
 
 # --- what is shown ---------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def test_simplified_meshes_keep_to_the_limit_and_near_the_surface(limit: int) ->
 
 
 def test_display_bytes_hold_triangles_normals_and_colours() -> None:
-    model = CadModel(box_mesh())
+    model = ClickableModel(box_mesh())
     data = display_bytes(model)
     length = int.from_bytes(data[:4], "little")
     assert length % 4 == 0
@@ -163,7 +163,7 @@ def test_display_bytes_hold_triangles_normals_and_colours() -> None:
 def test_two_million_faces_are_shown_decimated_and_picked_exactly() -> None:
     mesh = sphere(1000, dent=0.1)
     assert len(mesh.faces) == 2_000_000
-    model = CadModel(mesh)
+    model = ClickableModel(mesh)
     data = display_bytes(model)
     length = int.from_bytes(data[:4], "little")
     header = json.loads(data[4 : 4 + length])
@@ -186,7 +186,7 @@ CAMERA = Camera.from_fov(640, 480, fov_x=50.0)
 
 
 def test_wireframe_shows_the_edges_that_are_seen() -> None:
-    model = CadModel(box_mesh())
+    model = ClickableModel(box_mesh())
     turn = np.array([[0.8, 0, 0.6], [0.36, 0.8, -0.48], [-0.48, 0.6, 0.64]])
     alignment = Alignment(turn, [0, -0.5, 9], [1, 1.2, 0.7])
     lines = Wireframe.of_model(model).seen_in(CAMERA, alignment)
@@ -202,7 +202,7 @@ def test_wireframe_shows_the_edges_that_are_seen() -> None:
 
 
 def test_wireframe_shows_the_outline_of_smooth_models() -> None:
-    model = CadModel(sphere(40))
+    model = ClickableModel(sphere(40))
     alignment = Alignment(np.eye(3), [-3, 1, 4], [1, 1, 1])  # the sphere's centre at depth 6
     lines = Wireframe.of_model(model).seen_in(CAMERA, alignment)
     assert len(lines) > 40
@@ -212,7 +212,7 @@ def test_wireframe_shows_the_outline_of_smooth_models() -> None:
 
 
 def test_lines_behind_the_camera_are_left_out() -> None:
-    model = CadModel(box_mesh())
+    model = ClickableModel(box_mesh())
     behind = Alignment(np.eye(3), [0, 0, -9], [1, 1, 1])
     assert Wireframe.of_model(model).seen_in(CAMERA, behind).shape == (0, 2, 2)
     assert box_lines(model.scene.bounds, CAMERA, behind).shape == (0, 2, 2)

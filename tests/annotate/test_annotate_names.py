@@ -12,6 +12,7 @@ import pytest
 from support.annotating import Case, place
 from support.refusals import refusal_text
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.names import file_name, observation_file, refuse_collisions
 from cadalign.annotate.opening import find_session_files
 from cadalign.annotate.options import SessionOptions
@@ -45,7 +46,7 @@ def test_every_photo_of_a_folder_keeps_its_own_pairs(case: Case) -> None:
     assert set(numbers) == set(AWKWARD)
     for k, name in enumerate(AWKWARD):
         place(session, 0, [10.0 + k, 20], image=numbers[name])
-        session.act(numbers[name], {"do": "place_uv", "uv": [10.0 + k, 40]})  # a half
+        perform(session, numbers[name], {"do": "place_uv", "uv": [10.0 + k, 40]})  # a half
     for again in (case.open(image=folder), *(case.open(image=photo) for photo in photos)):
         for k, state in enumerate(again.photos):
             (first, half) = page_state(again, k)["pairs"]
@@ -101,7 +102,7 @@ def test_file_of_an_earlier_session_is_found_under_its_name(case: Case, name: st
     earlier = write_observation(case.folder / f"{name}.json", case, photo)
     session = case.open(image=photo)
     assert len(page_state(session, 0)["pairs"]) == len(case.clicks)
-    session.act(0, {"do": "delete", "pair": 1})
+    perform(session, 0, {"do": "delete", "pair": 1})
     assert len(Observation.load(earlier).points_2d) == len(case.clicks) - 1
     other = case.open(image=photo.with_suffix(".png"))
     assert page_state(other, 0)["pairs"] == []

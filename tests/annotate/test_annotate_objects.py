@@ -12,6 +12,7 @@ import pytest
 import tyro
 from support.annotating import Case, fitted, flat
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.history_file import history_path
 from cadalign.annotate.locks import WriterLocks
@@ -30,8 +31,8 @@ pytestmark = pytest.mark.long
 def put(session: Session, case: Case, count: int, *, slot: int, shift: float = 0.0) -> None:
     """Place pairs of the chair, moved sideways in the photo."""
     for keypoint, (u, v) in case.clicks[:count]:
-        session.act(0, {"do": "place_uv", "uv": [u + shift, v]}, slot=slot)
-        session.act(0, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
+        perform(session, 0, {"do": "place_uv", "uv": [u + shift, v]}, slot=slot)
+        perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
 
 
 def labels(session: Session, slot: int | None = None) -> list[str]:
@@ -43,7 +44,7 @@ def two(case: Case) -> Session:
     """A session with six pairs of the photo's chair, and seven of another one beside it."""
     session = case.open()
     put(session, case, 6, slot=0)
-    session.act(0, {"do": "add_object", "name": " left  chair "})
+    perform(session, 0, {"do": "add_object", "name": " left  chair "})
     put(session, case, 7, slot=1, shift=8.0)
     return session
 
@@ -77,7 +78,7 @@ def test_the_boxes_of_all_objects_are_shown(two: Session) -> None:
 
 
 def test_objects_are_found_again_with_their_undo(two: Session, case: Case) -> None:
-    two.act(0, {"do": "rename_object", "name": "desk"}, slot=0)
+    perform(two, 0, {"do": "rename_object", "name": "desk"}, slot=0)
     again = case.open()
     assert labels(again) == ["desk", "left chair"]
     assert [len(state.document.pairs) for state in again.objects[0]] == [6, 7]
@@ -86,15 +87,15 @@ def test_objects_are_found_again_with_their_undo(two: Session, case: Case) -> No
     assert before is not None
     assert after is not None
     np.testing.assert_array_equal(before.covariance, after.covariance)
-    again.act(0, {"do": "undo"}, slot=1)
+    perform(again, 0, {"do": "undo"}, slot=1)
     assert len(again.objects[0][1].document.complete_pairs) == 6
-    again.act(0, {"do": "undo"}, slot=0)
+    perform(again, 0, {"do": "undo"}, slot=0)
     assert labels(again) == ["object 1", "left chair"]
 
 
 def test_masks_of_objects_are_apart_and_no_photos(two: Session, case: Case) -> None:
     square = [[100, 100], [200, 100], [200, 200], [100, 200]]
-    two.act(0, {"do": "mask_paint", "points": square}, slot=1)
+    perform(two, 0, {"do": "mask_paint", "points": square}, slot=1)
     assert (case.folder / "photo.object-2.mask.png").exists()
     assert not two.objects[0][0].document.evidence.mask
     session = case.open(image=case.folder)
@@ -103,7 +104,7 @@ def test_masks_of_objects_are_apart_and_no_photos(two: Session, case: Case) -> N
 
 def test_a_deleted_object_is_brought_back(two: Session, case: Case) -> None:
     files = [case.folder / "photo.object-2.json", case.folder / "photo.object-2_fit" / "fit.json"]
-    outcome = two.act(0, {"do": "delete_object"}, slot=1)
+    outcome = perform(two, 0, {"do": "delete_object"}, slot=1)
     assert outcome.message == "Deleted: left chair. Ctrl+Z brings it back."
     assert not any(path.exists() for path in files)
     assert not files[1].parent.exists()
@@ -111,39 +112,39 @@ def test_a_deleted_object_is_brought_back(two: Session, case: Case) -> None:
     state = page_state(two, 0, slot=1)  # of the object that is left
     assert state["image"]["object"] == 0
     assert state["deleted"] == "left chair"
-    outcome = two.act(0, {"do": "undo"}, slot=0)
+    outcome = perform(two, 0, {"do": "undo"}, slot=0)
     assert outcome.shown is two.objects[0][1]
     assert all(path.exists() for path in files)
 
-    two.act(0, {"do": "delete_object"}, slot=1)
-    two.act(0, {"do": "delete", "pair": 1}, slot=0)
-    two.act(0, {"do": "undo"}, slot=0)  # of the pair
+    perform(two, 0, {"do": "delete_object"}, slot=1)
+    perform(two, 0, {"do": "delete", "pair": 1}, slot=0)
+    perform(two, 0, {"do": "undo"}, slot=0)  # of the pair
     assert len(two.objects[0][0].document.pairs) == 6
     assert not files[0].exists()
-    two.act(0, {"do": "restore_object"}, slot=0)
+    perform(two, 0, {"do": "restore_object"}, slot=0)
     assert labels(two) == ["object 1", "left chair"]
     assert page_state(two, 0)["deleted"] is None
-    two.act(0, {"do": "redo"}, slot=1)
+    perform(two, 0, {"do": "redo"}, slot=1)
     assert labels(two) == ["object 1"]
-    two.act(0, {"do": "undo"}, slot=0)
+    perform(two, 0, {"do": "undo"}, slot=0)
     assert all(path.exists() for path in files)
 
 
 def test_the_first_object_is_deleted_like_others(two: Session, case: Case) -> None:
-    two.act(0, {"do": "delete_object"}, slot=0)
+    perform(two, 0, {"do": "delete_object"}, slot=0)
     assert labels(two) == ["left chair"]
     assert not case.observation.exists()
     assert labels(case.open()) == ["left chair"]
-    two.act(0, {"do": "delete_object"}, slot=1)
+    perform(two, 0, {"do": "delete_object"}, slot=1)
     assert labels(two) == ["object 1"]  # an empty one, to begin with
-    two.act(0, {"do": "undo"})
-    two.act(0, {"do": "undo"})
+    perform(two, 0, {"do": "undo"})
+    perform(two, 0, {"do": "undo"})
     assert labels(two) == ["object 1", "left chair"]
 
 
 def test_a_new_object_does_not_take_a_deleted_ones_place(two: Session) -> None:
-    two.act(0, {"do": "delete_object"}, slot=1)
-    outcome = two.act(0, {"do": "add_object"}, slot=0)
+    perform(two, 0, {"do": "delete_object"}, slot=1)
+    outcome = perform(two, 0, {"do": "add_object"}, slot=0)
     assert outcome.shown is not None
     assert outcome.shown.files.observation.name == "photo.object-3.json"
     assert labels(two) == ["object 1", "object 3"]
@@ -158,7 +159,7 @@ def test_objects_have_models_of_their_own(
     state = page_state(session, 0)
     assert len(state["models"]) == 2
     assert len(set(state["models"])) == 2
-    session.act(0, {"do": "add_object", "name": "copy", "model": 1})
+    perform(session, 0, {"do": "add_object", "name": "copy", "model": 1})
     shown = page_state(session, 0, slot=2)
     assert shown["image"]["model_number"] == 1
     model = session.objects[0][2].model
@@ -166,8 +167,8 @@ def test_objects_have_models_of_their_own(
         xyz = case.instance.points_3d[case.instance.semantic_ids.tolist().index(keypoint)]
         known = model.registry.find(xyz, tolerance=1e-3)
         number = known if known is not None else add_point(model, xyz)
-        session.act(0, {"do": "place_uv", "uv": uv}, slot=2)
-        session.act(0, {"do": "place_keypoint", "keypoint": number}, slot=2)
+        perform(session, 0, {"do": "place_uv", "uv": uv}, slot=2)
+        perform(session, 0, {"do": "place_keypoint", "keypoint": number}, slot=2)
     assert model.keypoints_path != session.keypoints_path
     assert model.keypoints_path.exists()
     page = session.live(session.objects[0][2])[0].shown
@@ -221,16 +222,16 @@ def test_impossible_changes_of_objects_are_refused(
     two: Session, action: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CadalignError, match=message):
-        two.act(0, action, slot=0)
+        perform(two, 0, action, slot=0)
     assert labels(two) == ["object 1", "left chair"]
 
 
 def test_changes_of_a_deleted_object_are_refused(two: Session) -> None:
-    two.act(0, {"do": "delete_object"}, slot=1)
+    perform(two, 0, {"do": "delete_object"}, slot=1)
     with pytest.raises(CadalignError, match="object: this object was deleted"):
-        two.act(0, {"do": "delete", "pair": 1}, slot=1)
+        perform(two, 0, {"do": "delete", "pair": 1}, slot=1)
     with pytest.raises(CadalignError, match="object: there is no object 8 in this photo"):
-        two.act(0, {"do": "delete", "pair": 1}, slot=7)
+        perform(two, 0, {"do": "delete", "pair": 1}, slot=7)
 
 
 def test_an_object_that_another_annotator_has_is_not_written(case: Case) -> None:
@@ -242,10 +243,10 @@ def test_an_object_that_another_annotator_has_is_not_written(case: Case) -> None
         WriterLocks([second], whole_folder=False, address="second"),
     ):
         session = open_session(options, files, before_saving=first.confirm, reserve=first.reserve)
-        session.act(0, {"do": "add_object"})
+        perform(session, 0, {"do": "add_object"})
         trouble = page_state(session, 0, slot=1)["saved"]["trouble"]
         assert "another annotator has it open: second" in trouble
-        session.act(0, {"do": "place_uv", "uv": [5, 5]}, slot=0)
+        perform(session, 0, {"do": "place_uv", "uv": [5, 5]}, slot=0)
         assert case.observation.exists()
     assert not second.exists()
 

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 from support.annotating import IDLE, Case, opened_page, place, place_of_pixel
 from support.annotating import wait as support_wait
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.session import Session
 from cadalign.io.observation import Observation
 
@@ -79,7 +80,7 @@ def test_objects_are_added_switched_renamed_and_deleted_by_mouse(
     expect(page.get_by_role("alert")).to_have_text("Mark the new object's points.")
     for keypoint, (u, v) in case.clicks[:5]:
         click(page, [u + 6, v])
-        session.act(0, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
+        perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
     page.reload()
     wait(page, IDLE)
     assert shown(page) == (0, 1)  # as the address has it
@@ -132,8 +133,8 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
     wait(page, IDLE + " && annotator.state.image.number === 1")
     assert page.url.endswith("#2.2")
     for keypoint, uv in case.clicks[:5]:
-        session.act(1, {"do": "place_uv", "uv": uv}, slot=1)
-        session.act(1, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
+        perform(session, 1, {"do": "place_uv", "uv": uv}, slot=1)
+        perform(session, 1, {"do": "place_keypoint", "keypoint": keypoint}, slot=1)
     page.reload()
     wait(page, IDLE)
     chips = page.get_by_role("group", name="Photos of this object").get_by_role("button")
@@ -149,7 +150,7 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
 
 
 def test_a_photo_is_taken_from_the_object(page: Page, session: Session) -> None:
-    session.act(0, {"do": "add_view", "photo": 1})
+    perform(session, 0, {"do": "add_view", "photo": 1})
     page.evaluate("annotator.goTo(1, 1)")
     wait(page, IDLE + " && annotator.state.image.number === 1")
     page.get_by_role("button", name="Objects…").click()
@@ -173,10 +174,10 @@ def test_another_model_is_shown_for_its_object(page: Page) -> None:
 
 
 def test_an_object_of_another_tab_that_was_deleted_is_refused(page: Page, session: Session) -> None:
-    session.act(0, {"do": "add_object", "name": "lamp"})
+    perform(session, 0, {"do": "add_object", "name": "lamp"})
     page.evaluate("annotator.goTo(0, 1)")
     wait(page, IDLE + " && annotator.state.image.object === 1")
-    session.act(0, {"do": "delete_object"}, slot=1)
+    perform(session, 0, {"do": "delete_object"}, slot=1)
     page.evaluate("annotator.act({ do: 'place_uv', uv: [10, 10], pair: null })")
     wait(page, "annotator.api.idle")
     expect(page.get_by_role("alert")).to_contain_text("this object was deleted")

@@ -16,6 +16,7 @@ from support.annotating import IDLE, Case, place_all, place_of_pixel, place_twen
 from support.timing import Yardstick, reference_seconds
 
 from cadalign import ShapeModel
+from cadalign.annotate.actions import perform
 from cadalign.annotate.guard import Access
 from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.session import Session
@@ -233,7 +234,7 @@ def test_tabs_of_one_photo_add_to_each_other_and_are_undone_apart(
     opened: tuple[Driver, Case, Access],
 ) -> None:
     first, _, access = opened
-    first.session.act(0, {"do": "place_uv", "uv": [100, 100]})
+    perform(first.session, 0, {"do": "place_uv", "uv": [100, 100]})
     second = Driver(first.page.context.new_page(), first.session)
     second.open(access)
     for tab, step in ((first, [1, 0]), (second, [0, 1])):
@@ -410,7 +411,7 @@ def test_outliers_save_errors_and_misses_are_shown(opened: tuple[Driver, Case, A
     page = driver.page
     place_all(driver.session, case, count=10)
     u, v = case.clicks[4][1]
-    driver.session.act(0, {"do": "move", "pair": 5, "uv": [u + 45, v]})
+    perform(driver.session, 0, {"do": "move", "pair": 5, "uv": [u + 45, v]})
     page.evaluate("annotator.api.refresh()")
     driver.wait_for_state(lambda state: len(state["pairs"]) == 10)
     row = page.locator("tr.wrong")
@@ -507,15 +508,15 @@ def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: 
         expect(page.get_by_text("Three pairs give the first alignment")).to_be_visible()
         known = [click for click in case.clicks if click[0] in ids[:-1]][:4]
         for keypoint, uv in known:
-            session.act(0, {"do": "place_uv", "uv": uv})
-            session.act(0, {"do": "place_keypoint", "keypoint": keypoint})
+            perform(session, 0, {"do": "place_uv", "uv": uv})
+            perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint})
         driver.open(access)
         state = driver.wait_for_state(lambda state: state["alignment"]["status"] == "done")
         assert state["alignment"]["regions"]
         expect(page.locator(".facts dt").first).to_have_text("Length along x")
         page.wait_for_timeout(200)
         assert page.evaluate(COUNT_COLOR, [255, 150, 225]) > 10
-        session.act(0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
+        perform(session, 0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
         driver.open(access)
         choice = page.get_by_label("Keypoint of chair that pair 5 is")
         choice.select_option(f"keypoint {ids[-1]}")

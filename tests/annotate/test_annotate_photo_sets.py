@@ -14,6 +14,7 @@ import pytest
 from support.annotating import Case, place, place_all, served
 
 import cadalign.datasets
+from cadalign.annotate.actions import perform
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.exporting import annotated_photos
 from cadalign.annotate.session import Session
@@ -49,7 +50,7 @@ def annotated(case: Case) -> Session:
     geometry = cast_geometry(session.model.scene, case.instance.camera, pose)
     runs = np.flatnonzero(np.diff(np.r_[0, geometry.mask.ravel().astype(int), 0]))
     lengths = np.diff(np.r_[0, runs, geometry.mask.size])
-    session.act(0, {"do": "mask_load", "runs": [int(each) for each in lengths if each >= 0]})
+    perform(session, 0, {"do": "mask_load", "runs": [int(each) for each in lengths if each >= 0]})
     return session
 
 
@@ -171,8 +172,8 @@ def test_skipped_and_unaligned_photos_are_no_part(case: Case) -> None:
     live, _ = session.live(session.photos[0])
     assert isinstance(live, LiveAlignment)
     assert len(annotated_photos(session)) == 1
-    session.act(0, {"do": "mark", "mark": "skipped"})
+    perform(session, 0, {"do": "mark", "mark": "skipped"})
     assert annotated_photos(session) == []
-    session.act(0, {"do": "mark"})
+    perform(session, 0, {"do": "mark"})
     place(session, *case.clicks[6])
     assert len(annotated_photos(session)) == 1

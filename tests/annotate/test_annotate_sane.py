@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Box, Camera
+from cadalign.annotate.actions import perform
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -183,8 +184,8 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
         session = opened(case, calibrated=True)
         state = session.photos[0]
         for count, (u, v) in enumerate(case.points_2d.tolist(), start=1):
-            session.act(0, {"do": "place_uv", "uv": [u, v]})
-            session.act(0, {"do": "place_keypoint", "keypoint": count - 1})
+            perform(session, 0, {"do": "place_uv", "uv": [u, v]})
+            perform(session, 0, {"do": "place_keypoint", "keypoint": count - 1})
             if count < 4:
                 continue
             live, _ = session.live(state)
@@ -217,8 +218,8 @@ def test_unknown_focal_length_is_saved_with_its_prior(
     for case in photographed(real_data / "real" / "kitti_cars", tmp_path):
         session = opened(case, calibrated=False)
         for keypoint, (u, v) in enumerate(case.points_2d[:7].tolist()):
-            session.act(0, {"do": "place_uv", "uv": [u, v]})
-            session.act(0, {"do": "place_keypoint", "keypoint": keypoint})
+            perform(session, 0, {"do": "place_uv", "uv": [u, v]})
+            perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint})
         live, _ = session.live(session.photos[0])
         assert isinstance(live, LiveAlignment)
         assert live.cautious is not None

@@ -12,6 +12,7 @@ from PIL import Image
 from support.annotating import Case
 
 from cadalign import Result
+from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.cli import main
 from cadalign.io.observation import Observation
@@ -55,8 +56,8 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     ).save(case.observation)
     session = case.open()
     if not calibrated:
-        session.act(0, {"do": "focal", "known": False})
-    session.act(0, {"do": "delete", "pair": 2})
+        perform(session, 0, {"do": "focal", "known": False})
+    perform(session, 0, {"do": "delete", "pair": 2})
     live, _ = session.live(session.photos[0])
     page = live.cautious
     assert page is not None
@@ -109,8 +110,8 @@ def test_options_follow_the_pairs(case: Case) -> None:
     )
     Observation(instance.points_3d, points_2d, instance.camera).save(case.observation)
     session = case.open()
-    session.act(0, {"do": "move", "pair": 1, "uv": [50, 60]})
+    perform(session, 0, {"do": "move", "pair": 1, "uv": [50, 60]})
     assert Observation.load(case.observation).fit_options == {"sigma": None}
     while len(session.photos[0].document.pairs) > 4:
-        session.act(0, {"do": "delete", "pair": session.photos[0].document.pairs[-1].number})
+        perform(session, 0, {"do": "delete", "pair": session.photos[0].document.pairs[-1].number})
     assert Observation.load(case.observation).fit_options == {}

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place_all, wait
 
-from cadalign.annotate.model import CadModel, detail_bytes
+from cadalign.annotate.model import ClickableModel, detail_bytes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.wireframe import Wireframe
@@ -155,7 +155,7 @@ def test_prior_is_changed_and_switched_off(opened: tuple[Page, Session], case: C
 def test_of_doubled_faces_each_shows_its_side() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 2, 3], [0, 1, 4]])
-    model = CadModel(Mesh(corners, faces))
+    model = ClickableModel(Mesh(corners, faces))
     displayed = model.displayed
     assert displayed.mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 1, 4]]
     assert displayed.is_doubled.tolist() == [True, False, True, False]

@@ -15,10 +15,11 @@ from support.annotating import Case, place, place_all, place_twenty
 from support.refusals import refusal_text
 
 from cadalign import Camera, Result, fit
+from cadalign.annotate.actions import perform
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.photos import Photo, find_photos
+from cadalign.annotate.photos import PhotoFile, find_photos
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
@@ -88,7 +89,7 @@ def test_every_change_is_on_disk_at_once_and_found_again(case: Case) -> None:
         {"do": "focal", "known": True, "pixels": 800},
     ]
     for action in actions:
-        session.act(0, action)
+        perform(session, 0, action)
         for keypoints in (case.keypoints, None):
             again = case.open(keypoints=keypoints)
             assert comparable(page_state(again, 0)) == comparable(page_state(session, 0)), action
@@ -97,20 +98,20 @@ def test_every_change_is_on_disk_at_once_and_found_again(case: Case) -> None:
 def test_unfinished_halves_have_a_file_of_their_own_while_there_are_any(case: Case) -> None:
     session = case.open()
     unfinished = case.folder / "photo.unfinished.json"
-    session.act(0, {"do": "place_uv", "uv": [10, 20]})
-    session.act(0, {"do": "place_uv", "uv": [30, 40]})
+    perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
+    perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
     assert json.loads(unfinished.read_text())["pairs"] == [{"uv": [10, 20]}, {"uv": [30, 40]}]
-    session.act(0, {"do": "place_keypoint", "keypoint": 0})
+    perform(session, 0, {"do": "place_keypoint", "keypoint": 0})
     assert json.loads(unfinished.read_text())["pairs"] == [{"uv": [30, 40]}]
-    session.act(0, {"do": "delete", "pair": 2})
+    perform(session, 0, {"do": "delete", "pair": 2})
     assert not unfinished.exists()
 
 
 def test_all_pairs_can_be_deleted_and_the_camera_stays(case: Case) -> None:
     session = case.open()
-    session.act(0, {"do": "place_uv", "uv": [10, 20]})
-    session.act(0, {"do": "focal", "known": True, "pixels": 700})
-    session.act(0, {"do": "delete", "pair": 1})
+    perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
+    perform(session, 0, {"do": "focal", "known": True, "pixels": 700})
+    perform(session, 0, {"do": "delete", "pair": 1})
     state = page_state(case.open(camera=None), 0)
     assert state["pairs"] == []
     assert state["focal"]["pixels"] == 700
@@ -122,7 +123,7 @@ def test_fit_file_goes_with_the_alignment(case: Case) -> None:
     file = case.folder / "photo_fit" / "fit.json"
     assert file.exists()
     for pair in (1, 2, 3):
-        session.act(0, {"do": "delete", "pair": pair})
+        perform(session, 0, {"do": "delete", "pair": pair})
     assert not file.exists()
 
 
@@ -131,7 +132,7 @@ def test_fit_file_waits_for_the_solvers(case: Case) -> None:
     file = case.folder / "photo_fit" / "fit.json"
     before = file.read_bytes()
     unready = open_session(SessionOptions(image=case.photo, model=case.model))
-    unready.act(0, {"do": "delete", "pair": 1})
+    perform(unready, 0, {"do": "delete", "pair": 1})
     assert file.read_bytes() == before
     unready.warm_up()
     state = page_state(unready, 0)
@@ -146,7 +147,7 @@ def test_fit_file_goes_when_ready_solvers_find_no_alignment(case: Case) -> None:
     file = case.folder / "photo_fit" / "fit.json"
     unready = open_session(SessionOptions(image=case.photo, model=case.model))
     for pair in (1, 2, 3):
-        unready.act(0, {"do": "delete", "pair": pair})
+        perform(unready, 0, {"do": "delete", "pair": pair})
     assert file.exists()
     unready.warm_up()
     assert not file.exists()
@@ -154,15 +155,15 @@ def test_fit_file_goes_when_ready_solvers_find_no_alignment(case: Case) -> None:
 
 def test_placed_points_are_written_with_face_and_barycentrics(case: Case) -> None:
     session = case.open(keypoints=None)
-    session.act(0, {"do": "pick", **FROM_ABOVE})
-    session.act(0, {"do": "rename", "pair": 1, "name": "seat"})
+    perform(session, 0, {"do": "pick", **FROM_ABOVE})
+    perform(session, 0, {"do": "rename", "pair": 1, "name": "seat"})
     written = ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json")
     (point,) = written.keypoints
     assert point.name == "seat"
     assert point.face_index is not None
     rebuilt = session.model.scene.mesh.surface_points([point.face_index], [point.barycentric])
     np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-9)
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     assert ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json").keypoints == ()
 
 
@@ -176,12 +177,12 @@ def test_errors_of_saving_are_shown_and_nothing_is_lost(
 
     with monkeypatch.context() as patched:
         patched.setattr("os.replace", full)
-        session.act(0, {"do": "place_uv", "uv": [10, 20]})
+        perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
     state = page_state(session, 0)
     assert "No space left on device" in state["saved"]["trouble"]
     assert len(state["pairs"]) == 1
     assert not list(case.folder.glob(".unfinished-*"))
-    session.act(0, {"do": "place_uv", "uv": [30, 40]})
+    perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
     assert page_state(session, 0)["saved"]["trouble"] == ""
     assert len(page_state(case.open(), 0)["pairs"]) == 2
 
@@ -202,8 +203,8 @@ def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     session = case.open()
     expected = fit(instance.points_3d, instance.points_2d, instance.camera, sigma=sigma)
     assert page_state(session, 0)["alignment"]["alignment"] == expected.alignment.to_dict()
-    session.act(0, {"do": "place_uv", "uv": [10, 20]})
-    session.act(0, {"do": "pick", **FROM_ABOVE})
+    perform(session, 0, {"do": "place_uv", "uv": [10, 20]})
+    perform(session, 0, {"do": "pick", **FROM_ABOVE})
     written = Observation.load(case.observation)
     assert written.sigma is not None
     assert written.names is not None
@@ -221,7 +222,7 @@ def test_suggested_point_becomes_the_pairs_model_half(case: Case) -> None:
     state = place_all(session, case, count=6)
     suggestion = state["suggestion"]
     assert suggestion["keypoint"] not in {pair["keypoint"] for pair in state["pairs"]}
-    outcome = session.act(0, {"do": "suggested"})
+    outcome = perform(session, 0, {"do": "suggested"})
     assert session.photos[0].document.pair(outcome.selected).keypoint == suggestion["keypoint"]
 
 
@@ -234,7 +235,7 @@ def test_corners_of_the_surface_are_suggested_where_no_keypoint_is_left(case: Ca
     assert suggestion is not None
     assert suggestion["keypoint"] is None
     before = len(session.registry)
-    session.act(0, {"do": "suggested"})
+    perform(session, 0, {"do": "suggested"})
     assert len(session.registry) == before + 1
 
 
@@ -248,17 +249,17 @@ def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> Non
     if not model.is_seen(model.from_display(front), xyz):
         pytest.skip("the keypoint is not seen from outside")
     ray = {"origin": front.tolist(), "direction": (-outwards).tolist(), "near": 0}
-    session.act(0, {"do": "pick", **ray})
+    perform(session, 0, {"do": "pick", **ray})
     assert session.photos[0].document.pairs[0].keypoint == 0
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     ray = {"origin": back.tolist(), "direction": outwards.tolist(), "near": 0}
-    session.act(0, {"do": "pick", **ray})
+    perform(session, 0, {"do": "pick", **ray})
     assert 0 not in session.photos[0].document.keypoints
 
 
 def test_click_beside_the_model_says_so_and_changes_nothing(case: Case) -> None:
     session = case.open()
-    outcome = session.act(0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
+    outcome = perform(session, 0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
     assert outcome.message == "That click missed the model."
     assert not session.photos[0].history.can_undo
 
@@ -310,22 +311,22 @@ def test_bad_actions_are_refused_and_change_nothing(
     session = open_session(
         SessionOptions(image=original.photo, model=original.model, keypoints=original.keypoints)
     )
-    assert refusal_text(lambda: session.act(0, action)).startswith(message)
+    assert refusal_text(lambda: perform(session, 0, action)).startswith(message)
     assert session.photos[0].document.pairs == ()
     assert not original.observation.exists()
 
 
 def test_unknown_photo_is_refused(original: Case) -> None:
     session = open_session(SessionOptions(image=original.photo, model=original.model))
-    assert refusal_text(lambda: session.act(1, {"do": "undo"})) == "image: there is no photo 2"
+    assert refusal_text(lambda: perform(session, 1, {"do": "undo"})) == "image: there is no photo 2"
     assert refusal_text(lambda: page_state(session, -1)) == "image: there is no photo 0"
 
 
 def test_name_needs_a_model_point(case: Case) -> None:
     session = case.open()
-    session.act(0, {"do": "place_uv", "uv": [1, 2]})
+    perform(session, 0, {"do": "place_uv", "uv": [1, 2]})
     act = {"do": "rename", "pair": 1, "name": "x"}
-    assert refusal_text(lambda: session.act(0, act)) == (
+    assert refusal_text(lambda: perform(session, 0, act)) == (
         "pair: this pair has no model point yet; click on the model first"
     )
 
@@ -354,13 +355,13 @@ def test_without_a_camera_the_focal_length_is_estimated_and_the_file_says_so(
 def test_focal_length_can_be_said_to_be_known_and_not(case: Case) -> None:
     session = case.open()
     known = place_all(session, case)
-    session.act(0, {"do": "focal", "known": False})
+    perform(session, 0, {"do": "focal", "known": False})
     estimated = page_state(session, 0)
     assert estimated["alignment"]["focal"] != known["alignment"]["focal"]
     assert case.open().photos[0].document.focal.known is False  # the file says so
-    session.act(0, {"do": "focal", "known": True})
+    perform(session, 0, {"do": "focal", "known": True})
     assert page_state(session, 0)["alignment"]["focal"] == case.instance.camera.fx
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     assert page_state(session, 0)["alignment"]["focal"] == estimated["alignment"]["focal"]
 
 
@@ -412,7 +413,7 @@ def test_exif_focal_length_of_zero_is_ignored(case: Case) -> None:
 def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> None:
     path = case.folder / "turned.jpg"
     exif_photo(path, orientation=orientation)
-    photo = Photo.open(path)
+    photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
     kind, data = photo.encoded()
     assert kind == "image/jpeg"
@@ -424,8 +425,8 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
     assert (orientation == 1) == (data == path.read_bytes())
     session = case.open(camera=None, image=path)
     place_keypoint = {"do": "place_keypoint", "keypoint": 0}
-    session.act(0, {"do": "place_uv", "uv": [390, 10]})
-    session.act(0, place_keypoint)
+    perform(session, 0, {"do": "place_uv", "uv": [390, 10]})
+    perform(session, 0, place_keypoint)
     camera = Observation.load(case.folder / "turned.json").camera
     assert (camera.width, camera.height) == (400, 300)
 
@@ -433,7 +434,7 @@ def test_photos_are_shown_and_measured_upright(case: Case, orientation: int) -> 
 def test_orientation_that_does_not_exist_is_ignored(case: Case) -> None:
     path = case.folder / "odd.jpg"
     exif_photo(path, orientation=99)
-    photo = Photo.open(path)
+    photo = PhotoFile.open(path)
     assert (photo.width, photo.height) == (400, 300)
     assert photo.encoded() == ("image/jpeg", path.read_bytes())
 
@@ -571,7 +572,7 @@ def test_annotations_of_a_namesake_are_refused_and_kept(case: Case) -> None:
 
 
 def test_halves_of_pairs_of_a_namesake_are_refused(case: Case) -> None:
-    case.open().act(0, {"do": "place_keypoint", "keypoint": 0})
+    perform(case.open(), 0, {"do": "place_keypoint", "keypoint": 0})
     (case.folder / "sample_chair_000.keypoints.json").unlink()
     other = namesake(case)
     assert refusal_text(lambda: case.open(model=other)).startswith(

@@ -13,6 +13,7 @@ import pytest
 from support.annotating import Case, place, place_all
 
 from cadalign import CadalignError, Result, ShapeModel
+from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.shape_alignment import LiveShape
@@ -89,7 +90,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     given = Observation(points, instance.points_2d[keep], instance.camera, sigma, ids)
     given.save(case.observation)
     session = case.open(**options_of(kind, shape_file))
-    session.act(0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
+    perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
     page = live_shape(session).shown
     assert page is not None
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
@@ -172,22 +173,22 @@ def test_points_of_the_model_can_be_identified(
 ) -> None:
     """A new point does not get an id of the shape by chance, but on demand, and is saved."""
     session = case.open(shape=shape_file)
-    session.act(0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
+    perform(session, 0, {"do": "pick", "origin": [0, 0.05, -3], "direction": [0, 0, 1]})
     (pair,) = page_state(session, 0)["pairs"]
     assert not pair["counts"]
     assert pair["keypoint"] > 77
     with pytest.raises(CadalignError, match="no keypoint of the shape"):
-        session.act(0, {"do": "identify", "pair": pair["pair"], "label": 99})
+        perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 99})
     with pytest.raises(CadalignError, match="has its keypoint 5 already"):
-        session.act(0, {"do": "identify", "pair": pair["pair"], "label": 5})
-    session.act(0, {"do": "identify", "pair": pair["pair"], "label": 77})
+        perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 5})
+    perform(session, 0, {"do": "identify", "pair": pair["pair"], "label": 77})
     state = page_state(session, 0)
     assert state["pairs"][0]["counts"]
     assert state["pairs"][0]["keypoint"] == 77
     assert state["shape"]["missing"] == []
     written = ModelKeypoints.load(session.keypoints_path)
     assert 77 in written.semantic_ids
-    session.act(0, {"do": "undo"})
+    perform(session, 0, {"do": "undo"})
     assert not page_state(session, 0)["pairs"][0]["counts"]
 
 
@@ -218,7 +219,7 @@ def test_assumed_focal_length_is_shown_and_not_saved(case: Case, shape_file: Pat
     assert "The focal length is assumed" in state["alignment"]["notes"][0]
     assert not (case.folder / "photo_fit/fit.json").exists()
     assert not Observation.load(case.observation).camera.focal_known
-    session.act(0, {"do": "focal", "known": True})
+    perform(session, 0, {"do": "focal", "known": True})
     assert (case.folder / "photo_fit/fit.json").exists()
     assert Observation.load(case.observation).camera.focal_known
 
@@ -230,7 +231,7 @@ def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:
     assert not [pair for pair in pairs if pair["off"] is not None]
     wrong = next(pair for pair in pairs[3:] if pair["counts"])
     u, v = wrong["uv"]
-    session.act(0, {"do": "move", "pair": wrong["pair"], "uv": [u - 60, v + 40]})
+    perform(session, 0, {"do": "move", "pair": wrong["pair"], "uv": [u - 60, v + 40]})
     off = {pair["pair"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]}
     assert list(off) == [wrong["pair"]]
     assert off[wrong["pair"]] == pytest.approx(72, abs=20)

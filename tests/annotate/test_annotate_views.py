@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.annotating import Case, fitted, flat
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.claims import Claims
 from cadalign.annotate.page_state import page_state
@@ -55,8 +56,8 @@ def put(
         if photo or off is not None:
             (seen,) = case.instance.camera.project(pose.apply([session.registry[keypoint].xyz]))
             place = (seen + rng.normal(scale=off or 1.0, size=2)).tolist()
-        session.act(photo, {"do": "place_uv", "uv": place}, slot=slot)
-        session.act(photo, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
+        perform(session, photo, {"do": "place_uv", "uv": place}, slot=slot)
+        perform(session, photo, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
 
 
 def opened(case: Case, **options: Any) -> Session:
@@ -72,7 +73,7 @@ def both(case: Case) -> Session:
     """A session with seven pairs in the first photo and six in the second."""
     session = opened(case)
     put(session, case, 7)
-    session.act(0, ADD)
+    perform(session, 0, ADD)
     put(session, case, 6, photo=1, slot=1)
     return session
 
@@ -125,7 +126,7 @@ def test_objects_photos_are_found_again(both: Session, case: Case) -> None:
         np.testing.assert_array_equal(found.shown.covariance, expected.shown.covariance)
         np.testing.assert_array_equal(found.residuals, expected.residuals)
     before = again.objects[1][1].document.pairs
-    again.act(1, {"do": "undo"}, slot=1)
+    perform(again, 1, {"do": "undo"}, slot=1)
     assert len(again.objects[1][1].document.complete_pairs) == len(before) - 1
 
 
@@ -133,19 +134,19 @@ def test_a_photo_with_few_pairs_does_not_count_yet(case: Case) -> None:
     session = opened(case)
     put(session, case, 7)
     alone, _ = session.live(session.photos[0])
-    outcome = session.act(0, ADD)
+    outcome = perform(session, 0, ADD)
     assert outcome.shown is session.objects[1][1]
     state = page_state(session, 1, outcome)
     assert state["alignment"]["message"] == "3 more pairs to the first alignment of this photo"
     assert isinstance(session.live(session.photos[0])[0], LiveAlignment)
     assert [len(view.points_2d) for view in Observation.load(case.observation).views] == [7]
     # Neither photo nor half a pair is lost.
-    session.act(1, {"do": "place_uv", "uv": [50, 60]}, slot=1)
+    perform(session, 1, {"do": "place_uv", "uv": [50, 60]}, slot=1)
     session = opened(case)
     (pair,) = session.objects[1][1].document.pairs
     assert pair.uv == (50, 60)
     assert session.objects[1][1].is_shown
-    session.act(1, {"do": "delete", "pair": pair.number}, slot=1)
+    perform(session, 1, {"do": "delete", "pair": pair.number}, slot=1)
     put(session, case, 2, photo=1, slot=1)
     state = page_state(session, 0)
     notes = state["alignment"]["notes"]
@@ -156,9 +157,9 @@ def test_a_photo_with_few_pairs_does_not_count_yet(case: Case) -> None:
 
 
 def test_what_is_the_objects_is_shared(both: Session, case: Case) -> None:
-    both.act(1, {"do": "lengths", "height": 0.8, "sigma": 0.01}, slot=1)
-    both.act(1, {"do": "prior", "stretch": 0.1}, slot=1)
-    both.act(1, {"do": "rename_object", "name": "chair"}, slot=1)
+    perform(both, 1, {"do": "lengths", "height": 0.8, "sigma": 0.01}, slot=1)
+    perform(both, 1, {"do": "prior", "stretch": 0.1}, slot=1)
+    perform(both, 1, {"do": "rename_object", "name": "chair"}, slot=1)
     for photo, slot in ((0, 0), (1, 1)):
         state = page_state(both, photo, slot=slot)
         assert state["evidence"]["lengths"]["height"] == 0.8
@@ -169,7 +170,7 @@ def test_what_is_the_objects_is_shared(both: Session, case: Case) -> None:
     assert data["object"] == "chair"
     assert data["size"]["height"] == 0.8
     assert data["fit"]["scale_prior_sigma"] == 0.1
-    outcome = both.act(0, {"do": "undo"})  # in whichever photo it was done
+    outcome = perform(both, 0, {"do": "undo"})  # in whichever photo it was done
     assert not outcome.message
     assert page_state(both, 1, slot=1)["objects"][0]["label"] == "object 1 of photo.png"
 
@@ -180,7 +181,7 @@ def test_a_mask_of_a_further_photo_is_its_own(
     corners = np.array([uv for _, uv in case.clicks])
     (u0, v0), (u1, v1) = corners.min(axis=0), corners.max(axis=0)
     square = [[u0, v0], [u1, v0], [u1, v1], [u0, v1]]
-    both.act(1, {"do": "mask_paint", "points": square}, slot=1)
+    perform(both, 1, {"do": "mask_paint", "points": square}, slot=1)
     assert (case.folder / "photo.right.mask.png").exists()
     views = Observation.load(case.observation).views
     assert [view.evidence.mask is not None for view in views] == [False, True]
@@ -195,47 +196,47 @@ def test_a_mask_of_a_further_photo_is_its_own(
 
 
 def test_a_photo_is_taken_from_the_object_and_brought_back(both: Session, case: Case) -> None:
-    outcome = both.act(1, {"do": "remove_view"}, slot=1)
+    outcome = perform(both, 1, {"do": "remove_view"}, slot=1)
     assert outcome.shown is both.objects[0][0]
     assert len(Observation.load(case.observation).views) == 1
     state = page_state(both, 1, slot=1)
     assert state["image"]["object"] == 0  # the photo's own, empty object
     assert [each["name"] for each in state["further_photos"]] == ["photo.png"]
-    both.act(0, {"do": "undo"})
+    perform(both, 0, {"do": "undo"})
     assert len(Observation.load(case.observation).views) == 2
     assert both.objects[1][1].is_shown
-    both.act(0, {"do": "redo"})
-    both.act(0, ADD)
+    perform(both, 0, {"do": "redo"})
+    perform(both, 0, ADD)
     assert len(both.objects[1]) == 2
     assert not both.objects[1][1].document.pairs
 
 
 def test_undoing_the_addition_leads_to_another_object(case: Case) -> None:
     session = opened(case)
-    session.act(0, ADD)
-    outcome = session.act(1, {"do": "undo"}, slot=1)
+    perform(session, 0, ADD)
+    outcome = perform(session, 1, {"do": "undo"}, slot=1)
     assert outcome.message == "This photo is no longer one of the object's."
     assert page_state(session, 1, outcome, slot=1)["image"]["object"] == 0
 
 
 def test_undoing_a_change_of_another_photo_says_so(both: Session) -> None:
     message = "That was a change in another photo of this object."
-    assert both.act(0, {"do": "undo"}).message == message
-    assert both.act(0, {"do": "redo"}).message == message
-    assert not both.act(1, {"do": "undo"}, slot=1).message
+    assert perform(both, 0, {"do": "undo"}).message == message
+    assert perform(both, 0, {"do": "redo"}).message == message
+    assert not perform(both, 1, {"do": "undo"}, slot=1).message
 
 
 def test_deleting_the_object_takes_it_from_all_photos(both: Session, case: Case) -> None:
-    both.act(1, {"do": "delete_object"}, slot=1)
+    perform(both, 1, {"do": "delete_object"}, slot=1)
     assert not case.observation.exists()
     assert page_state(both, 1)["image"]["object"] == 0
-    outcome = both.act(1, {"do": "undo"})
+    outcome = perform(both, 1, {"do": "undo"})
     assert outcome.shown is both.objects[0][0]
     assert len(Observation.load(case.observation).views) == 2
 
 
 def test_a_photo_of_an_object_can_have_objects_of_its_own(both: Session, case: Case) -> None:
-    both.act(1, {"do": "add_object", "name": "lamp"}, slot=1)
+    perform(both, 1, {"do": "add_object", "name": "lamp"}, slot=1)
     put(both, case, 5, photo=1, slot=2)
     assert (case.folder / "right.object-2.json").exists()
     again = opened(case)
@@ -248,15 +249,15 @@ def test_an_assumed_focal_length_of_one_photo_keeps_the_alignment_from_being_sav
 ) -> None:
     session = opened(case, camera=None)
     focal = {"do": "focal", "known": True, "pixels": case.instance.camera.fx}
-    session.act(0, focal)
+    perform(session, 0, focal)
     put(session, case, 7)
-    session.act(0, ADD)
-    session.act(1, {"do": "focal", "known": False}, slot=1)
+    perform(session, 0, ADD)
+    perform(session, 1, {"do": "focal", "known": False}, slot=1)
     put(session, case, 6, photo=1, slot=1)
     notes = page_state(session, 0)["alignment"]["notes"]
     assert notes[0].startswith("The focal length of right.png is assumed. Choose 'known' in that")
     assert not (case.folder / "photo_fit" / "fit.json").exists()
-    session.act(1, focal, slot=1)
+    perform(session, 1, focal, slot=1)
     assert (case.folder / "photo_fit" / "fit.json").exists()
 
 
@@ -274,7 +275,7 @@ def test_photos_beside_a_rig_are_refused(case: Case) -> None:
     first.save(case.observation)
     session = opened(case)
     with pytest.raises(CadalignError, match="the cameras of this object's photos are known"):
-        session.act(0, ADD)
+        perform(session, 0, ADD)
 
 
 def test_a_missing_further_photo_is_named(case: Case) -> None:
@@ -292,7 +293,7 @@ def test_one_writer_has_all_photos_of_an_object() -> None:
 
 def test_pairs_of_a_similar_model_are_taken_for_as_far_off_as_they_are(case: Case) -> None:
     session = opened(case)
-    session.act(0, ADD)
+    perform(session, 0, ADD)
     off = 8.0
     for photo in (0, 1):
         put(session, case, 7, photo=photo, slot=photo, off=off)
@@ -304,5 +305,5 @@ def test_pairs_of_a_similar_model_are_taken_for_as_far_off_as_they_are(case: Cas
     # What the file says of pairs that are gone does not hold for others.
     again = opened(case)
     for pair in again.objects[1][1].document.pairs[:4]:
-        again.act(1, {"do": "delete", "pair": pair.number}, slot=1)
+        perform(again, 1, {"do": "delete", "pair": pair.number}, slot=1)
     assert live(again, 0, 0).sigma != found.sigma

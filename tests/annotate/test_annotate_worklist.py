@@ -13,6 +13,7 @@ import trimesh
 from playwright.sync_api import Browser
 from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, wait
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
@@ -44,10 +45,10 @@ def test_photos_come_in_natural_order_with_states(case: Case) -> None:
     assert not (case.folder / FILE).exists()
     for keypoint, uv in case.clicks[:6]:
         place(session, keypoint, uv, image=3)
-    session.act(0, {"do": "mark", "mark": "done"})
-    session.act(1, {"do": "mark", "mark": "skipped"})
-    session.act(1, {"do": "mark"})
-    session.act(2, {"do": "mark", "mark": "skipped"})
+    perform(session, 0, {"do": "mark", "mark": "done"})
+    perform(session, 1, {"do": "mark", "mark": "skipped"})
+    perform(session, 1, {"do": "mark"})
+    perform(session, 2, {"do": "mark", "mark": "skipped"})
     again = worklist_state(case.open(image=case.folder))
     assert [each["state"] for each in again] == ["done", "to do", "skipped", "begun"]
     assert again[3]["pairs"] == 6
@@ -109,17 +110,17 @@ def test_detections_are_proposed_and_taken(case: Case) -> None:
     count = len(case.clicks)
     assert len(page_state(session, 1)["proposals"]) == count
     keypoint, (u, v) = case.clicks[2]
-    session.act(1, {"do": "accept", "keypoints": [keypoint]})
+    perform(session, 1, {"do": "accept", "keypoints": [keypoint]})
     (pair,) = photo.document.pairs
     assert (pair.keypoint, pair.uv) == (keypoint, (u + 1, v))
     assert len(page_state(session, 1)["proposals"]) == count - 1
-    session.act(1, {"do": "accept"})
+    perform(session, 1, {"do": "accept"})
     state = page_state(session, 1)
     assert state["proposals"] == []
     assert state["alignment"]["status"] == "done"
-    session.act(1, {"do": "undo"})  # all at once
+    perform(session, 1, {"do": "undo"})  # all at once
     assert len(photo.document.pairs) == 1
-    assert "Nothing is proposed" in session.act(0, {"do": "accept"}).message
+    assert "Nothing is proposed" in perform(session, 0, {"do": "accept"}).message
     file.write_text(json.dumps(detections(case, case.open(), ["elsewhere.png"], 1.0)))
     with pytest.raises(CadalignError, match="no keypoint of the model"):
         case.open(image=case.folder, detections=file)
@@ -133,7 +134,7 @@ def test_annotations_are_exported_as_coco_and_glb(
     for image in (0, 1):
         for keypoint, uv in case.clicks[image : 5 + image]:
             place(session, keypoint, uv, image=image)
-    session.act(2, {"do": "mark", "mark": "skipped"})
+    perform(session, 2, {"do": "mark", "mark": "skipped"})
     data = coco_of(session)
     assert [image["file_name"] for image in data["images"]] == ["other.png", "photo.png"]
     to = case.folder.parent / "all.json"
@@ -147,7 +148,7 @@ def test_annotations_are_exported_as_coco_and_glb(
 
     scene = trimesh.load(io.BytesIO(glb_of(session, 1)), file_type="glb")
     assert len(scene.geometry) > 0
-    session.act(1, {"do": "lengths", "height": 0.9, "sigma": 0.02})
+    perform(session, 1, {"do": "lengths", "height": 0.9, "sigma": 0.02})
     assert glb_of(session, 1)[:4] == b"glTF"
     with pytest.raises(CadalignError, match="no alignment yet"):
         glb_of(session, 2)

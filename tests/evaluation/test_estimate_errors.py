@@ -10,13 +10,13 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.errors import estimate_errors
 from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
-from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.rotations import rotation_from_vector
 
-NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
-HALF_TURN = SymmetryGroup(np.zeros(3), np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]))
+NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
+HALF_TURN = InstanceSymmetry(np.zeros(3), np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]))
 
 
 def alignment(rng: np.random.Generator) -> Alignment:

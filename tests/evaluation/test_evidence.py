@@ -14,7 +14,7 @@ from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
 from cadalign.evaluation.evidence.experiment import BOUNDS, EvidenceExperiment
 from cadalign.evaluation.evidence.methods import bound_of, evidence_for, truth_in
-from cadalign.evaluation.evidence.options import METHODS, EvidenceOptions
+from cadalign.evaluation.evidence.options import METHODS, EvidenceRunOptions
 from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
 from cadalign.evaluation.evidence.summary import summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -31,13 +31,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def car(root: Path) -> ObjectScene:
     (model,) = KeypointNet(root).subset(categories=["car"])
-    return make_scene(model, 0, EvidenceOptions(root, noise_px=0.0))
+    return make_scene(model, 0, EvidenceRunOptions(root, noise_px=0.0))
 
 
 @pytest.mark.long
 def test_scene_is_the_same_each_time(root: Path) -> None:
     (model,) = KeypointNet(root).subset(categories=["car"])
-    options = EvidenceOptions(root)
+    options = EvidenceRunOptions(root)
     first, again = (make_scene(model, 1, options) for _ in range(2))
     assert first.gt == again.gt
     assert first.height == again.height
@@ -62,7 +62,7 @@ def test_shots_without_noise_show_the_truth(car: ObjectScene) -> None:
 @pytest.mark.parametrize("method", QUICK)
 def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str) -> None:
     """Without noise the estimate is the truth, where its stated covariance is the bound."""
-    options = EvidenceOptions(root, noise_px=0.0)
+    options = EvidenceRunOptions(root, noise_px=0.0)
     given = evidence_for(method, car, options)
     result = align(car.model, given.views, size=given.size)
     bound = bound_of(result, given, car)
@@ -75,7 +75,7 @@ def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str
 
 @pytest.mark.long
 def test_every_method_gives_what_it_is_named_after(car: ObjectScene, root: Path) -> None:
-    options = EvidenceOptions(root)
+    options = EvidenceRunOptions(root)
     for method in METHODS:
         given = evidence_for(method, car, options)
         first = given.views[0]
@@ -124,7 +124,7 @@ def test_rows_have_errors_and_bounds(root: Path) -> None:
 
 
 def test_model_that_fails_gives_failed_rows(root: Path) -> None:
-    options = EvidenceOptions(root, methods=("keypoints", "depth"))
+    options = EvidenceRunOptions(root, methods=("keypoints", "depth"))
     experiment = EvidenceExperiment(options)
     (model,) = KeypointNet(root).subset(categories=["car"])
     from cadalign.evaluation.keypointnet.tasks import KeypointTask
@@ -150,4 +150,4 @@ def test_model_that_fails_gives_failed_rows(root: Path) -> None:
     ],
 )
 def test_invalid_options_are_refused(root: Path, options: dict, text: str) -> None:
-    assert refusal_text(lambda: EvidenceOptions(root, **options)).startswith(text)
+    assert refusal_text(lambda: EvidenceRunOptions(root, **options)).startswith(text)

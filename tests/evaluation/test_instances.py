@@ -16,7 +16,7 @@ from cadalign.evaluation.instances.instance import (
     Instance,
     make_hull_instances,
 )
-from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
@@ -105,7 +105,7 @@ def task(model_id: str = "a", view: int = 0) -> KeypointTask:
         view=view,
         hull=KeypointHull(cloud()),
         semantic_ids=np.arange(14),
-        symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+        symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
         model=None,
     )
 

@@ -11,7 +11,7 @@ from cadalign import Alignment
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
-from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry, symmetry_group
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import rotation_error, translation_error
 from cadalign.geometry.rotations import rotation_from_vector
@@ -40,7 +40,7 @@ def table() -> tuple[FloatArray, Symmetries]:
     return xyz, Symmetries(reflections=ring + upper)
 
 
-def errors(group: SymmetryGroup, est: Alignment, gt: Alignment) -> tuple[float, float]:
+def errors(group: InstanceSymmetry, est: Alignment, gt: Alignment) -> tuple[float, float]:
     truth = group.nearest_truth(est=est, gt=gt)
     return rotation_error(est=est, gt=truth), translation_error(est=est, gt=truth)
 
@@ -50,7 +50,7 @@ def some_truth(seed: int = 0) -> Alignment:
     return Alignment(random_rotation(rng), [0.3, -0.2, 4.0], [1.0, 0.6, 1.7])
 
 
-def turned(gt: Alignment, group: SymmetryGroup, rotation: FloatArray) -> Alignment:
+def turned(gt: Alignment, group: InstanceSymmetry, rotation: FloatArray) -> Alignment:
     """The alignment of the object turned about the group's centre."""
     shift = gt.rotation @ (group.center - rotation @ group.center)
     return Alignment(gt.rotation @ rotation, gt.translation + shift, gt.scale)

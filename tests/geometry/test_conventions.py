@@ -68,4 +68,4 @@ def test_no_other_module_writes_the_conversions_out() -> None:
         for path in (SOURCES / folder).rglob("*.py")
         if patterns.search(path.read_text(encoding="utf-8"))
     ]
-    assert {Path(name).name for name in found} == {"conventions.py"}, found
+    assert {Path(name).name for name in found} == {"conventions.py", "pixels.py"}, found

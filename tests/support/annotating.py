@@ -16,6 +16,7 @@ import pytest
 import uvicorn
 from playwright.sync_api import Browser, Page
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -108,8 +109,8 @@ def make_case(root: Path, folder: Path, *, model_id: str = "sample_chair_000") -
 
 def place(session: Session, keypoint: int, uv: list[float], *, image: int = 0) -> None:
     """Place both halves of a pair."""
-    session.act(image, {"do": "place_uv", "uv": uv})
-    session.act(image, {"do": "place_keypoint", "keypoint": keypoint})
+    perform(session, image, {"do": "place_uv", "uv": uv})
+    perform(session, image, {"do": "place_keypoint", "keypoint": keypoint})
 
 
 def place_all(session: Session, case: Case, *, count: int | None = None) -> dict[str, Any]:

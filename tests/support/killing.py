@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from cadalign.annotate.actions import perform
 from cadalign.annotate.history_file import history_path
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
@@ -175,7 +176,7 @@ class _Shadow:
 
     def act(self, action: dict[str, Any]) -> None:
         with suppress(CadalignError):
-            self._session.act(0, action)
+            perform(self._session, 0, action)
 
 
 def _draw(rng: np.random.Generator, state: dict[str, Any]) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from cadalign.annotate.choosing.choice import ModelChoice
 from cadalign.annotate.files import filled
+from cadalign.annotate.session import PhotoState, Session
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
@@ -18,9 +19,6 @@ from cadalign.render import RaycastRenderer, Scene
 from cadalign.render.views.viewpoints import frame_object, look_at
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.page import score_text
-
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
 
 LEAST_PAIRS = 4
 _THUMBNAIL = (180, 135)  # [px]

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from cadalign.annotate.action import Action, Outcome
-from cadalign.annotate.document import Document, FurtherView, History, Pair
+from cadalign.annotate.action import Action, ActionOutcome
+from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.objects.state import PhotoState
 from cadalign.annotate.objects.view_history import ViewHistory
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import Text
 from cadalign.retrieval.models import ModelKey
-
-if TYPE_CHECKING:
-    from cadalign.annotate.session import PhotoState, Session
 
 
 class ChooseModel(Action):
@@ -24,14 +22,14 @@ class ChooseModel(Action):
     category: Text
     model: Text
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         before = sum(pair.keypoint is not None for pair in state.document.pairs)
         switch_model(session, state, (self.category, self.model))
         lost = before - sum(pair.keypoint is not None for pair in state.document.pairs)
         if not lost:
-            return Outcome()
+            return ActionOutcome()
         pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
-        return Outcome(message=f"{pairs} no keypoint on this model: click on it.")
+        return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
 
 
 def switch_model(session: Session, state: PhotoState, key: ModelKey) -> None:
@@ -92,7 +90,7 @@ def _carried_history(history: History, carried: Mapping[int, int]) -> History:
     return moved
 
 
-def _carried(document: Document, carried: Mapping[int, int]) -> Document:
+def _carried(document: AnnotationDocument, carried: Mapping[int, int]) -> AnnotationDocument:
     """The document with its pairs' keypoints on the new model; halves without any are left out."""
     moved: list[Pair] = []
     for pair in document.pairs:

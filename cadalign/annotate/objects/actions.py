@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-from cadalign.annotate.action import Action, Outcome
-from cadalign.annotate.document import Document
-from cadalign.annotate.objects.adding import add_object, add_view
+from cadalign.annotate.action import Action, ActionOutcome
+from cadalign.annotate.alignment import LIKELY_STRETCH
+from cadalign.annotate.document import AnnotationDocument, History, Priors
+from cadalign.annotate.evidence import MarkedEvidence
+from cadalign.annotate.files import AnnotationFiles
+from cadalign.annotate.names import object_file, object_number
 from cadalign.annotate.objects.listing import label_of, shown_objects
+from cadalign.annotate.objects.models import OpenedModel
+from cadalign.annotate.objects.opening import new_view
+from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Index
-
-if TYPE_CHECKING:
-    from cadalign.annotate.objects.state import PhotoState
-    from cadalign.annotate.session import Session
 
 _LONGEST_NAME = 60
 
@@ -25,11 +27,11 @@ class AddObject(Action):
     name: str = ""
     model: Index | None = None
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         photo, _ = session.place_of(state)
         name = _free_name(self.name, session.objects[photo], None)
         model = state.model if self.model is None else session.models[self.model]
-        return Outcome(shown=add_object(session, photo, model, name))
+        return ActionOutcome(shown=_add_object(session, photo, model, name))
 
 
 class RenameObject(Action):
@@ -37,32 +39,34 @@ class RenameObject(Action):
 
     name: str
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         photo, _ = session.place_of(state)
         name = _free_name(self.name, session.objects[photo], state)
         state.history.record(replace(state.document, name=name))
-        return Outcome()
+        return ActionOutcome()
 
 
 class DeleteObject(Action):
     """Delete the object with its files; it can be brought back while the program runs."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         label, owner = label_of(state), state.owner
         kept = owner.document
-        empty = Document(focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True)
+        empty = AnnotationDocument(
+            focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True
+        )
         owner.history.record(empty)
         for view in (owner, *owner.views):
             view.drawn = None
         for each in (owner, *owner.views):
             session.deletions.add(session.place_of(each)[0], owner)
-        return Outcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
+        return ActionOutcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
 
 
 class RestoreObject(Action):
     """Bring back the object of the photo that was deleted last."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         deleted = session.deletions.last(session.place_of(state)[0])
         if deleted is None:
             raise InputError("no deleted object is left", where="restore", fix="add one")
@@ -74,7 +78,7 @@ class AddView(Action):
 
     photo: Index
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         target = session.photo_state(self.photo)
         if any(view.key == target.key for view in state.all_views):
             raise InputError(
@@ -88,13 +92,13 @@ class AddView(Action):
                 where="photo",
                 fix="write its camera pose into the observation",
             )
-        return Outcome(shown=add_view(session, state.owner, self.photo))
+        return ActionOutcome(shown=_add_view(session, state.owner, self.photo))
 
 
 class RemoveView(Action):
     """Take the photo from the object, with its pairs; undo brings it back."""
 
-    def apply(self, session: Session, state: PhotoState) -> Outcome:
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         if state.lead is None:
             raise InputError(
                 "the object's first photo cannot be taken from it",
@@ -102,7 +106,9 @@ class RemoveView(Action):
                 fix="delete the object, or take its other photos from it",
             )
         state.remove_view()
-        return Outcome(shown=state.owner, message=f"{state.photo.path.name} is no longer used.")
+        return ActionOutcome(
+            shown=state.owner, message=f"{state.photo.path.name} is no longer used."
+        )
 
 
 OBJECT_ACTIONS: dict[str, type[Action]] = {
@@ -116,10 +122,10 @@ OBJECT_ACTIONS: dict[str, type[Action]] = {
 """Actions by the name that the page sends as ``do``."""
 
 
-def bring_back(deleted: PhotoState) -> Outcome:
+def bring_back(deleted: PhotoState) -> ActionOutcome:
     """Undo the deletion of an object."""
     deleted.history.undo()
-    return Outcome(shown=deleted, message=f"Brought back: {label_of(deleted)}.")
+    return ActionOutcome(shown=deleted, message=f"Brought back: {label_of(deleted)}.")
 
 
 def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> str:
@@ -138,3 +144,49 @@ def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> s
             fix="choose another name",
         )
     return name
+
+
+def _add_object(session: Session, photo: int, model: OpenedModel, name: str) -> PhotoState:
+    """Add an object to the photo of a number; its camera is that of the photo's other objects."""
+    states = session.objects[photo]
+    like = states[0]
+    if session.shape is not None and session.shape.learned is not None and model is not like.model:
+        raise InputError(
+            "the shape is that of one category, with one model",
+            where="model",
+            fix="start without --shape for objects of several models",
+        )
+    first = like.files.observation
+    taken = {object_number(each.files.observation) for each in states if each.lead is None}
+    number = next(
+        number
+        for number in range(2, len(states) + 3)
+        if number not in taken and not object_file(first, number).exists()
+    )
+    priors = Priors(focal=like.intrinsics.prior)
+    if session.shape is None:
+        priors = Priors(LIKELY_STRETCH, like.intrinsics.likely_focal)
+    document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
+    files = AnnotationFiles(object_file(first, number), like.photo.path, model.path)
+    added = PhotoState(like.photo, files, like.intrinsics, History(document), model)
+    states.append(added)
+    return added
+
+
+def _add_view(session: Session, owner: PhotoState, photo: int) -> PhotoState:
+    """Add the photo of a number to an object, or one that was taken from it again."""
+    like = session.objects[photo][0]
+    view = next((each for each in owner.views if each.key == like.key), None)
+    if view is None:
+        view = new_view(owner, like.photo, like.intrinsics)
+        session.objects[photo].append(view)
+    shared = owner.document
+    view.history.record(
+        AnnotationDocument(
+            focal=like.document.focal,
+            priors=Priors(shared.priors.stretch, like.intrinsics.likely_focal),
+            evidence=MarkedEvidence(lengths=shared.evidence.lengths),
+            name=shared.name,
+        )
+    )
+    return view

@@ -7,26 +7,26 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cadalign.annotate.keypoint_registry import KeypointRegistry
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 
 
-class AnnotatedModel:
+class OpenedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to.
 
     Parameters
     ----------
     path : Path
         Of the mesh.
-    cad : CadModel
+    cad : ClickableModel
     registry : KeypointRegistry
     keypoints_path : Path
     """
 
     def __init__(
-        self, path: Path, cad: CadModel, registry: KeypointRegistry, keypoints_path: Path
+        self, path: Path, cad: ClickableModel, registry: KeypointRegistry, keypoints_path: Path
     ) -> None:
         self.path = path
         self.cad = cad
@@ -63,15 +63,15 @@ class Models:
     def __init__(
         self,
         paths: Sequence[Path],
-        opened: Callable[[Path, Sequence[AnnotatedModel]], AnnotatedModel],
+        opened: Callable[[Path, Sequence[OpenedModel]], OpenedModel],
     ) -> None:
         self.paths: list[Path] = []
         self._open = opened
-        self._models: dict[int, AnnotatedModel] = {}
+        self._models: dict[int, OpenedModel] = {}
         for path in paths:
             self.number_of(path)
 
-    def __getitem__(self, number: int) -> AnnotatedModel:
+    def __getitem__(self, number: int) -> OpenedModel:
         if not 0 <= number < len(self.paths):
             raise InputError(
                 f"there is no model {number}", where="model", fix="choose one of the list"
@@ -84,7 +84,7 @@ class Models:
         return len(self.paths)
 
     @property
-    def opened(self) -> tuple[AnnotatedModel, ...]:
+    def opened(self) -> tuple[OpenedModel, ...]:
         """The models that are open."""
         return tuple(self._models.values())
 

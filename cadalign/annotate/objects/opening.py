@@ -11,8 +11,8 @@ import numpy as np
 
 from cadalign.annotate.alignment import LIKELY_STRETCH
 from cadalign.annotate.choosing.choice import ModelChoice
-from cadalign.annotate.document import Document, FocalChoice, FurtherView, History, Priors
-from cadalign.annotate.evidence import Evidence, Lengths
+from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, History, Priors
+from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths
 from cadalign.annotate.files import (
     SAME_PLACE,
     AnnotationFiles,
@@ -22,14 +22,14 @@ from cadalign.annotate.files import (
 from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.history_file import history_path, read_history
 from cadalign.annotate.keypoint_registry import KeypointRegistry
-from cadalign.annotate.model import CadModel
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.objects.models import AnnotatedModel
+from cadalign.annotate.objects.models import OpenedModel
 from cadalign.annotate.objects.state import PhotoState
 from cadalign.annotate.objects.unfinished import LeftOut, StoredView
 from cadalign.annotate.objects.view_history import ViewHistory
-from cadalign.annotate.photos import Intrinsics, Photo, intrinsics_of
+from cadalign.annotate.photos import Intrinsics, PhotoFile, intrinsics_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
@@ -60,9 +60,9 @@ class ModelOpener:
     shape: ObjectShape | None
     choice: ModelChoice | None = None
 
-    def open(self, path: Path, opened: Sequence[AnnotatedModel]) -> AnnotatedModel:
+    def open(self, path: Path, opened: Sequence[OpenedModel]) -> OpenedModel:
         """Read a model, its given keypoints, and those of earlier sessions."""
-        cad = CadModel(load_mesh(path))
+        cad = ClickableModel(load_mesh(path))
         own = self._keypoints_path(path, opened)
         beside = keypoints_file(path, path.parent)
         source = beside if opened or self.keypoints is None else self.keypoints
@@ -78,9 +78,9 @@ class ModelOpener:
             earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
             refuse_other_model(earlier.model, path, where=own)
             registry.merge(earlier.keypoints, tolerance=SAME_PLACE * cad.diagonal)
-        return AnnotatedModel(path, cad, registry, own)
+        return OpenedModel(path, cad, registry, own)
 
-    def _keypoints_path(self, path: Path, opened: Sequence[AnnotatedModel]) -> Path:
+    def _keypoints_path(self, path: Path, opened: Sequence[OpenedModel]) -> Path:
         """The model's file of keypoints; with folders in its name where another model has it."""
         plain = keypoints_file(path, self.folder)
         if not opened and self.choice is None:
@@ -104,8 +104,8 @@ def _is_others(path: Path, model: Path) -> bool:
 
 def open_object(
     files: AnnotationFiles,
-    photo: Photo,
-    model: AnnotatedModel,
+    photo: PhotoFile,
+    model: OpenedModel,
     *,
     camera: Camera | None,
     shape: ObjectShape | None,
@@ -125,13 +125,13 @@ def open_object(
         likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
         priors = stored.priors_or(likely, exif=intrinsics.prior)
     further = with_options(stored.further)
-    evidence = Evidence.of(further)
+    evidence = MarkedEvidence.of(further)
     document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
     state = PhotoState(photo, files, intrinsics, History(document), model, further)
     for each in stored.views:
         document = _with_view(state, document, each)
 
-    def is_same(drawn: Evidence, view: str | None) -> bool:
+    def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
         found = next((each for each in state.views if each.key == view), state)
         return _is_same(drawn, found)
 
@@ -151,7 +151,7 @@ def open_object(
     return state
 
 
-def new_view(owner: PhotoState, photo: Photo, intrinsics: Intrinsics) -> PhotoState:
+def new_view(owner: PhotoState, photo: PhotoFile, intrinsics: Intrinsics) -> PhotoState:
     """The state of an object in a further photo, which its history does not have yet."""
     assert isinstance(owner.history, History)
     view = PhotoState(
@@ -168,7 +168,7 @@ def new_view(owner: PhotoState, photo: Photo, intrinsics: Intrinsics) -> PhotoSt
 
 
 def _intrinsics(
-    photo: Photo, own: Camera | None, given: Camera | None
+    photo: PhotoFile, own: Camera | None, given: Camera | None
 ) -> tuple[Intrinsics, FocalChoice]:
     """The camera of a photo: that of its observation, or else the given one."""
     if own is not None and not own.focal_known:
@@ -178,10 +178,12 @@ def _intrinsics(
     return intrinsics, FocalChoice(known=intrinsics.calibrated)
 
 
-def _with_view(owner: PhotoState, document: Document, stored: StoredView) -> Document:
+def _with_view(
+    owner: PhotoState, document: AnnotationDocument, stored: StoredView
+) -> AnnotationDocument:
     """The object's document with a further photo, of which the state is added to the owner's."""
     try:
-        photo = Photo.open(stored.image)
+        photo = PhotoFile.open(stored.image)
         intrinsics, focal = _intrinsics(photo, stored.camera, None)
     except CadalignError as error:
         logger.warning("%s: kept, but not opened: %s", owner.files.observation.name, error)
@@ -192,19 +194,19 @@ def _with_view(owner: PhotoState, document: Document, stored: StoredView) -> Doc
         stored.document,
         focal=focal,
         priors=Priors(document.priors.stretch, intrinsics.likely_focal),
-        evidence=replace(Evidence.of(view.further), lengths=document.evidence.lengths),
+        evidence=replace(MarkedEvidence.of(view.further), lengths=document.evidence.lengths),
     )
     return replace(document, further_views=(*document.further_views, FurtherView(view.key, own)))
 
 
-def _is_same(drawn: Evidence, state: PhotoState) -> bool:
+def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     """True if what was drawn is what an observation file has."""
     further = state.further
     mask = None if drawn.mask is None else state.mask_file(drawn.mask.base)
     ours = drawn.added_to(further, state.camera, mask if further.image.mask is not None else None)
     if (ours.image.mask, ours.image.mask_sigma) != (further.image.mask, further.image.mask_sigma):
         return False
-    if state.lead is None and Lengths.of(ours.size) != Lengths.of(further.size):
+    if state.lead is None and MarkedLengths.of(ours.size) != MarkedLengths.of(further.size):
         return False
     one, other = ours.image.up, further.image.up
     if one is None or other is None:

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.document import Document, History
+from cadalign.annotate.document import AnnotationDocument, History
 from cadalign.annotate.evidence import MaskDrawing
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.names import file_name, mask_file
-from cadalign.annotate.objects.models import AnnotatedModel
+from cadalign.annotate.objects.models import OpenedModel
 from cadalign.annotate.objects.unfinished import LeftOut
 from cadalign.annotate.objects.view_history import ViewHistory
-from cadalign.annotate.photos import Intrinsics, Photo
+from cadalign.annotate.photos import Intrinsics, PhotoFile
 from cadalign.annotate.proposals import Proposal
 from cadalign.annotate.shape_alignment import JointEstimate, LiveShape
 from cadalign.annotate.suggestion import Suggestion
@@ -32,11 +32,11 @@ class PhotoState:
     in the further ones, also where undoing took them back.
     """
 
-    photo: Photo
+    photo: PhotoFile
     files: AnnotationFiles
     intrinsics: Intrinsics
     history: History | ViewHistory
-    model: AnnotatedModel
+    model: OpenedModel
     further: FurtherEvidence = field(default_factory=FurtherEvidence)
     proposals: tuple[Proposal, ...] = ()  # of a detector
     lead: PhotoState | None = None
@@ -49,23 +49,25 @@ class PhotoState:
     """What the file beside the observation has."""
     fit_pending: bool = False
     """True if the alignment's file is still to be written, since the solvers were not ready."""
-    live: tuple[Document, Live, Suggestion | None] | None = field(default=None, repr=False)
+    live: tuple[AnnotationDocument, Live, Suggestion | None] | None = field(
+        default=None, repr=False
+    )
     """What was computed last, of that document of the object."""
-    joint: tuple[Document, JointEstimate] | None = field(default=None, repr=False)
+    joint: tuple[AnnotationDocument, JointEstimate] | None = field(default=None, repr=False)
     """The estimate from all photos that was computed last."""
 
     @property
-    def document(self) -> Document:
+    def document(self) -> AnnotationDocument:
         """The current annotation in this photo."""
         return self.history.document
 
     @property
-    def marked(self) -> Document:
+    def marked(self) -> AnnotationDocument:
         """The current annotation in this photo alone."""
         return replace(self.document, further_views=())
 
     @property
-    def object_document(self) -> Document:
+    def object_document(self) -> AnnotationDocument:
         """The current annotation of the object in all its photos."""
         return self.history.object_document
 

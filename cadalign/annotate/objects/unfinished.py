@@ -10,12 +10,12 @@ from typing import Any
 
 import msgspec
 
-from cadalign.annotate.document import Document, Pair
+from cadalign.annotate.document import AnnotationDocument, Pair
 from cadalign.annotate.keypoint_registry import KeypointRegistry
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Document as JsonDocument
 from cadalign.io.documents import (
+    Document,
     Labelled,
     NotNegative,
     PathText,
@@ -51,7 +51,7 @@ class Half(Labelled, kw_only=True):
             raise InputError("uv and semantic_id are both missing", fix="give one of them")
 
 
-class UnfinishedView(JsonDocument):
+class UnfinishedView(Document):
     """The pairs of a further photo that the observation lacks, or the photo without any."""
 
     image: PathText
@@ -59,7 +59,7 @@ class UnfinishedView(JsonDocument):
     pairs: list[Half] = msgspec.field(default_factory=list)
 
 
-class Unfinished(JsonDocument):
+class Unfinished(Document):
     """File of the pairs that the observation lacks."""
 
     pairs: list[Half]
@@ -80,7 +80,7 @@ class StoredView:
     """A further photo of an earlier session's annotation."""
 
     image: Path
-    document: Document
+    document: AnnotationDocument
     camera: Camera
     evidence: ImageEvidence
 
@@ -135,13 +135,17 @@ def with_unfinished(
             continue
         with in_file(path), within(f"views[{number}]"):
             camera = Camera.from_dict(each.camera)
-        view = known.get(image.resolve(), StoredView(image, Document(), camera, ImageEvidence()))
+        view = known.get(
+            image.resolve(), StoredView(image, AnnotationDocument(), camera, ImageEvidence())
+        )
         document = with_halves(view.document, each.pairs, registry)
         known[image.resolve()] = replace(view, document=document)
     return list(known.values())
 
 
-def with_halves(document: Document, halves: Sequence[Half], registry: KeypointRegistry) -> Document:
+def with_halves(
+    document: AnnotationDocument, halves: Sequence[Half], registry: KeypointRegistry
+) -> AnnotationDocument:
     """The document with pairs of such a file, of which some are of no use any more."""
     placed = {pair.uv for pair in document.pairs}
     for half in halves:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cadalign.annotate.document import Document, History
+from cadalign.annotate.document import AnnotationDocument, History
 
 
 class ViewHistory:
@@ -21,14 +21,14 @@ class ViewHistory:
         self._photo = photo
 
     @property
-    def object_document(self) -> Document:
+    def object_document(self) -> AnnotationDocument:
         """The document of the object."""
         return self._whole.document
 
     @property
-    def document(self) -> Document:
+    def document(self) -> AnnotationDocument:
         """The photo's document; an empty one while it shows no view of the object."""
-        return self._whole.document.view(self._photo) or Document()
+        return self._whole.document.view(self._photo) or AnnotationDocument()
 
     @property
     def revision(self) -> int:
@@ -45,7 +45,7 @@ class ViewHistory:
         """True if there is a change of the object to redo."""
         return self._whole.can_redo
 
-    def record(self, document: Document, *, step: object = None) -> None:
+    def record(self, document: AnnotationDocument, *, step: object = None) -> None:
         """Go on to another document of the photo; see `History.record`."""
         changed = self._whole.document.with_view(self._photo, document)
         self._whole.record(changed, step=None if step is None else (self._photo, step))

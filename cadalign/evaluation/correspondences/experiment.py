@@ -30,11 +30,11 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets import Correspondences
 from cadalign.errors import DataError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.result import Result
@@ -48,9 +48,6 @@ from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng
-
-if TYPE_CHECKING:
-    from cadalign.datasets import Correspondences
 
 SUCCESS_DEG = 0.5
 """A success has less than this rotation error [degrees] ..."""
@@ -79,8 +76,6 @@ class CorrespondenceExperiment:
 
     def warm_up(self) -> None:
         """Compile the solvers."""
-        from cadalign.datasets import Correspondences
-
         problem = simulate_problem(
             np.random.default_rng(0), points=40, noise_px=0.5, stretch=(1.0, 1.0)
         )

@@ -6,16 +6,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from cadalign.datasets import Correspondences, CorrespondenceSet
 from cadalign.errors import DataError
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.runs.tables import Row
-
-if TYPE_CHECKING:
-    from cadalign.datasets import Correspondences, CorrespondenceSet
 
 
 @dataclass(frozen=True, eq=False)

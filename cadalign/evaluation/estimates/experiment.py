@@ -20,7 +20,7 @@ from cadalign.evaluation.photos.methods import PhotoEstimate
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
 from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import Sighting, Target
+from cadalign.evaluation.photos.sighting import PhotoTarget, Sighting
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns
@@ -77,7 +77,7 @@ class EstimatesExperiment:
             self.failure(PhotoTask(-1, f"{photo.name}, problem {row + 1}"), str(problem))
             for row, problem in enumerate(photo.problems)
         ]
-        targets = [Target(photo, found, str(dataset.root)) for found in photo.objects]
+        targets = [PhotoTarget(photo, found, str(dataset.root)) for found in photo.objects]
         estimates = [self._estimates(index, photo, targets) for index in range(len(self.methods))]
         protocol = protocol_of(dataset.kind)
         for target in targets:
@@ -90,7 +90,7 @@ class EstimatesExperiment:
         return Rows.joined(parts)
 
     def _estimates(
-        self, index: int, photo: Photo, targets: Sequence[Target]
+        self, index: int, photo: Photo, targets: Sequence[PhotoTarget]
     ) -> dict[str, PoseEstimate] | CadalignError:
         """Estimates of a file by the objects' ids, or why it has none of the photo."""
         try:
@@ -101,7 +101,7 @@ class EstimatesExperiment:
 
     def _object(
         self,
-        target: Target,
+        target: PhotoTarget,
         estimates: Sequence[PoseEstimate | CadalignError | None],
         protocol: Protocol,
         *,
@@ -128,7 +128,7 @@ class EstimatesExperiment:
 
     def _answer(
         self,
-        target: Target,
+        target: PhotoTarget,
         method: str,
         estimate: PoseEstimate | CadalignError | None,
         protocol: Protocol,
@@ -151,7 +151,7 @@ class EstimatesExperiment:
         return Outcome(names, _FACTS | scores, seconds=estimate.seconds), found
 
 
-def _sighting(target: Target) -> Sighting | None:
+def _sighting(target: PhotoTarget) -> Sighting | None:
     """The object without keypoints, for its picture and its record; None without a camera."""
     camera, bounds = target.camera, target.bounds
     if camera is None or bounds is None or not camera.focal_known:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.errors import CadalignError
 from cadalign.evaluation.photos.metrics.bop import mssd
-from cadalign.evaluation.photos.sighting import Target
+from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.alignment import Alignment
 
@@ -17,7 +17,7 @@ _STEP = 0.1  # of rotations about an axis of symmetry, coarse: it only decides w
 
 
 def match_estimates(
-    targets: Sequence[Target], poses: Sequence[PoseEstimate]
+    targets: Sequence[PhotoTarget], poses: Sequence[PoseEstimate]
 ) -> dict[str, PoseEstimate]:
     """The estimate of each object, by the object's id.
 
@@ -25,7 +25,7 @@ def match_estimates(
     of the highest scores; the others are not counted. The best estimate takes the object that it is
     nearest to, by the symmetry-aware distance of surfaces, and so on.
     """
-    of_model: dict[str, list[Target]] = defaultdict(list)
+    of_model: dict[str, list[PhotoTarget]] = defaultdict(list)
     for target in targets:
         if target.found.model is not None:
             of_model[target.found.model.model_id].append(target)
@@ -39,7 +39,7 @@ def match_estimates(
     return found
 
 
-def _distance(target: Target, est: Alignment) -> float:
+def _distance(target: PhotoTarget, est: Alignment) -> float:
     gt, cad = target.gt, target.cad
     if gt is None:
         return float("inf")

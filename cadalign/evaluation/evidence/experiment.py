@@ -39,7 +39,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.evidence.methods import bound_of, evidence_for
-from cadalign.evaluation.evidence.options import EvidenceOptions
+from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
@@ -68,7 +68,7 @@ class EvidenceExperiment:
     columns = COLUMNS
     timing_columns = (*_NAMES, ("seconds", float))
 
-    options: EvidenceOptions
+    options: EvidenceRunOptions
 
     def warm_up(self) -> None:
         """Compile the kernels."""

@@ -22,7 +22,7 @@ from cadalign.evaluation.evidence.options import (
     MASK,
     VIEWS_FREE,
     VIEWS_KNOWN,
-    EvidenceOptions,
+    EvidenceRunOptions,
 )
 from cadalign.evaluation.evidence.scene import ObjectScene, Shot
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -42,7 +42,7 @@ class Given:
     size: Size | None
 
 
-def evidence_for(method: str, scene: ObjectScene, options: EvidenceOptions) -> Given:
+def evidence_for(method: str, scene: ObjectScene, options: EvidenceRunOptions) -> Given:
     """The views and the size that a method gives."""
     kinds = COMBINED.get(method, (method,))
     count = next((VIEWS_KNOWN[kind] for kind in kinds if kind in VIEWS_KNOWN), 1)
@@ -95,7 +95,7 @@ def truth_in(shot: Shot, gt: Alignment) -> Alignment:
 
 
 def _of_first(
-    kinds: tuple[str, ...], scene: ObjectScene, options: EvidenceOptions
+    kinds: tuple[str, ...], scene: ObjectScene, options: EvidenceRunOptions
 ) -> dict[str, Any]:
     """Fields of the first view beyond its keypoints."""
     shot = scene.shots[0]

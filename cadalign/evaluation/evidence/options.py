@@ -32,7 +32,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mas
 
 
 @dataclass(frozen=True)
-class EvidenceOptions(ModelOptions, NoiseOption):
+class EvidenceRunOptions(ModelOptions, NoiseOption):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -83,4 +83,4 @@ class EvidenceOptions(ModelOptions, NoiseOption):
             raise InputError(what, where="methods", fix=f"known are {', '.join(METHODS)}")
 
 
-OPTIONS = EvidenceOptions
+OPTIONS = EvidenceRunOptions

@@ -11,7 +11,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.estimation.model import Model
 from cadalign.evaluation.accuracy.masks import damaged_mask
-from cadalign.evaluation.evidence.options import EvidenceOptions
+from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, load_scene, make_instance
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -90,7 +90,7 @@ class ObjectScene:
 _scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
 
 
-def make_scene(model: AnnotatedModel, view: int, options: EvidenceOptions) -> ObjectScene:
+def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) -> ObjectScene:
     """Draw a view of a model, its stretch, the other cameras, and the noise of everything.
 
     Everything random follows from (seed, category, model id, view). The cameras turn about the
@@ -149,7 +149,7 @@ def _shoot(
     pose: Alignment,
     motion: FloatArray,
     rng: np.random.Generator,
-    options: EvidenceOptions,
+    options: EvidenceRunOptions,
 ) -> Shot:
     noise, of_depths = rng.standard_normal((len(xyz), 2)), rng.standard_normal(len(xyz))
     about = rng.standard_normal(2)

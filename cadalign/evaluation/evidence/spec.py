@@ -7,7 +7,7 @@ from functools import partial
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.evidence.experiment import COLUMNS, EvidenceExperiment
 from cadalign.evaluation.evidence.figures import plots
-from cadalign.evaluation.evidence.options import EvidenceOptions
+from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.evidence.summary import HEADLINE, console_table, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
 from cadalign.evaluation.runs.folder import RunFolder
@@ -18,7 +18,7 @@ from cadalign.evaluation.spec import Spec, on_datasets
 _CHUNK = 2
 
 
-def plan(options: EvidenceOptions, folder: RunFolder) -> Plan[KeypointTask]:
+def plan(options: EvidenceRunOptions, folder: RunFolder) -> Plan[KeypointTask]:
     """Plan a run over the views of a dataset's models that have meshes."""
     dataset = KeypointNet(options.root, shapenet_root=options.shapenet).subset(
         categories=options.categories, split=options.split, with_mesh=True
@@ -43,7 +43,7 @@ def _describe(run: Run) -> str:
 
 
 SPEC = Spec(
-    options=EvidenceOptions,
+    options=EvidenceRunOptions,
     plan=plan,
     results=COLUMNS,
     columns=HEADLINE,

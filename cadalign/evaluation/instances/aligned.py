@@ -10,12 +10,13 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.uncertainty.weakness import Uncertainty
+from cadalign.estimation.view import View
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Alternative, Result
-    from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCALE = 1e-6
 
@@ -99,7 +100,6 @@ def align_instance(
     """
     # Only here: their kernels take time to import, and most experiments do without.
     from cadalign.estimation.align import align
-    from cadalign.estimation.view import View
 
     known = np.isin(instance.semantic_ids, shape.ids)
     view = View(

@@ -10,7 +10,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.instance import Instance
-from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.pose_errors import (
@@ -33,7 +33,7 @@ POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
 def estimate_errors(
     estimates: Sequence[Alignment],
     instances: Sequence[Instance],
-    symmetries: Sequence[SymmetryGroup],
+    symmetries: Sequence[InstanceSymmetry],
 ) -> list[Row | InputError]:
     """Errors of an estimate of each instance; the reason where one is not finite.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.datasets import AnnotatedModel, check_solid
 from cadalign.errors import TooFewVisibleError
 from cadalign.evaluation.instances.hull import HullView, KeypointHull, sample_hull_views
 from cadalign.geometry.alignment import Alignment
@@ -20,7 +21,6 @@ from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     # Workers that look at annotations only are not to carry the renderer's libraries.
-    from cadalign.datasets import AnnotatedModel
     from cadalign.render import Scene
 
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
@@ -79,7 +79,6 @@ class Instance:
 
 def load_scene(model: AnnotatedModel) -> Scene:
     """Read a model's mesh for `make_instance`."""
-    from cadalign.datasets import check_solid
     from cadalign.render import Scene
 
     mesh = model.load_mesh()

@@ -18,7 +18,7 @@ from cadalign.geometry.rotations import rotation_from_vector
 
 
 @dataclass(frozen=True, eq=False)
-class SymmetryGroup:
+class InstanceSymmetry:
     """Rotations about one point that map an object onto itself.
 
     Parameters
@@ -82,6 +82,6 @@ class SymmetryGroup:
         return np.asarray(rotation @ rotation_from_vector(self.axis * float(angle)))
 
 
-def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
+def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> InstanceSymmetry:
     """The rotations that map a model with the keypoints (k, 3) onto itself."""
-    return SymmetryGroup(*rotations_of(xyz, symmetries))
+    return InstanceSymmetry(*rotations_of(xyz, symmetries))

@@ -40,10 +40,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from cadalign.datasets import AnnotatedModel
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.fit import fit, fit_batch
 from cadalign.estimation.result import Result
@@ -59,7 +60,7 @@ from cadalign.evaluation.instances.instance import (
     make_instance,
 )
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
-from cadalign.evaluation.instances.symmetry import SymmetryGroup
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
@@ -70,9 +71,6 @@ from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-
-if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
@@ -125,7 +123,7 @@ class KeypointNetExperiment:
             view=0,
             hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
             semantic_ids=np.arange(12),
-            symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+            symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
             model=None,
         )
         self.evaluate([task])

@@ -6,19 +6,17 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from cadalign.arrays import IntArray
+from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import RAYS
-from cadalign.evaluation.instances.symmetry import SymmetryGroup, symmetry_group
+from cadalign.evaluation.instances.symmetry import InstanceSymmetry, symmetry_group
 from cadalign.evaluation.runs.tables import Row
-
-if TYPE_CHECKING:
-    from cadalign.datasets import AnnotatedModel, KeypointNet
 
 AUTO = "auto"
 """Rays where there is a mesh, the hull's rule elsewhere."""
@@ -43,7 +41,7 @@ class KeypointTask:
     view: int
     hull: KeypointHull
     semantic_ids: IntArray
-    symmetry: SymmetryGroup
+    symmetry: InstanceSymmetry
     model: AnnotatedModel | None
     problem: str = ""
 
@@ -66,7 +64,7 @@ class KeypointTask:
                 view=0,
                 hull=KeypointHull(np.empty((0, 3))),
                 semantic_ids=np.empty(0, dtype=np.int64),
-                symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
+                symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
                 model=None,
                 problem=str(error),
             )

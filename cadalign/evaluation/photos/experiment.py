@@ -47,7 +47,7 @@ from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
 from cadalign.evaluation.photos.scores import SCORE_COLUMNS, score_alignment
-from cadalign.evaluation.photos.sighting import LeftOutError, Sighting, Target, sight
+from cadalign.evaluation.photos.sighting import LeftOutError, PhotoTarget, Sighting, sight
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -116,7 +116,7 @@ class PhotosExperiment:
         wanted = self.options.categories
         for found in photo.objects:
             if wanted is None or found.category in wanted:
-                parts.append(self._object(Target(photo, found, root), protocol, shown=shown))
+                parts.append(self._object(PhotoTarget(photo, found, root), protocol, shown=shown))
         return Rows.joined(parts)
 
     def _bad_object(self, photo: Photo, number: int) -> Rows:
@@ -124,7 +124,7 @@ class PhotosExperiment:
         task = PhotoTask(-1, f"{photo.name}, problem {number + 1}")
         return self.failure(task, str(photo.problems[number]))
 
-    def _object(self, target: Target, protocol: Protocol, *, shown: bool) -> Rows:
+    def _object(self, target: PhotoTarget, protocol: Protocol, *, shown: bool) -> Rows:
         try:
             sighting = sight(target, protocol, self.options)
         except Exception as error:

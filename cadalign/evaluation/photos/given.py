@@ -12,7 +12,7 @@ from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
 from cadalign.evaluation.photos.experiment import COLUMNS
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
 from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import Target
+from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.evaluation.photos.summary import summarize_cells
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
@@ -77,14 +77,16 @@ def summarize_rows(rows: list[Row]) -> list[Summary]:
     return summarize_cells(cells, list(dict.fromkeys(row["method"] for row in rows)))
 
 
-def _targets(dataset: PhotoDataset, root: str) -> Iterator[Target]:
+def _targets(dataset: PhotoDataset, root: str) -> Iterator[PhotoTarget]:
     for photo in dataset:
         for found in photo.objects:
             if found.truth.cam_from_model is not None or found.truth.box is not None:
-                yield Target(photo, found, root)
+                yield PhotoTarget(photo, found, root)
 
 
-def _outcome(target: Target, protocol: Protocol, est: Alignment | None, method: str) -> Outcome:
+def _outcome(
+    target: PhotoTarget, protocol: Protocol, est: Alignment | None, method: str
+) -> Outcome:
     names, facts = target.names(method), {"source": ""}
     if est is None:
         return Outcome.failure("there is no estimate", names, **facts)

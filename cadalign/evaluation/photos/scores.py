@@ -15,7 +15,7 @@ from cadalign.evaluation.photos.metrics.kitti import kitti_errors
 from cadalign.evaluation.photos.metrics.nine_dof import degree_cm, nine_dof_iou
 from cadalign.evaluation.photos.metrics.scan2cad import PlacedModel, scan2cad_errors
 from cadalign.evaluation.photos.protocols import Protocol
-from cadalign.evaluation.photos.sighting import Target
+from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -34,12 +34,12 @@ SCORE_COLUMNS: Columns = (
 """Columns of all metrics; those of other data sets are empty."""
 
 
-def score_alignment(target: Target, protocol: Protocol, est: Alignment, box: Box) -> Row:
+def score_alignment(target: PhotoTarget, protocol: Protocol, est: Alignment, box: Box) -> Row:
     """Errors of an estimate by column; none where the truth is not known.
 
     Parameters
     ----------
-    target : Target
+    target : PhotoTarget
         The object.
     protocol : Protocol
         Of the data set.
@@ -59,13 +59,13 @@ def score_alignment(target: Target, protocol: Protocol, est: Alignment, box: Box
     }
 
 
-def _viewpoint(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     symmetry = target.found.symmetry
     error = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)
     return {"rotation_error_deg": error}
 
 
-def _nine_dof(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _nine_dof(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     found, gt_box = target.found, target.gt_box
     values: Row = {}
     if found.truth.metres is not None:
@@ -77,7 +77,7 @@ def _nine_dof(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
     return values
 
 
-def _scan2cad(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _scan2cad(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     found, bounds = target.found, target.bounds
     center = np.zeros(3) if bounds is None else -bounds.mean(axis=0)
     truth = PlacedModel(found.category, gt, symmetry=found.symmetry, center=center)
@@ -90,7 +90,7 @@ def _scan2cad(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
     }
 
 
-def _kitti(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _kitti(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     if target.gt_box is None:
         return {}
     errors = kitti_errors(est=box, gt=target.gt_box)
@@ -103,7 +103,7 @@ def _kitti(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
     }
 
 
-def _bop(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
+def _bop(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
     cad, camera, metres = target.cad, target.photo.camera, target.found.truth.metres
     if cad is None or not cad.has_mesh or camera is None:
         return {}
@@ -132,7 +132,7 @@ def _bop(target: Target, est: Alignment, gt: Alignment, box: Box) -> Row:
     return values | {"vsd_recall": bop.vsd_recall([discrepancies])}
 
 
-_SCORES: dict[str, Callable[[Target, Alignment, Alignment, Box], Row]] = {
+_SCORES: dict[str, Callable[[PhotoTarget, Alignment, Alignment, Box], Row]] = {
     protocols.VIEWPOINT: _viewpoint,
     protocols.NINE_DOF: _nine_dof,
     protocols.SCAN2CAD: _scan2cad,

@@ -33,7 +33,7 @@ class LeftOutError(CadalignError):
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class PhotoTarget:
     """An object of a photo with its truth, as metrics need it.
 
     Parameters
@@ -109,7 +109,7 @@ class Sighting:
 
     Parameters
     ----------
-    target : Target
+    target : PhotoTarget
     camera : Camera
         With a focal length.
     source : {"annotated", "detected", "simulated"}
@@ -130,7 +130,7 @@ class Sighting:
         The model's upward axis.
     """
 
-    target: Target
+    target: PhotoTarget
     camera: Camera
     source: str
     names: tuple[str, ...]
@@ -148,7 +148,7 @@ class Sighting:
         return self.model.xyz[[row_of[name] for name in self.names]]
 
 
-def sight(target: Target, protocol: Protocol, options: PhotosOptions) -> Sighting:
+def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Sighting:
     """Collect what methods are given of an object.
 
     Raises
@@ -204,7 +204,7 @@ def _marked(
 
 
 def _simulated(
-    target: Target, camera: Camera, cad: Cad, model: NamedPoints | None, options: PhotosOptions
+    target: PhotoTarget, camera: Camera, cad: Cad, model: NamedPoints | None, options: PhotosOptions
 ) -> tuple[NamedPoints, tuple[str, ...], FloatArray]:
     """Points of the model, those that the photo shows, and their pixels with noise.
 
@@ -241,7 +241,7 @@ def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
     return np.asarray(near[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)])
 
 
-def _sigma(target: Target, protocol: Protocol, options: PhotosOptions, source: str) -> float:
+def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, source: str) -> float:
     """The standard deviation of keypoints [px] that methods are told."""
     if source == SIMULATED:
         return max(options.simulated_noise_px, _LEAST_PX)

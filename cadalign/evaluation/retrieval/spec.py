@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from cadalign.datasets import KeypointNet
 from cadalign.evaluation.metrics import QUERIES
 from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, RetrievalExperiment
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
@@ -41,8 +42,6 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
 
 def _library_of(options: RetrievalRunOptions) -> Library:
     """The library at a place, or one of the data set there."""
-    from cadalign.datasets import KeypointNet
-
     if options.root.is_file():
         return Library.open(options.root)
     categories = None if options.whole_library else options.categories

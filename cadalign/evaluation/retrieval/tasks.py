@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.datasets.models.categories import require_category
 from cadalign.errors import InputError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
+from cadalign.retrieval.models import LibraryModel
 from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     from cadalign.retrieval.library import Library
-    from cadalign.retrieval.models import LibraryModel
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,6 @@ class RetrievalTask:
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
     """Every model with every noise and number of keypoints that it has, model by model."""
-    from cadalign.datasets.models.categories import require_category
-
     names = library.categories
     if options.categories is not None:
         chosen = {require_category(name, names, where="categories") for name in options.categories}

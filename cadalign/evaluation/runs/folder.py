@@ -28,7 +28,6 @@ from typing import Annotated, Any
 
 from msgspec import Meta, field
 
-from cadalign import __version__
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
 from cadalign.io.files import refuse_nul, write_json, writing
@@ -165,7 +164,7 @@ def _versions() -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "versions": {
-            "cadalign": __version__,
+            "cadalign": version("cadalign"),
             "python": platform.python_version(),
             "machine": platform.machine(),
             **{name: version(name) for name in ("numpy", "scipy", "numba", "pyarrow")},

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cadalign.errors import InputError
+from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, InProcess, LocalProcesses, Workers
 from cadalign.evaluation.runs.tables import Columns, is_whole, read_table, write_rows, write_tables
@@ -72,8 +73,6 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
     ``threads`` share the work of a run without workers.
     """
     if dask is not None:
-        from cadalign.evaluation.runs.cluster import DaskWorkers
-
         return DaskWorkers(dask)
     if count < -1:
         raise InputError(

@@ -56,11 +56,11 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.unseen.calibration import probability_level
-from cadalign.evaluation.unseen.learned import Learned
+from cadalign.evaluation.unseen.learned import LearnedFiles
 from cadalign.evaluation.unseen.methods import ShapeEstimate, estimate_shape
 from cadalign.evaluation.unseen.options import UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview, sighting_record
-from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask, observe_object
+from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTask, observe_object
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import (
@@ -93,7 +93,7 @@ class UnseenExperiment:
     timing_columns = (*_NAMES, ("seconds", float))
     record_columns = RECORD_COLUMNS
 
-    learned: Learned
+    learned: LearnedFiles
     options: UnseenOptions
     previews: RunFolder | None = None  # of the objects' meshes
 
@@ -103,7 +103,7 @@ class UnseenExperiment:
         points = rng.uniform(-0.3, 0.3, (9, 3))
         pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
         pixels, ids = KEYPOINT_CAMERA.project(pose.apply(points)), np.arange(9)
-        sighting = Sighting(pixels, ids, ids, np.zeros(9, dtype=bool), pose, points, ids)
+        sighting = UnseenSighting(pixels, ids, ids, np.zeros(9, dtype=bool), pose, points, ids)
         view = View(KEYPOINT_CAMERA, pixels)
         for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
             _coverage(align(model, view), sighting, ids, ids)
@@ -131,7 +131,7 @@ class UnseenExperiment:
         return Rows.of(outcomes, [sighting_record(sighting, outcomes, estimates, sigma=sigma)])
 
     def _answer(
-        self, task: UnseenTask, sighting: Sighting, method: str
+        self, task: UnseenTask, sighting: UnseenSighting, method: str
     ) -> tuple[Outcome, ShapeEstimate | CadalignError]:
         names, facts = task.names(method), {"keypoints": len(sighting.points_2d)}
         start = time.perf_counter()
@@ -145,7 +145,7 @@ class UnseenExperiment:
         return Outcome(names, values, seconds=seconds), found
 
 
-def _errors(found: ShapeEstimate, sighting: Sighting) -> Row:
+def _errors(found: ShapeEstimate, sighting: UnseenSighting) -> Row:
     est, gt = found.alignment, sighting.gt
     ids = sighting.all_ids.tolist()
     row_of = {name: row for row, name in enumerate(found.ids.tolist())}
@@ -180,7 +180,7 @@ def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
     return float(np.sqrt(((factor * est - gt) ** 2).sum(axis=1).mean()))
 
 
-def _coverage(result: Result, sighting: Sighting, known: IntArray, rows: IntArray) -> Row:
+def _coverage(result: Result, sighting: UnseenSighting, known: IntArray, rows: IntArray) -> Row:
     """Place of the truth in the stated probabilities; metrics by column.
 
     ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the

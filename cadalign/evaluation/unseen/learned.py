@@ -23,7 +23,7 @@ logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedFiles:
     """Files of what is learned: shape models by category, and the library of all models."""
 
     shapes: tuple[tuple[str, str], ...]
@@ -58,7 +58,7 @@ class Learned:
 
 def learn(
     dataset: KeypointNet, categories: Sequence[str], *, split: str, folder: RunFolder
-) -> Learned:
+) -> LearnedFiles:
     """Learn from the models of a split, or find in a folder what was learned from them before.
 
     Boxes are those of the keypoints. Files are named after a hash of their models, so that those
@@ -90,7 +90,7 @@ def learn(
     file = place / f"library-{library.fingerprint[:16]}.cadalign"
     if not file.is_file():
         library.save(file)
-    return Learned(tuple(shapes), str(file.absolute()))
+    return LearnedFiles(tuple(shapes), str(file.absolute()))
 
 
 def _hash(models: Sequence[AnnotatedModel]) -> str:

@@ -15,7 +15,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.unseen.learned import Learned
+from cadalign.evaluation.unseen.learned import LearnedFiles
 from cadalign.evaluation.unseen.options import (
     EXACT,
     LIMIT,
@@ -25,7 +25,7 @@ from cadalign.evaluation.unseen.options import (
     SHAPE,
     UnseenOptions,
 )
-from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask
+from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTask
 from cadalign.geometry.alignment import Alignment
 from cadalign.retrieval.models import LibraryModel
 from cadalign.seeding import instance_rng
@@ -68,7 +68,11 @@ class ShapeEstimate:
 
 
 def estimate_shape(
-    method: str, task: UnseenTask, sighting: Sighting, learned: Learned, options: UnseenOptions
+    method: str,
+    task: UnseenTask,
+    sighting: UnseenSighting,
+    learned: LearnedFiles,
+    options: UnseenOptions,
 ) -> ShapeEstimate:
     """The estimate of a method; raises CadalignError where it has none."""
     if method == LIMIT:
@@ -93,7 +97,7 @@ def estimate_shape(
 
 
 def _aligned(
-    model: Model | ShapeModel, sighting: Sighting, options: UnseenOptions, *, misfit_px: float
+    model: Model | ShapeModel, sighting: UnseenSighting, options: UnseenOptions, *, misfit_px: float
 ) -> ShapeEstimate:
     """Align a model with those given keypoints that it has."""
     sigma = options.noise_px or 1.0
@@ -112,7 +116,7 @@ def _aligned(
 
 
 def _nearest(
-    task: UnseenTask, sighting: Sighting, learned: Learned, options: UnseenOptions
+    task: UnseenTask, sighting: UnseenSighting, learned: LearnedFiles, options: UnseenOptions
 ) -> ShapeEstimate:
     library = learned.opened_library()
     first = library.retrieve(
@@ -131,7 +135,7 @@ def _nearest(
 
 
 def _random_model(
-    task: UnseenTask, sighting: Sighting, learned: Learned, options: UnseenOptions
+    task: UnseenTask, sighting: UnseenSighting, learned: LearnedFiles, options: UnseenOptions
 ) -> LibraryModel:
     """A random model of the category, among those that share enough keypoints with the image."""
     library = learned.opened_library()
@@ -146,7 +150,7 @@ def _random_model(
     raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
 
 
-def _bound(sighting: Sighting) -> ShapeEstimate:
+def _bound(sighting: UnseenSighting) -> ShapeEstimate:
     """The ideal estimate with the object's own model from the keypoints that are no outliers."""
     kept = ~sighting.is_outlier
     alignment = limit_estimate(

@@ -25,7 +25,7 @@ from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.unseen.methods import ShapeEstimate
-from cadalign.evaluation.unseen.tasks import Sighting, UnseenTask
+from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTask
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.files import writing
 
@@ -33,7 +33,7 @@ logger = logging.getLogger("cadalign")
 
 
 def sighting_record(
-    sighting: Sighting,
+    sighting: UnseenSighting,
     outcomes: Sequence[Outcome],
     estimates: Sequence[ShapeEstimate | CadalignError],
     *,
@@ -80,7 +80,7 @@ def keep_preview(folder: RunFolder, root: Path, task: UnseenTask) -> None:
 _dataset = lru_cache(maxsize=1)(KeypointNet)
 
 
-def _aligned(found: ShapeEstimate, sighting: Sighting, sigma: float) -> AlignedShape:
+def _aligned(found: ShapeEstimate, sighting: UnseenSighting, sigma: float) -> AlignedShape:
     """An estimate in terms of the object, of which it has some keypoints."""
     row_of = {label: row for row, label in enumerate(found.ids.tolist())}
     known = np.flatnonzero([label in row_of for label in sighting.all_ids.tolist()])
@@ -103,7 +103,7 @@ def _aligned(found: ShapeEstimate, sighting: Sighting, sigma: float) -> AlignedS
 
 
 def _warp(
-    found: Alignment, points: FloatArray, sighting: Sighting, known: IntArray
+    found: Alignment, points: FloatArray, sighting: UnseenSighting, known: IntArray
 ) -> tuple[Alignment, Warp]:
     """The alignment of the object's box with that of estimated points, and what remains."""
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -111,7 +111,7 @@ def _warp(
     return alignment, Warp(sighting.xyz[known], alignment.inverse(found.apply(points)))
 
 
-def _rms(alignment: Alignment, warp: Warp, sighting: Sighting, known: IntArray) -> float:
+def _rms(alignment: Alignment, warp: Warp, sighting: UnseenSighting, known: IntArray) -> float:
     """Root mean square residual [px] of the given keypoints that the method has."""
     given = np.isin(sighting.rows, known)
     places = warp.target[np.searchsorted(known, sighting.rows[given])]

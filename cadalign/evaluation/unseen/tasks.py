@@ -91,7 +91,7 @@ class UnseenTasks(Sequence[UnseenTask]):
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class UnseenSighting:
     """Content of a view of an object, and the truth.
 
     Parameters
@@ -122,7 +122,7 @@ class Sighting:
         return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
 
 
-def observe_object(task: UnseenTask, options: UnseenOptions) -> Sighting:
+def observe_object(task: UnseenTask, options: UnseenOptions) -> UnseenSighting:
     """Draw a view of an object, the keypoints that are given, their noise and outliers.
 
     Views are those of `sample_hull_view`; hidden keypoints may be given, too. Everything random
@@ -148,6 +148,6 @@ def observe_object(task: UnseenTask, options: UnseenOptions) -> Sighting:
     clean = KEYPOINT_CAMERA.project(gt.apply(task.xyz[rows]))
     points = clean + options.noise_px * noise[rows]
     points[is_outlier] = elsewhere[rows][is_outlier]
-    return Sighting(
+    return UnseenSighting(
         points, task.semantic_ids[rows], rows, is_outlier, gt, task.xyz, task.semantic_ids
     )

@@ -18,7 +18,7 @@ from cadalign.datasets import Bop, Scan2CAD
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.estimates.files import method_names, open_estimates
 from cadalign.evaluation.estimates.matching import match_estimates
-from cadalign.evaluation.photos.sighting import Target
+from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.spec import Spec
@@ -130,7 +130,7 @@ def test_bad_lines_and_strays_are_counted_and_the_rest_is_scored(
 
 def test_the_best_estimates_of_a_model_are_matched_with_the_nearest_objects(scene: Path) -> None:
     photo = Bop(scene)[0]
-    targets = [Target(photo, found, str(scene)) for found in photo.objects]
+    targets = [PhotoTarget(photo, found, str(scene)) for found in photo.objects]
     poses = [
         estimate("0", 2, pose(118.0), 0.9),
         estimate("0", 2, pose(1.0), 0.8),

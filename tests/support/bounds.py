@@ -19,16 +19,17 @@ def bound_of(result: Result, truths: Sequence[Alignment]) -> np.ndarray:
 
     ``truths`` are in the frame of each pose: the rig's, or each view's camera.
     """
-    assert result.basis is not None
+    basis = result.statistics.basis
+    assert basis is not None
     poses = [np.concatenate([each.rotation.ravel(), each.translation]) for each in truths]
     true_state = State(
         np.array(poses),
         np.log(truths[0].scale),
-        np.zeros_like(result.basis.state.coefficients),
-        np.zeros_like(result.basis.state.displacements),
+        np.zeros_like(basis.state.coefficients),
+        np.zeros_like(basis.state.displacements),
     )
-    unknowns = joint_covariance(result.basis.evidence, true_state)[0]
-    return pose_and_lengths(result.basis.evidence, true_state, unknowns)
+    unknowns = joint_covariance(basis.evidence, true_state)[0]
+    return pose_and_lengths(basis.evidence, true_state, unknowns)
 
 
 def whitened_square(result: Result, truths: Sequence[Alignment]) -> float:

@@ -11,14 +11,13 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 
 from cadalign.datasets.models import model_keypoints
-from cadalign.estimation import align_document, document
+from cadalign.estimation import document
 from cadalign.io.observation_file import OneView, SeveralViews
 
 FORMATS: dict[str, tuple[Any, ...]] = {
     "observation": (OneView, SeveralViews),
     "model_keypoints": (model_keypoints._File,),
     "fit": (document._Result,),
-    "alignment": (align_document._Result,),
 }
 
 

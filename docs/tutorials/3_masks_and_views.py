@@ -52,7 +52,7 @@ ids = bottle.keypoints.semantic_ids
 model = cadalign.Model(points_3d=bottle.keypoints.xyz, ids=ids, mesh=mesh)
 
 
-def report(name: str, result: cadalign.AlignResult) -> None:
+def report(name: str, result: cadalign.Result) -> None:
     """One line of errors and deviations."""
     iou = cadalign.metrics.box_iou(est=result.box, gt=true_box)
     turn = cadalign.metrics.rotation_error(est=result.alignment, gt=truth)

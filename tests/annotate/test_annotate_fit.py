@@ -76,7 +76,8 @@ def test_standard_deviations_scale_with_the_residuals() -> None:
     assert live.result is not None
     assert live.cautious is not None
     assert 4 < live.sigma < 14
-    np.testing.assert_allclose(live.cautious.covariance, live.result.covariance * live.sigma**2)
+    wider = live.result.fisher_covariance * live.sigma**2
+    np.testing.assert_allclose(live.cautious.fisher_covariance, wider)
     similar = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=None)
     assert similar.sigma == pytest.approx(live.sigma, rel=1e-6)
     assert live_of(problem_of(3, points=12, noise_px=0.01)).sigma == 1.0
@@ -229,10 +230,10 @@ def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> No
 def test_next_best_concerns_the_most_uncertain_unknown() -> None:
     problem = problem_of(4, points=10, noise_px=1.0)
     result = fit(problem.points_3d, problem.points_2d, problem.camera)
-    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 1e-4, 0.04])
+    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 0.0, 1e-4, 0.04])
     next_best = find_next_best(problem.points_3d, problem.camera, result.alignment, covariance, 1.0)
     assert next_best is not None
-    assert next_best.unknown == 7
+    assert next_best.unknown == 8
     assert next_best.before == pytest.approx(0.2)
     distance = np.linalg.norm(result.alignment.translation)
     covariance[5, 5] = (0.3 * distance) ** 2  # in shares of the distance
@@ -252,7 +253,7 @@ def test_equally_good_candidates_give_the_first() -> None:
     assert (
         find_next_best(same[:0], problem.camera, result.alignment, result.covariance, 1.0) is None
     )
-    assert find_next_best(same, problem.camera, result.alignment, np.zeros((8, 8)), 1.0) is None
+    assert find_next_best(same, problem.camera, result.alignment, np.zeros((9, 9)), 1.0) is None
 
 
 # --- derivatives -----------------------------------------------------------------------------
@@ -271,28 +272,22 @@ def test_projection_jacobian_matches_differences(seed: int) -> None:
     def project(step: np.ndarray) -> np.ndarray:
         x, y, z = step[:3]
         turn = np.array([[1, -z, y], [z, 1, -x], [-y, x, 1.0]])
-        linear = turn @ pose.rotation * (pose.scale * np.exp([0, step[6], step[7]]))
-        camera = LENS_CAMERA.with_focal(LENS_CAMERA.fx * np.exp(step[8]))
+        linear = turn @ pose.rotation * (pose.scale * np.exp(step[6:9]))
+        camera = LENS_CAMERA.with_focal(LENS_CAMERA.fx * np.exp(step[9]))
         return camera.project(points @ linear.T + pose.translation + step[3:6])
 
-    jacobian = projection_jacobian(points, LENS_CAMERA, pose, known_axis="x", unknowns=9)
-    for unknown in range(9):
-        step = np.zeros(9)
+    jacobian = projection_jacobian(points, LENS_CAMERA, pose)
+    for unknown in range(10):
+        step = np.zeros(10)
         step[unknown] = 1e-6
         difference = (project(step) - project(-step)) / 2e-6
         np.testing.assert_allclose(jacobian[:, :, unknown], difference, rtol=1e-5, atol=1e-4)
-    np.testing.assert_array_equal(
-        projection_jacobian(points, LENS_CAMERA, pose, known_axis="x", unknowns=8),
-        jacobian[:, :, :8],
-    )
 
 
 def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
     pose = Alignment(np.eye(3), [0, 0, 4], [1, 1, 1])
-    with pytest.raises(InputError, match=r"^unknowns: 7 is neither 8 nor 9$"):
-        projection_jacobian(np.zeros((1, 3)), LENS_CAMERA, pose, known_axis="x", unknowns=7)
     with pytest.raises(InputError, match=r"^points_3d: a point lies behind the camera$"):
-        projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose, known_axis="x", unknowns=8)
+        projection_jacobian(np.array([[0, 0, -5.0]]), LENS_CAMERA, pose)
 
 
 # --- text -----------------------------------------------------------------------------------
@@ -340,10 +335,10 @@ def test_notes_name_alternatives_and_weak_stretches() -> None:
 
 
 def test_text_names_point_and_gain() -> None:
-    assert next_best_text(NextBest(0, 7, 0.12, 0.034), "left arm") == (
+    assert next_best_text(NextBest(0, 8, 0.12, 0.034), "left arm") == (
         "left arm: it would determine the stretch along z to ± 3.4 % instead of 12 %"
     )
     assert next_best_text(NextBest(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
         "tip: it would determine the rotation to ± 0.5° instead of 4°"
     )
-    assert UNKNOWNS[8] == "the focal length"
+    assert UNKNOWNS[9] == "the focal length"

@@ -149,7 +149,7 @@ def test_results_export_themselves(tmp_path: Path) -> None:
     assert coco["annotations"][0]["keypoints"][2::3] == [2] * len(MORE)
     view = View(CAMERA, pixels)
     joint = align(Model(points_3d=MORE, mesh=wedge()), view)
-    path = joint.export(tmp_path / "joint.obj", view)
+    path = joint.export(tmp_path / "joint.obj")
     np.testing.assert_allclose(
         load_mesh(path).vertices, joint.alignment.apply(wedge().vertices), atol=1e-5
     )

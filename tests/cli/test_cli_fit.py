@@ -78,7 +78,7 @@ def test_json_goes_to_standard_output_and_nothing_else_does(
     data = json.loads(captured.out)
     assert data == json.loads((tmp_path / "out" / "fit.json").read_text())
     assert data["method"] == "optimal"
-    assert len(data["residuals"]) == 10
+    assert len(data["views"][0]["residuals"]) == 10
 
 
 def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -130,7 +130,7 @@ def test_known_focal_length_can_be_estimated_all_the_same(folder: Path) -> None:
     estimated = fitted(folder, "known", "--focal", "estimate", "--json")
     assert estimated.camera.fx == pytest.approx(620, rel=0.1)
     assert estimated.covariance is not None
-    assert estimated.covariance.shape == (9, 9)
+    assert estimated.covariance.shape == (10, 10)
 
 
 def test_robust_fit_draws_by_the_scores(folder: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cadalign import Camera, RansacOptions, Results, fit, fit_batch
+from cadalign import Camera, RansacOptions, Result, Results, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 
@@ -51,6 +51,9 @@ def assert_like_single_fits(
         else:
             assert batch.fisher_covariance is not None
             assert (batch.fisher_covariance[b] == single.fisher_covariance).all()
+        result = batch[b]
+        assert isinstance(result, Result)
+        assert result.to_dict() | {"stats": None} == single.to_dict() | {"stats": None}
 
 
 RAGGED = problems_of([6, 20, 7, 100, 10, 64])

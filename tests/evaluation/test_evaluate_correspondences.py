@@ -18,7 +18,8 @@ from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_c
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
-from cadalign.estimation.result import Result
+from cadalign.estimation.result import Result, ViewResult
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation import plots
 from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
@@ -305,20 +306,15 @@ class TestRows:
         )
         angle = np.radians(0.4)
         turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-        est = Result(
-            alignment=Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99]),
-            points_3d=points,
-            residuals=np.zeros((4, 2)),
-            inliers=np.array([True, False, True, True]),
-            method="",
-            camera=CAMERA,
-            sigma=None,
-            covariance=None,
-            known_axis="x",
-            stretched_axes="yz",
-            focal="known",
-            focal_prior=None,
-        )
+
+        def made(alignment, inliers):
+            view = ViewResult(
+                CAMERA, alignment, (0, 1, 2, 3), *np.zeros((2, 4, 2)), inliers, Stated(None)
+            )
+            return Result((view,), view.ids, points, "", view.statistics)
+
+        pose = Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99])
+        est = made(pose, np.array([True, False, True, True]))
         inlier_columns = ("inliers", "inlier_precision", "inlier_recall")
         row = errors_of(est, truth, method="ransac-optimal")
         assert row["rotation_error_deg"] == pytest.approx(0.4)
@@ -326,11 +322,11 @@ class TestRows:
         assert (row["scale_y_error"], row["scale_z_error"]) == pytest.approx((0.005, 0.005))
         assert row["success"]
         assert [row[name] for name in inlier_columns] == [3, 2 / 3, 2 / 3]
-        every = replace(est, inliers=np.ones(4, dtype=bool))
+        every = made(pose, np.ones(4, dtype=bool))
         row = errors_of(every, truth, method="ransac-optimal")
         assert [row[name] for name in inlier_columns] == [4, 3 / 4, 1]
         for scale in ([1, 1.02, 2.0], [1, 1.0, 1.97]):
-            off = replace(est, alignment=Alignment(turn, [0, 0, 10], scale))
+            off = made(Alignment(turn, [0, 0, 10], scale), np.ones(4, dtype=bool))
             assert not errors_of(off, truth, method="epnp")["success"]
 
     def test_options_of_the_search_reach_it(self):

@@ -70,12 +70,9 @@ def test_ray_derivatives_are_those_of_finite_differences(seed: int) -> None:
 
 
 @pytest.mark.slow
-@given(seed=seeds, axis=st.sampled_from("xyz"), camera=st.sampled_from([PLAIN, LENS]))
-def test_pixel_derivatives_are_those_of_finite_differences(
-    seed: int, axis: str, camera: Camera
-) -> None:
+@given(seed=seeds, camera=st.sampled_from([PLAIN, LENS]))
+def test_pixel_derivatives_are_those_of_finite_differences(seed: int, camera: Camera) -> None:
     alignment, points = pose_and_points(seed)
-    first, second = (k for k in range(3) if "xyz"[k] != axis)
 
     def pixels(unknown: int, step: float) -> np.ndarray:
         turn, shift, stretch = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -84,8 +81,8 @@ def test_pixel_derivatives_are_those_of_finite_differences(
             turn[unknown] = step
         elif unknown < 6:
             shift[unknown - 3] = step
-        elif unknown < 8:
-            stretch[(first, second)[unknown - 6]] = step
+        elif unknown < 9:
+            stretch[unknown - 6] = step
         else:
             lens = camera.with_focal(camera.fx * np.exp(step))
         changed = Alignment(
@@ -95,8 +92,8 @@ def test_pixel_derivatives_are_those_of_finite_differences(
         )
         return lens.project(changed.apply(points))
 
-    jacobian = projection_jacobian(points, camera, alignment, known_axis=axis, unknowns=9)
-    for k in range(9):
+    jacobian = projection_jacobian(points, camera, alignment)
+    for k in range(10):
         numerical = (pixels(k, STEP) - pixels(k, -STEP)) / (2 * STEP)
         np.testing.assert_allclose(jacobian[:, :, k], numerical, rtol=1e-6, atol=1e-4)
 

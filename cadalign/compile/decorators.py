@@ -77,7 +77,7 @@ class KernelFamily:
 
     @property
     def _numba_type_(self) -> types.Dispatcher:
-        return types.Dispatcher(self)
+        return types.Dispatcher(cast(Any, self))
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
         """Types of a call by a kernel."""

@@ -8,7 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.joint_robust import Consensus, find_consensus, robust_starts
+from cadalign.estimation.joint_robust import (
+    Consensus,
+    find_consensus,
+    robust_starts,
+    with_sightings,
+)
 from cadalign.estimation.lenses import ROUNDS, Lenses
 from cadalign.estimation.model import Size
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
@@ -134,8 +139,7 @@ def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
             break
         lenses = minimum.lenses.at(log_focals)
         there = problem.evidence(minimum.evidence.shape, lenses)
-        sightings = [column[minimum.inliers] for column in there.sightings]
-        evidence = there._replace(sightings=type(there.sightings)(*sightings))
+        evidence = with_sightings(there, minimum.inliers)
         state = minimum.state._replace(log_focals=np.zeros_like(log_focals))
         cost, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
         if not cost < np.inf:

@@ -26,16 +26,19 @@ from cadalign.compile import KernelFamily
 @KernelFamily
 def room_of(system: Any) -> Any:
     """Room for the system's equations, whose ``gradient`` has one entry for each unknown."""
+    raise NotImplementedError
 
 
 @KernelFamily
 def evaluate(system: Any, state: FloatArray, equations: Any) -> float:
     """Write the normal equations at a proposed state; returns the cost."""
+    raise NotImplementedError
 
 
 @KernelFamily
 def cost_at(system: Any, state: FloatArray) -> float:
     """The cost at a state, without derivatives."""
+    raise NotImplementedError
 
 
 @KernelFamily
@@ -45,6 +48,7 @@ def solve(system: Any, equations: Any, damping: float, step: FloatArray) -> floa
     Returns the decrease of the cost that the equations predict for it, NaN where they have no
     solution.
     """
+    raise NotImplementedError
 
 
 @KernelFamily
@@ -57,11 +61,13 @@ def move(
     moved: FloatArray,
 ) -> None:
     """Write the state that a step leads to; what the equations eliminate follows it."""
+    raise NotImplementedError
 
 
 @KernelFamily
 def accept(system: Any, state: FloatArray, equations: Any) -> None:
     """Make the equations that were evaluated last, at this state, those that steps are from."""
+    raise NotImplementedError
 
 
 @KernelFamily
@@ -70,13 +76,16 @@ def score_of(system: Any, state: FloatArray, cost: float) -> float:
 
     Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
     """
+    raise NotImplementedError
 
 
 @KernelFamily
 def are_same(system: Any, first: FloatArray, second: FloatArray) -> bool:
     """True if two states lie at the same minimum."""
+    raise NotImplementedError
 
 
 @KernelFamily
 def is_estimate(system: Any, state: FloatArray) -> bool:
     """False for a state that no object has, such as one whose scales ran off to zero."""
+    raise NotImplementedError

@@ -6,9 +6,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.focal_search import focal_slopes
 from cadalign.estimation.options import Sigma
-from cadalign.estimation.problems import full_covariance, whitening_of
+from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
 from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

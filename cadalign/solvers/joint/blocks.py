@@ -30,7 +30,7 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
 @inlined
 def first_scale(evidence: Evidence) -> int:
     """Place of the log scales in the border."""
-    return evidence.focals.low.shape[0]
+    return int(evidence.focals.low.shape[0])
 
 
 @kernel
@@ -203,7 +203,7 @@ def _undisplaced(evidence: Evidence, state: State, i: int, a: int) -> float:
     value = evidence.shape.mean[i, a]
     for k in range(evidence.shape.modes.shape[0]):
         value += state.coefficients[k] * evidence.shape.modes[k, i, a]
-    return value
+    return float(value)
 
 
 @inlined

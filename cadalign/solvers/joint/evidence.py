@@ -188,7 +188,7 @@ def unstretched(shape: Shape, state: State, i: int, a: int) -> float:
     value = shape.mean[i, a] + state.displacements[i, a]
     for k in range(shape.modes.shape[0]):
         value += state.coefficients[k] * shape.modes[k, i, a]
-    return value
+    return float(value)
 
 
 @kernel

@@ -308,7 +308,7 @@ def joint_score(evidence: Evidence, row: FloatArray, cost: float) -> float:
     decide_on_undetermined(equations.new, equations.new.blocks.shape[0])
     if not factorize_arrow(equations.new):
         return np.inf
-    return cost + log_determinant(equations.new) + equations.log_determinant[0]
+    return float(cost + log_determinant(equations.new) + equations.log_determinant[0])
 
 
 @are_same.of(Evidence)

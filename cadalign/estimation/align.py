@@ -16,6 +16,7 @@ from cadalign.estimation.assemble import assemble
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model, Size
+from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import FitStats, Result
@@ -41,7 +42,7 @@ def align(
     views: View | Sequence[View],
     *,
     size: Size | None = None,
-    init: Alignment | None = None,
+    init: Alignment | Sequence[Alignment | None] | None = None,
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
@@ -60,15 +61,16 @@ def align(
         size; views without it have a pose each and share the stretch and the shape.
     size : Size, optional
         Known lengths of the object.
-    init : Alignment, optional
+    init : Alignment or sequence of Alignment or None, optional
         A start beside those that the keypoints suggest, needed where these are too few: the
         alignment in the rig's frame or, where the views have no ``cam_from_rig``, in the first
-        camera's.
+        camera's, or one or None for each view.
     loss, loss_scale
         As for `cadalign.fit`.
     ransac : RansacOptions, optional
-        Search for the keypoints that agree, for views with outliers; of its options,
-        ``max_reproj_error`` and ``seed`` count where the shape is not exact.
+        Search for the keypoints that agree, for views with outliers. Where the shape is not exact,
+        ``minimal`` names the size of the samples, of which at most ``max_iterations`` are drawn,
+        and ``refine=False`` refines only once on the inliers.
     focal : {"known", "estimate"}
         Take the focal lengths of the views' cameras as right, or estimate them: views of equal
         cameras share one. ``result.cameras`` have the estimates.
@@ -102,16 +104,17 @@ def align(
     start = time.perf_counter()
     given = [views] if isinstance(views, View) else list(views)
     _check_views(given)
-    _check_start(size, init)
+    _check_size(size)
+    inits = _checked_inits(init, given)
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
     lenses = Lenses.of(given, focal, focal_prior)
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
     if size is None and ransac is None and not lenses.count and is_single(model, given):
-        return align_single(cast(ShapeModel, model), given[0], options=options, init=init)
+        return align_single(cast(ShapeModel, model), given[0], options=options, init=inits[0])
     prior = prior_of(model)
-    left_out = views_without_pose(prior, given, is_started=init is not None)
+    left_out = views_without_pose(prior, given, inits)
     if left_out:
         check_first(left_out)
         others = [view for number, view in enumerate(given) if number not in left_out]
@@ -120,7 +123,7 @@ def align(
                 model,
                 others,
                 size=size,
-                init=init,
+                init=[each for number, each in enumerate(inits) if number not in left_out],
                 loss=loss,
                 loss_scale=loss_scale,
                 ransac=ransac,
@@ -129,22 +132,31 @@ def align(
             )
         return with_views_left_out(found_by_used, prior, given, left_out)
     problem = Problem(prior, given, size, options, lenses)
-    minima, iterations, hypotheses = find_minima(problem, init, ransac)
+    lacks_sigma = any(view.sigma is None and len(view.keypoint_ids) for view in given)
+    if lacks_sigma:
+        problem, minima, iterations, hypotheses = find_minima_and_noise(problem, inits, ransac)
+    else:
+        minima, iterations, hypotheses = find_minima(problem, inits, ransac)
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    if all(view.mask is None for view in given):
-        return assemble(model, prior, given, minima, stats)
-    from cadalign.estimation.contours.depth import fit_depths
-    from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
+    masks = None
+    if any(view.mask is not None for view in given):
+        from cadalign.estimation.contours.depth import fit_depths
+        from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
 
-    masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
-    stats = replace(stats, seconds=time.perf_counter() - start)
-    return masks.noted_in(assemble(model, prior, given, masks.minima, stats))
+        masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
+        minima = masks.minima
+    if lacks_sigma:
+        minima = widened_by_noise(problem, minima)
+    stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
+    result = assemble(model, prior, given, minima, stats)
+    if lacks_sigma:
+        result = replace(result, sigma=problem.noise)
+    return result if masks is None else masks.noted_in(result)
 
 
 def align_batch(
@@ -156,14 +168,16 @@ def align_batch(
     loss: str = "linear",
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
+    focal: str = "known",
+    focal_prior: FocalPrior | None = None,
     workers: int = 1,
 ) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.
 
     Parameters
     ----------
-    model, loss, loss_scale, ransac
-        As for `align`.
+    model, loss, loss_scale, ransac, focal, focal_prior
+        As for `align`; every object has focal lengths of its own.
     objects : sequence of View or of sequences of View
         The views of every object.
     size, init
@@ -209,6 +223,8 @@ def align_batch(
                 loss=loss,
                 loss_scale=loss_scale,
                 ransac=ransac,
+                focal=focal,
+                focal_prior=focal_prior,
             )
         except CadalignError as error:
             return error
@@ -247,10 +263,27 @@ def _check_views(views: Sequence[object]) -> None:
             raise InputError(what, where=f"views[{number}]")
 
 
-def _check_start(size: object, init: object) -> None:
+def _check_size(size: object) -> None:
     if size is not None and not isinstance(size, Size):
         what = f"expected a cadalign.Size, got {type(size).__name__}"
         raise InputError(what, where="size")
-    if init is not None and not isinstance(init, Alignment):
+
+
+def _checked_inits(init: object, views: Sequence[View]) -> list[Alignment | None]:
+    """A start or None for each view; for the first one where a single start is given."""
+    if init is None or isinstance(init, Alignment):
+        return [init, *[None] * (len(views) - 1)]
+    if not isinstance(init, Sequence):
         what = f"expected a cadalign.Alignment, got {type(init).__name__}"
         raise InputError(what, where="init")
+    if len(init) != len(views):
+        fix = "give one, or one or None for each view"
+        raise InputError(f"{len(init)} for {len(views)} views", where="init", fix=fix)
+    for number, each in enumerate(init):
+        if each is not None and not isinstance(each, Alignment):
+            what = f"expected a cadalign.Alignment or None, got {type(each).__name__}"
+            raise InputError(what, where=f"init[{number}]")
+    known = next((each for each in init if each is not None), None)
+    if views[0].cam_from_rig is not None:  # they share one pose
+        return [known, *[None] * (len(views) - 1)]
+    return list(init)

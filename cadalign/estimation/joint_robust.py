@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
-from cadalign.solvers.constants import CAUCHY, LINEAR, UNKNOWNS
+from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
 from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
 
-_SAMPLE = 4
-_MOST_SAMPLES = 100
+_INLIER_RATIO = 0.5
+_LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
 _REFINED = 8
 _ROUNDS = 5
 _KEPT = 4  # minima of the robust search that are settled on their inliers
@@ -33,8 +37,16 @@ class Consensus(NamedTuple):
     score: float
 
 
-def robust_starts(evidence: Evidence, seed: int, init: Start | None = None) -> Starts:
-    """Starts for keypoints with outliers: poses under a robust loss, and those of small samples."""
+def robust_starts(
+    evidence: Evidence,
+    ransac: RansacOptions,
+    confidences: Sequence[FloatArray | None],
+    init: Start | None = None,
+) -> Starts:
+    """Starts for keypoints with outliers: poses under a robust loss, and those of small samples.
+
+    ``confidences`` (n_v,) are those of every view's keypoints.
+    """
     starts = starts_of(with_loss(evidence, CAUCHY), init)
     if evidence.rig.pose.max() > 0:
         return starts
@@ -42,7 +54,7 @@ def robust_starts(evidence: Evidence, seed: int, init: Start | None = None) -> S
         [
             in_rig(pose, camera)
             for view, camera in enumerate(evidence.rig.cam_from_rig)
-            for pose in _hypotheses(evidence, view, seed)
+            for pose in _hypotheses(evidence, view, ransac, confidences[view])
         ]
     ).reshape(-1, 12)
     count, focals = len(samples), starts.log_focals.shape[1]
@@ -54,7 +66,7 @@ def robust_starts(evidence: Evidence, seed: int, init: Start | None = None) -> S
 
 
 def find_consensus(
-    evidence: Evidence, starts: Starts, threshold: FloatArray
+    evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool
 ) -> tuple[list[Consensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
@@ -68,22 +80,26 @@ def find_consensus(
     starts : Starts
     threshold : (N,) float
         Largest whitened residual of an inlier.
+    settles : bool
+        Refine on the inliers until these don't change any more, and not only once.
     """
     minima, iterations = search_joint(with_loss(evidence, CAUCHY), *starts)
     found = []
     for state in minima.states[:_KEPT]:
-        refined = _settle(evidence, state, threshold)
+        refined = _settle(evidence, state, threshold, _ROUNDS if settles else 1)
         if refined is not None:
             found.append(refined)
     found.sort(key=lambda consensus: consensus.score)
     return found, iterations
 
 
-def _settle(evidence: Evidence, state: State, threshold: FloatArray) -> Consensus | None:
+def _settle(
+    evidence: Evidence, state: State, threshold: FloatArray, rounds: int
+) -> Consensus | None:
     """Refine on the inliers until these don't change."""
     best: Consensus | None = None
     inliers = _lengths(evidence, state) < threshold
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         if inliers.sum() < _LEAST_INLIERS:
             break
         some = with_sightings(evidence, inliers)
@@ -134,15 +150,15 @@ def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
     return evidence._replace(sightings=some)
 
 
-def _hypotheses(evidence: Evidence, view: int, seed: int) -> FloatArray:
+def _hypotheses(
+    evidence: Evidence, view: int, ransac: RansacOptions, confidences: FloatArray | None
+) -> FloatArray:
     """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
     given = rays_in(evidence, view)
-    count = len(given.points)
-    if count < _SAMPLE:
+    count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
+    if count < size:
         return np.empty((0, 12))
-    rng = np.random.default_rng(seed)
-    draws = np.array([rng.permutation(count)[:_SAMPLE] for _ in range(_MOST_SAMPLES)])
-    draws = np.unique(np.sort(draws, axis=1), axis=0)
+    draws = _draws(count, size, ransac, confidences)
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     chosen = draws.ravel()
@@ -150,16 +166,39 @@ def _hypotheses(evidence: Evidence, view: int, seed: int) -> FloatArray:
         given.points[chosen],
         given.rays[chosen],
         given.whitening[chosen],
-        np.arange(len(draws) + 1) * _SAMPLE,
+        np.arange(len(draws) + 1) * size,
         LINEAR,
         np.ones(len(draws)),
         np.zeros(len(draws)),
         free,
-        _SAMPLE,
+        size,
     )
     poses = found[np.isfinite(costs)]
     scores = np.array([_truncated(given, pose) for pose in poses])
     return poses[np.argsort(scores)][:_REFINED, :12]
+
+
+def _draws(
+    count: int, size: int, ransac: RansacOptions, confidences: FloatArray | None
+) -> IntArray:
+    """Samples (S, size) of keypoints: all where these are few, otherwise drawn at random.
+
+    So many that one without outliers is among them with the wanted probability, if half of the
+    keypoints are inliers. With confidences every other sample is drawn by these.
+    """
+    without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
+    wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
+    if math.comb(count, size) <= wanted:
+        return np.array(list(combinations(range(count), size)))
+    rng = np.random.default_rng(ransac.seed)
+    weights = None
+    if confidences is not None and confidences.sum() > 0:
+        weights = confidences + _LEAST_CONFIDENCE * confidences.max()
+        weights = weights / weights.sum()
+    draws = [
+        rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)
+    ]
+    return np.unique(np.sort(draws, axis=1), axis=0)
 
 
 def _truncated(given: ViewRays, pose: FloatArray) -> float:

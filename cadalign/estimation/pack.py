@@ -48,10 +48,12 @@ def evidence_of(
     loss: int,
     loss_scale: float,
     lenses: Lenses | None = None,
+    noise: float = 1.0,
 ) -> Evidence:
     """All that the views, the size and the first component of the prior tell.
 
-    By default the views' focal lengths are known.
+    By default the views' focal lengths are known. Keypoints without a sigma have the standard
+    deviation ``noise`` [px].
 
     Raises
     ------
@@ -69,7 +71,7 @@ def evidence_of(
         _check_view(prior, view, number)
     return Evidence(
         prior.components[0],
-        _sightings(rows, views, lenses.cameras, loss, loss_scale),
+        _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
         _rig(views),
         lenses.focals(),
         _directions(prior, views),
@@ -106,6 +108,7 @@ def _sightings(
     names: Sequence[list[int]],
     views: Sequence[View],
     cameras: Sequence[Camera],
+    noise: float,
     loss: int,
     loss_scale: float,
 ) -> Sightings:
@@ -116,7 +119,8 @@ def _sightings(
         images.append(np.full(len(rows), number))
         seen = rays_of(np.require(pixels, requirements="W"), camera)
         rays.append(seen)
-        whitenings.append(np.broadcast_to(whitening_of(view.sigma, seen, camera), (len(rows), 3)))
+        sigma = noise if view.sigma is None else view.sigma
+        whitenings.append(np.broadcast_to(whitening_of(sigma, seen, camera), (len(rows), 3)))
         slopes.append(focal_slopes(pixels, camera, seen) if camera.distortion else 0.0 * seen)
         depths.append(_depths(view, len(rows)))
     point = np.concatenate(points)

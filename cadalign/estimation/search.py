@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -30,6 +30,10 @@ _MOST_PER_FOCAL_OF_SEVERAL = 3
 _ITERATIONS = 100
 
 
+Inits = Sequence[Alignment | None]
+"""Given starts: one for each view of unknown motion, or one in the frame that the views share."""
+
+
 class Problem(NamedTuple):
     """Views of an object with a prior shape, in the terms of the user."""
 
@@ -38,6 +42,7 @@ class Problem(NamedTuple):
     size: Size | None
     options: FitOptions
     lenses: Lenses
+    noise: float = 1.0  # [px], where it is not given
 
     def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
         """The evidence about one component of the shape, with rays of ``lenses``."""
@@ -48,6 +53,7 @@ class Problem(NamedTuple):
             loss=LOSSES[self.options.loss],
             loss_scale=self.options.loss_scale,
             lenses=lenses,
+            noise=self.noise,
         )
         return everything._replace(shape=shape)
 
@@ -68,7 +74,7 @@ class Minimum(NamedTuple):
 
 
 def find_minima(
-    problem: Problem, init: Alignment | None, ransac: RansacOptions | None
+    problem: Problem, init: Inits, ransac: RansacOptions | None
 ) -> tuple[list[Minimum], int, int]:
     """Minima, the likeliest first, and the numbers of iterations and of starts."""
     minima: list[Minimum] = []
@@ -83,7 +89,7 @@ def find_minima(
             found, used = _search(evidence, starts)
         else:
             threshold = _thresholds(evidence, problem.lenses, ransac.max_reproj_error)
-            found, used = find_consensus(evidence, starts, threshold)
+            found, used = find_consensus(evidence, starts, threshold, settles=ransac.refine)
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
@@ -96,20 +102,19 @@ def find_minima(
     return minima, iterations, hypotheses
 
 
-def _starts(
-    problem: Problem, shape: Shape, init: Alignment | None, ransac: RansacOptions | None
-) -> Starts:
+def _starts(problem: Problem, shape: Shape, init: Inits, ransac: RansacOptions | None) -> Starts:
     """Starts at every focal length of the grid, or at those that are known."""
     lenses = problem.lenses
     found = []
     for log_focals in lenses.grid():
         known = Lenses(tuple(lenses.cameras_at(log_focals)), (-1,) * len(lenses.cameras))
         evidence = problem.evidence(shape, known)
-        first = None if init is None else _start(init, evidence)
+        first = _start(init, evidence)
         if ransac is None:
             starts = starts_of(evidence, first)
         else:
-            starts = robust_starts(evidence, int(ransac.seed), first)
+            trusted = [cast("FloatArray | None", view.confidences) for view in problem.views]
+            starts = robust_starts(evidence, ransac, trusted, first)
         if lenses.count:
             one = starts.poses.shape[1] == 1
             most = _MOST_PER_FOCAL if one else _MOST_PER_FOCAL_OF_SEVERAL
@@ -156,11 +161,19 @@ def _thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> 
     return max_reproj_error / focal[sightings.image] * root
 
 
-def _start(init: Alignment, evidence: Evidence) -> Start:
-    """A given alignment as a start; where the size is held, it shrinks about the origin."""
-    rotation, translation, scale = init.rotation, init.translation, np.array(init.scale)
+def _start(init: Inits, evidence: Evidence) -> Start | None:
+    """Given alignments as a start; where the size is held, they shrink about their cameras."""
+    given = [each for each in init if each is not None]
+    if not given:
+        return None
     held = evidence.scales.free == 0
+    poses: list[FloatArray | None] = [None] * (int(evidence.rig.pose.max()) + 1)
+    for number, each in enumerate(init):
+        if each is None:
+            continue
+        size = np.array(each.scale)[held].mean() if held.any() else 1.0
+        poses[number] = np.concatenate([each.rotation.ravel(), each.translation / size])
+    scale = np.array(given[0].scale)
     if held.any():
-        size = scale[held].mean()
-        scale, translation = np.where(held, 1.0, scale / size), translation / size
-    return Start(np.concatenate([rotation.ravel(), translation]), np.log(scale))
+        scale = np.where(held, 1.0, scale / scale[held].mean())
+    return Start(poses, np.log(scale))

@@ -94,6 +94,8 @@ def is_single(model: object, views: Sequence[View]) -> bool:
         return False
     view = views[0]
     others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
+    if view.sigma is None:
+        return False
     return len(view.keypoint_ids) >= _LEAST_POINTS and all(each is None for each in others)
 
 

@@ -60,9 +60,12 @@ def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArra
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
     if init is not None:
-        if _is_underdetermined(evidence):  # what the keypoints alone suggest is arbitrary
-            per_pose[0].clear()
-        per_pose[0].insert(0, (init.pose, init.log_scales))
+        for given, found_of_pose in zip(init.poses, per_pose, strict=True):
+            if given is None:
+                continue
+            if _is_underdetermined(evidence):  # what the keypoints alone suggest is arbitrary
+                found_of_pose.clear()
+            found_of_pose.insert(0, (given, init.log_scales))
     elif is_metric and poses == 1:
         rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
         placed = metric_starts(evidence, rotations)
@@ -92,9 +95,9 @@ def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArra
 
 
 class Start(NamedTuple):
-    """A pose (12,) of the rig, and log scales (3,)."""
+    """A given start: a pose (12,) or None for each pose of the evidence, and log scales (3,)."""
 
-    pose: FloatArray
+    poses: Sequence[FloatArray | None]
     log_scales: FloatArray
 
 

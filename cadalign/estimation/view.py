@@ -43,8 +43,9 @@ class View:
         Keypoints in the image [px]; integers are pixel centres.
     ids : sequence of n int or str, optional
         The model's ids or names of these keypoints; by default its first n, in its order.
-    sigma : float, (n,) float, or (n, 2, 2) float
-        Standard deviation of the keypoints, of each, or covariance of each [px].
+    sigma : float, (n,) float, (n, 2, 2) float, or None
+        Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
+        for all views that have none, by its likelihood under a weak prior about 2 px.
     confidences : (n,) float, optional
         Confidences of the keypoints, for a robust search.
     depth : (n,) or (h, w) float, or path, optional
@@ -96,7 +97,7 @@ class View:
     camera: Camera
     points_2d: npt.ArrayLike = ()
     ids: Sequence[Hashable] | None = None
-    sigma: Sigma = 1.0
+    sigma: Sigma | None = 1.0
     confidences: npt.ArrayLike | None = None
     depth: npt.ArrayLike | str | os.PathLike[str] | None = None
     depth_sigma: npt.ArrayLike = 0.01

@@ -28,12 +28,13 @@ _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rot
 _ITERATIONS = 50
 
 
-def views_without_pose(prior: ShapePrior, views: Sequence[View], *, is_started: bool) -> list[int]:
+def views_without_pose(
+    prior: ShapePrior, views: Sequence[View], inits: Sequence[Alignment | None]
+) -> list[int]:
     """Numbers of the views of unknown motion whose keypoints determine no pose.
 
     Those are fewer than three keypoints, or keypoints on one line. A single view, views of a rig,
-    the first view of an estimate that ``is_started`` from a given alignment, and views that tell
-    nothing at all are never among them.
+    views with a given start, and views that tell nothing at all are never among them.
     """
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
         return []
@@ -41,7 +42,7 @@ def views_without_pose(prior: ShapePrior, views: Sequence[View], *, is_started: 
     return [
         number
         for number, view in enumerate(views)
-        if not (is_started and number == 0)
+        if inits[number] is None
         and (len(view.keypoint_ids) or view.mask is not None or view.up is not None)
         and _is_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]

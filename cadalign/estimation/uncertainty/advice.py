@@ -216,13 +216,14 @@ def _keypoints(scene: KnownScene, name: Hashable) -> Iterator[Advice]:
 def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
     count = len(view.keypoint_ids)
     depth = view.depth
+    sigma = 1.0 if view.sigma is None else view.sigma
     if depth is not None and view.depth_image is None:
         depth = np.append(cast(FloatArray, depth), np.nan)
     return replace(
         _without_scale(view),
         points_2d=np.vstack([cast(FloatArray, view.points_2d), place]),
         ids=(*view.keypoint_ids, name),
-        sigma=_with_mean(view.sigma, count, is_one=np.ndim(view.sigma) == 0),
+        sigma=_with_mean(sigma, count, is_one=np.ndim(sigma) == 0),
         confidences=None,
         depth=depth,
         depth_sigma=_with_mean(view.depth_sigma, count, is_one=np.ndim(view.depth_sigma) == 0),

@@ -77,6 +77,7 @@ def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
     if basis is None:
         (view,), (shot,) = given.views, given.shots
         points = np.asarray(scene.model.points_3d)[shot.rows]
+        assert view.sigma is not None
         return cramer_rao_bound(points, view.camera, scene.gt, sigma=view.sigma, focal="known")
     evidence, state = basis.evidence, basis.state
     loss = np.full_like(evidence.sightings.loss, LINEAR)

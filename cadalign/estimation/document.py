@@ -1,9 +1,9 @@
-"""The JSON form of a result, as `fit.json` holds it; `older_documents` reads that of 0.1.0."""
+"""The JSON form of a result, as `fit.json` holds it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.older_document import completed, upgraded
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pixel_information
 from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
@@ -46,7 +47,7 @@ class _Alternative(ForeignDocument):
     bounds: Matrix | None = None
 
 
-class ReadOptions(ForeignDocument):
+class _Options(ForeignDocument):
     """The fields of `FitOptions`."""
 
     method: str
@@ -63,17 +64,24 @@ class ReadOptions(ForeignDocument):
 class _View(ForeignDocument):
     camera: Any
     alignment: Any
-    ids: list[int | str]
+    ids: list[int | str] | None  # older files lack them
     points_2d: list[tuple[Finite, Finite] | None]
     residuals: list[tuple[float, float] | None]
     inliers: list[bool]
     covariance: Matrix | None
 
     def __post_init__(self) -> None:
-        check_view(self.residuals, self.inliers, {"ids": self.ids, "points_2d": self.points_2d})
+        for name in ("ids", "points_2d", "inliers"):
+            entries = getattr(self, name)
+            if entries is not None and len(entries) != len(self.residuals):
+                what = f"{len(entries)} entries for {len(self.residuals)} residuals"
+                raise InputError(what, where=name)
+        for row, (residual, kept) in enumerate(zip(self.residuals, self.inliers, strict=True)):
+            if kept and not (residual and math.isfinite(sum(residual))):
+                raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
 
 
-class ReadSummary(ForeignDocument):
+class _Summary(ForeignDocument):
     """The fields of `EvidenceSummary`."""
 
     kind: str
@@ -119,9 +127,9 @@ class _Result(ForeignDocument):
     sigma: NotNegative | None = None
     cost: float | None = None
     alternatives: tuple[_Alternative, ...] = ()
-    evidence: tuple[ReadSummary, ...] = ()
+    evidence: tuple[_Summary, ...] = ()
     misfit: _Misfit | None = None
-    options: ReadOptions | None = None
+    options: _Options | None = None
     focal_prior: FocalPrior | None = None
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
     equal_under_symmetry: str = ""
@@ -131,29 +139,10 @@ class _Result(ForeignDocument):
         if not self.views:
             raise InputError("there are none", where="views")
         for name in ("ids", "points_covariance", "points_cam_covariance"):
-            check_count(getattr(self, name), name, self.points_3d)
-
-
-def check_count(entries: Sequence[object] | None, name: str, points: Sequence[object]) -> None:
-    """Refuse a field that has not an entry for each keypoint."""
-    if entries is not None and len(entries) != len(points):
-        what = f"{len(entries)} entries, but points_3d has {len(points)}"
-        raise InputError(what, where=name)
-
-
-def check_view(
-    residuals: Sequence[tuple[float, float] | None],
-    inliers: Sequence[bool],
-    others: Mapping[str, Sequence[object]],
-) -> None:
-    """Refuse fields of a view of different lengths, and inliers behind the camera."""
-    for name, entries in {"inliers": inliers, **others}.items():
-        if len(entries) != len(residuals):
-            what = f"{len(entries)} entries for {len(residuals)} residuals"
-            raise InputError(what, where=name)
-    for row, (residual, kept) in enumerate(zip(residuals, inliers, strict=True)):
-        if kept and not (residual and math.isfinite(sum(residual))):
-            raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
+            entries = getattr(self, name)
+            if entries is not None and len(entries) != len(self.points_3d):
+                what = f"{len(entries)} entries, but points_3d has {len(self.points_3d)}"
+                raise InputError(what, where=name)
 
 
 def write_result(result: Result) -> dict[str, Any]:
@@ -225,12 +214,9 @@ def _plain(array: FloatArray | None) -> Any:
 
 
 def _plain_options(options: FitOptions) -> dict[str, Any]:
-    return {**asdict(replace(options, sigma=None)), "sigma": plain_sigma(options.sigma)}
-
-
-def plain_sigma(sigma: Any) -> Any:
-    """A deviation, one for each keypoint, or covariances, as numbers and lists."""
-    return sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
+    sigma = options.sigma
+    plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
+    return {**asdict(replace(options, sigma=None)), "sigma": plain}
 
 
 def read_result(data: Mapping[str, Any]) -> Result:
@@ -244,9 +230,7 @@ def read_result(data: Mapping[str, Any]) -> Result:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             if isinstance(data, Mapping) and "version" not in data:
-                from cadalign.estimation.older_documents import read_older
-
-                return read_older(data)
+                return completed(_result(convert(upgraded(data, VERSION), _Result)))
             return _result(convert(data, _Result))
     except CadalignError as error:
         place = f"result: {error.where}" if error.where else "result"
@@ -261,12 +245,12 @@ def _result(read: _Result) -> Result:
             views.append(_view(view, unknowns))
     statistics = Stated(
         views[0].covariance,
-        fisher_covariance=read_array(read.fisher_covariance, "fisher_covariance", unknowns),
-        points_covariance=read_points(read.points_covariance, "points_covariance"),
-        points_cam_covariance=read_points(read.points_cam_covariance, "points_cam_covariance"),
+        fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns),
+        points_covariance=_of_points(read.points_covariance, "points_covariance"),
+        points_cam_covariance=_of_points(read.points_cam_covariance, "points_cam_covariance"),
         warnings=tuple(read.warnings),
         misfit=None if read.misfit is None else _misfit(read.misfit),
-        evidence=tuple(summary_of(each) for each in read.evidence),
+        evidence=tuple(EvidenceSummary(**msgspec.structs.asdict(each)) for each in read.evidence),
         degrees_of_freedom=read.degrees_of_freedom,
     )
     views[0] = replace(views[0], statistics=statistics)
@@ -288,11 +272,11 @@ def _result(read: _Result) -> Result:
             for row, entry in enumerate(read.alternatives)
         ),
         stats=read.stats,
-        options=None if read.options is None else read_options(read.options, count),
+        options=None if read.options is None else _options(read.options, count),
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
         component=read.component,
         rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
-        own_bounds=read_bounds(read.bounds),
+        own_bounds=_bounds(read.bounds),
         own_stretch=None if read.stretch is None else np.array(read.stretch),
         own_equal=read.equal_under_symmetry,
     )
@@ -302,37 +286,32 @@ def _view(read: _View, unknowns: int) -> ViewResult:
     return ViewResult(
         Camera.from_dict(read.camera),
         Alignment.from_dict(read.alignment),
-        tuple(read.ids),
+        tuple(read.ids or ()),
         np.array([row or _UNKNOWN for row in read.points_2d]).reshape(-1, 2),
-        read_residuals(read.residuals),
+        np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
         np.array(read.inliers, dtype=bool),
-        Stated(read_array(read.covariance, "covariance", unknowns)),
+        Stated(_array(read.covariance, "covariance", unknowns)),
     )
 
 
-def read_residuals(rows: Sequence[tuple[float, float] | None]) -> FloatArray:
-    """Residuals (n, 2) [px]; infinite behind the camera."""
-    return np.array([row or _BEHIND for row in rows]).reshape(-1, 2)
-
-
-def read_array(value: Matrix | None, name: str, size: int) -> FloatArray | None:
+def _array(value: Matrix | None, name: str, size: int) -> FloatArray | None:
     """A covariance (size, size), if there is one."""
     return None if value is None else as_floats(value, name=name, shape=(size, size))
 
 
-def read_bounds(value: Matrix | None) -> FloatArray | None:
+def _bounds(value: Matrix | None) -> FloatArray | None:
     """A box (2, 3), if there is one."""
     return None if value is None else as_floats(value, name="bounds", shape=(2, 3))
 
 
-def read_points(value: list[Matrix] | None, name: str) -> FloatArray | None:
+def _of_points(value: list[Matrix] | None, name: str) -> FloatArray | None:
     """Covariances (m, 3, 3) of keypoints, if there are any."""
     if value is None or not value:
         return None if value is None else np.empty((0, 3, 3))
     return as_floats(value, name=name, shape=(None, 3, 3))
 
 
-def read_options(read: ReadOptions, count: int) -> FitOptions:
+def _options(read: _Options, count: int) -> FitOptions:
     """The options of a fit of so many keypoints."""
     with within("options"):
         sigma: Any = read.sigma
@@ -347,11 +326,6 @@ def read_options(read: ReadOptions, count: int) -> FitOptions:
         return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
 
 
-def summary_of(read: ReadSummary) -> EvidenceSummary:
-    """The summary of a piece of evidence."""
-    return EvidenceSummary(**msgspec.structs.asdict(read))
-
-
 def _misfit(read: _Misfit) -> Misfit:
     outliers = {each.row: each.distance_px for each in read.outliers}
     return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers)
@@ -364,5 +338,5 @@ def _alternative(entry: _Alternative, where: str) -> Alternative:
             entry.relative_likelihood,
             Camera.from_dict(entry.camera),
             np.array(entry.points_3d).reshape(-1, 3),
-            read_bounds(entry.bounds),
+            _bounds(entry.bounds),
         )

@@ -31,6 +31,7 @@ def result_of_solution(
         sigma = float(options.sigma)
     inliers = np.empty(len(problems.points_3d), dtype=bool)
     inliers.fill(True)
+    effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
     covariance = None
     if solutions.covariances is not None:
         covariance = full_covariance(solutions.covariances[0], options.known_axis)
@@ -42,7 +43,7 @@ def result_of_solution(
         residuals=solutions.residuals,
         inliers=inliers,
         method=options.method,
-        stats=FitStats(iterations, hypotheses, seconds),
+        stats=quickly(FitStats, effort),
         sigma=sigma,
         covariance=covariance,
         cost=None if covariance is None else solutions.costs.item(0),

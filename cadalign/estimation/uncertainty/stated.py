@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,49 +28,9 @@ if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.misfit import Misfit
 
 
-class Statistics(Protocol):
-    """What is stated, by whatever door a result came."""
-
-    @property
-    def covariance(self) -> FloatArray | None:
-        """The calibrated covariance (9, 9) or (10, 10)."""
-
-    @property
-    def fisher_covariance(self) -> FloatArray | None:
-        """The inverse Fisher information, in the same form."""
-
-    @property
-    def points_covariance(self) -> FloatArray | None:
-        """Of the keypoints (m, 3, 3) in the model's frame; None where it follows."""
-
-    @property
-    def points_cam_covariance(self) -> FloatArray | None:
-        """Of the keypoints (m, 3, 3) in the first camera; None where it follows."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about the evidence."""
-
-    @property
-    def misfit(self) -> Misfit | None:
-        """The test that the residuals fail."""
-
-    @property
-    def evidence(self) -> tuple[EvidenceSummary, ...]:
-        """Agreement of the pieces of evidence."""
-
-    @property
-    def degrees_of_freedom(self) -> float | None:
-        """Of the t distribution of the errors."""
-
-    @property
-    def basis(self) -> AnyBasis | None:
-        """What contributions are computed from."""
-
-
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """Statements that are known; see `Statistics`."""
+    """Statements that are known."""
 
     covariance: FloatArray | None
     fisher_covariance: FloatArray | None = None
@@ -177,6 +137,10 @@ class KeypointStatistics:
         count = max(len(residuals), 1)
         in_sigmas, rms = np.sqrt([whitened / (2 * count), squares / count]).tolist()
         return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
+
+
+Statistics = Stated | KeypointStatistics
+"""What is stated, by whatever door a result came."""
 
 
 def points_covariances(

@@ -50,7 +50,8 @@ from cadalign.solvers.unknowns import move_rigid, orthonormalize
 POSE_UNKNOWNS = 6
 POSE = 12  # numbers of a pose at the start of a state
 _RESIDUAL = 6
-_SAME_CHORD = 1e-3
+_SAME_CHORD = 0.05
+_LEAST_INFORMATION = 25.0  # about a turn [1 / rad^2]; beyond, the posterior is no Gaussian
 
 
 class Posed(NamedTuple):
@@ -478,6 +479,8 @@ def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
     equations = posed_room(system)
     score = evaluate_posed(system, state, equations)
     factor = equations.normal.new_hessian
+    for k in range(3):
+        factor[k, k] += _LEAST_INFORMATION
     if not score < np.inf or not cholesky(factor, POSE_UNKNOWNS, 0.0):
         return np.inf
     for k in range(POSE_UNKNOWNS):

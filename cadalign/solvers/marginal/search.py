@@ -20,14 +20,13 @@ from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, tar
 from cadalign.solvers.refine import refine
 from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
 from cadalign.solvers.starts import rotation_starts
-from cadalign.solvers.system import cost_at, score_of
+from cadalign.solvers.system import are_same, cost_at, score_of
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 3
 _MAX_ITERATIONS = 200
 _SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
-_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
-_LESS_LIKELY = 25.0  # excess score at which a minimum of the cost is given up
+_UNLIKELY = 40.0  # excess cost or score, after the probe, at which a start is given up
 _MOST_STARTS = 64
 _MOST = 32
 _ROTATIONS = 96
@@ -63,7 +62,7 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
         states = np.empty((chosen.shape[0], 12 + 6 * n))
         for s in range(chosen.shape[0]):
             states[s] = state_at(starts[chosen[s]], n)
-        effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
+        effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, 0, _UNLIKELY)
         search(Posed(targets[g], seen, False), states, effort, g, mixture.penalties[g], likely)
     return _integrated(mixture, targets, seen, likely), count
 
@@ -72,25 +71,27 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
 def _integrated(
     mixture: Mixture, targets: list[GaussianTarget], seen: Seen, likely: Minima
 ) -> Minima:
-    """The minima of F that minima of the cost lead to."""
+    """The minima of F that states of a low cost lead to, the most promising first."""
     count = likely.counts[0]
     minima = room_for_minima(max(count, 1), likely.states.shape[1])
     minima.counts[1] = likely.counts[1]
     scores = np.empty(count)
     for k in range(count):
-        g, state = likely.label[k], likely.states[k]
-        scores[k] = score_of(Posed(targets[g], seen, True), state, 0.0) + mixture.penalties[g]
-    least = np.inf
-    for k in range(count):
-        least = min(least, scores[k])
+        system = Posed(targets[likely.label[k]], seen, True)
+        scores[k] = score_of(system, likely.states[k], 0.0) + mixture.penalties[likely.label[k]]
     for k in np.argsort(scores):
-        if not scores[k] < least + _LESS_LIKELY:
+        if not scores[k] < minima.scores[0] + _UNLIKELY:
             break
         g, state = likely.label[k], likely.states[k]
         system = Posed(targets[g], seen, True)
-        cost, used, _ = refine(system, _MAX_ITERATIONS, state)
-        minima.counts[1] += used
-        add_minimum(system, state, cost, g, mixture.penalties[g], minima)
+        is_new = True
+        for j in range(minima.counts[0]):
+            if minima.label[j] == g and are_same(system, state, minima.states[j]):
+                is_new = False
+        if is_new:
+            cost, used, _ = refine(system, _MAX_ITERATIONS, state)
+            minima.counts[1] += used
+            add_minimum(system, state, cost, g, mixture.penalties[g], minima)
     for k in range(minima.counts[0]):
         system = Posed(targets[minima.label[k]], seen, False)
         minima.costs[k] = cost_at(system, minima.states[k])

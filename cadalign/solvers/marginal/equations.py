@@ -71,7 +71,7 @@ class Whitened(NamedTuple):
 
     ``rows`` (7, 2 n) are the derivatives by the pose and the residuals e, less A S h where the
     shape is integrated out; ``by_shape`` (2 n, 3) those by the own point, not whitened; ``factor``
-    (2 n, 2 n) the lower Cholesky factor of M, with the inverse of its diagonal. ``slope`` (3 n,) is
+    (2 n, 2 n) the upper Cholesky factor of M, with the inverse of its diagonal. ``slope`` (3 n,) is
     h and ``turned`` (6,) half the derivative of log det M by the pose, with the shape held.
     ``sums`` (2,) holds the decrease of F that the least squares of the rows are subtracted from,
     and log det M.
@@ -234,7 +234,7 @@ def _fall_of_weight(loss: int, scale: float, root: float, square: float) -> floa
 
 @fast_sums
 def _widen(covariance: FloatArray, by_shape: FloatArray, matrix: FloatArray) -> None:
-    """Write the lower triangle of ``M = I + A S A'``."""
+    """Write the upper triangle of ``M = I + A S A'``."""
     size = by_shape.shape[0]
     row = np.empty(covariance.shape[0])
     for c in range(size):
@@ -248,7 +248,7 @@ def _widen(covariance: FloatArray, by_shape: FloatArray, matrix: FloatArray) -> 
             )
         for d in range(c + 1):
             j = 3 * (d // 2)
-            matrix[c, d] = (
+            matrix[d, c] = (
                 row[j] * by_shape[d, 0] + row[j + 1] * by_shape[d, 1] + row[j + 2] * by_shape[d, 2]
             )
         matrix[c, c] += 1.0
@@ -256,23 +256,31 @@ def _widen(covariance: FloatArray, by_shape: FloatArray, matrix: FloatArray) -> 
 
 @fast_sums
 def _factorize(new: Whitened) -> bool:
-    """Factorize M; False if it is not positive."""
+    """Factorize M, two rows at a time; False if it is not positive."""
     factor = new.factor
+    size = factor.shape[0]
     log_determinant = 0.0
-    for i in range(factor.shape[0]):
-        for j in range(i):
-            total = 0.0
-            for k in range(j):
-                total += factor[i, k] * factor[j, k]
-            factor[i, j] = (factor[i, j] - total) * factor[j, j]
-        total = 0.0
-        for k in range(i):
-            total += factor[i, k] * factor[i, k]
-        square = factor[i, i] - total
-        if not square > 0.0:
+    for k in range(0, size, 2):
+        one, two = factor[k], factor[k + 1]
+        first = one[k]
+        if not first > 0.0:
             return False
-        log_determinant += np.log(square)
-        factor[i, i] = 1.0 / np.sqrt(square)  # its only use is to divide by the diagonal
+        scale = 1.0 / np.sqrt(first)
+        share = one[k + 1] * scale
+        second = two[k + 1] - share * share
+        if not second > 0.0:
+            return False
+        log_determinant += np.log(first * second)
+        scale_two = 1.0 / np.sqrt(second)
+        one[k], one[k + 1], two[k + 1] = scale, share, scale_two
+        for j in range(k + 2, size):
+            above = one[j] * scale
+            one[j] = above
+            two[j] = (two[j] - share * above) * scale_two
+        for i in range(k + 2, size):
+            row, p, q = factor[i], one[i], two[i]
+            for j in range(i, size):
+                row[j] -= p * one[j] + q * two[j]
     new.sums[1] = log_determinant
     return True
 
@@ -281,16 +289,20 @@ def _factorize(new: Whitened) -> bool:
 def _whiten(new: Whitened, hessian: FloatArray, gradient: FloatArray) -> None:
     """Whiten the rows, and sum the normal equations."""
     factor, rows = new.factor, new.rows
-    for i in range(factor.shape[0]):
-        for m in range(POSE_UNKNOWNS + 1):
-            total = 0.0
-            for k in range(i):
-                total += factor[i, k] * rows[m, k]
-            rows[m, i] = (rows[m, i] - total) * factor[i, i]
+    size = factor.shape[0]
+    for m in range(POSE_UNKNOWNS + 1):
+        row = rows[m]
+        for k in range(0, size, 2):
+            one, two = factor[k], factor[k + 1]
+            p = row[k] * one[k]
+            q = (row[k + 1] - p * one[k + 1]) * two[k + 1]
+            row[k], row[k + 1] = p, q
+            for j in range(k + 2, size):
+                row[j] -= p * one[j] + q * two[j]
     for k in range(POSE_UNKNOWNS):
         for m in range(k, POSE_UNKNOWNS + 1):
             total = 0.0
-            for c in range(factor.shape[0]):
+            for c in range(size):
                 total += rows[k, c] * rows[m, c]
             if m < POSE_UNKNOWNS:
                 hessian[k, m] = hessian[m, k] = total
@@ -300,23 +312,29 @@ def _whiten(new: Whitened, hessian: FloatArray, gradient: FloatArray) -> None:
 
 @fast_sums
 def _invert(factor: FloatArray, inverse: FloatArray, square: FloatArray) -> None:
-    """Write the inverse of the factor, and that of M."""
+    """Write the transposed inverse of the factor, and the inverse of M."""
     size = factor.shape[0]
-    for i in range(size):
-        for k in range(size):
-            inverse[i, k] = square[i, k] = 0.0
-        for k in range(i):
-            product = factor[i, k] * factor[i, i]
-            for m in range(k + 1):
-                inverse[i, m] -= product * inverse[k, m]
-        inverse[i, i] = factor[i, i]
-        for c in range(i + 1):
-            product = inverse[i, c]
-            for d in range(c + 1):
-                square[c, d] += product * inverse[i, d]
-    for c in range(size):
-        for d in range(c):
-            square[d, c] = square[c, d]
+    for k in range(size):
+        for j in range(size):
+            inverse[k, j] = square[k, j] = 0.0
+    for k in range(0, size, 2):
+        one, two = inverse[k], inverse[k + 1]
+        for i in range(0, k, 2):
+            over, under = inverse[i], inverse[i + 1]
+            p, q = factor[i, k], factor[i + 1, k]
+            r, s = factor[i, k + 1], factor[i + 1, k + 1]
+            for j in range(i + 2):
+                one[j] -= p * over[j] + q * under[j]
+                two[j] -= r * over[j] + s * under[j]
+        share, scale, scale_two = factor[k, k + 1], factor[k, k], factor[k + 1, k + 1]
+        one[k], two[k + 1] = 1.0, 1.0
+        for j in range(k + 2):
+            one[j] *= scale
+            two[j] = (two[j] - share * one[j]) * scale_two
+        for i in range(k + 2):
+            row, p, q = square[i], one[i], two[i]
+            for j in range(k + 2):
+                row[j] += p * one[j] + q * two[j]
 
 
 @fast_sums
@@ -433,9 +451,10 @@ def _move(
     factor, by_shape, right = equations.current.factor, equations.current.by_shape, equations.right
     slope, covariance = equations.current.slope, system.target.covariance
     for i in range(factor.shape[0] - 1, -1, -1):
-        right[i] *= factor[i, i]
-        for k in range(i):
-            right[k] -= factor[i, k] * right[i]
+        total = right[i]
+        for k in range(i + 1, factor.shape[0]):
+            total -= factor[i, k] * right[k]
+        right[i] = total * factor[i, i]
     size = covariance.shape[0]
     share = 1.0 / (1.0 + damping)
     force = np.empty(size)
@@ -463,7 +482,7 @@ def _accept(system: Posed, state: FloatArray, equations: MarginalEquations) -> N
         copy_into(current.rows[k], new.rows[k])
     for c in range(new.factor.shape[0]):
         copy_into(current.by_shape[c], new.by_shape[c])
-        for d in range(c + 1):
+        for d in range(c, new.factor.shape[0]):
             current.factor[c, d] = new.factor[c, d]
     copy_into(current.slope, new.slope)
     copy_into(current.turned, new.turned)

@@ -172,14 +172,15 @@ def _whitened_by_points(
     for p in range(count):
         for c in range(size):
             first = 3 * seen.points[c // 2]
-            total = square * (
+            told[p, c] = square * (
                 by_shape[c, 0] * whole[p, first]
                 + by_shape[c, 1] * whole[p, first + 1]
                 + by_shape[c, 2] * whole[p, first + 2]
             )
-            for k in range(c):
-                total -= factor[c, k] * told[p, k]
-            told[p, c] = total * factor[c, c]
+        for c in range(size):
+            told[p, c] *= factor[c, c]
+            for k in range(c + 1, size):
+                told[p, k] -= factor[c, k] * told[p, c]
     return told
 
 

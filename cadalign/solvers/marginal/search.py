@@ -24,9 +24,10 @@ from cadalign.solvers.system import are_same, cost_at, score_of
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 3
-_MAX_ITERATIONS = 200
+_MAX_ITERATIONS = 30
 _SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
-_UNLIKELY = 40.0  # excess cost or score, after the probe, at which a start is given up
+_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
+_LESS_LIKELY = 20.0  # excess score at which a start is given up, refined no further
 _MOST_STARTS = 64
 _MOST = 32
 _ROTATIONS = 96
@@ -80,7 +81,7 @@ def _integrated(
         system = Posed(targets[likely.label[k]], seen, True)
         scores[k] = score_of(system, likely.states[k], 0.0) + mixture.penalties[likely.label[k]]
     for k in np.argsort(scores):
-        if not scores[k] < minima.scores[0] + _UNLIKELY:
+        if not scores[k] < minima.scores[0] + _LESS_LIKELY:
             break
         g, state = likely.label[k], likely.states[k]
         system = Posed(targets[g], seen, True)

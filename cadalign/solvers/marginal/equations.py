@@ -414,7 +414,8 @@ def posed_cost(system: Posed, state: FloatArray) -> float:
     pose = np.ones(POSE_SIZE)
     copy_into(pose[:POSE], state[:POSE])
     keypoints = Keypoints(points, seen.rays, seen.whitening, seen.loss, seen.loss_scale)
-    return keypoint_cost(keypoints, pose) + prior
+    prior += keypoint_cost(keypoints, pose)
+    return prior
 
 
 @solve.of(Posed)

@@ -23,7 +23,7 @@ from cadalign.solvers.starts import rotation_starts
 from cadalign.solvers.system import are_same, cost_at, score_of
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
-_PROBE_ITERATIONS = 3
+_PROBE_ITERATIONS = 2
 _MAX_ITERATIONS = 30
 _SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up

@@ -414,8 +414,7 @@ def posed_cost(system: Posed, state: FloatArray) -> float:
     pose = np.ones(POSE_SIZE)
     copy_into(pose[:POSE], state[:POSE])
     keypoints = Keypoints(points, seen.rays, seen.whitening, seen.loss, seen.loss_scale)
-    prior += keypoint_cost(keypoints, pose)
-    return prior
+    return keypoint_cost(keypoints, pose) + prior
 
 
 @solve.of(Posed)
@@ -425,7 +424,7 @@ def _solve(system: Posed, equations: MarginalEquations, damping: float, step: Fl
     if expected != expected:
         return np.nan
     rows = equations.current.rows
-    expected = equations.current.sums[0]
+    expected = float(equations.current.sums[0])
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
             expected -= 2.0 * equations.current.turned[k] * step[k]

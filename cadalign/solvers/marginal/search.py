@@ -1,7 +1,9 @@
 """Search for the poses of one view's keypoints under a mixture of Gaussian shapes.
 
-It starts from poses that the keypoints suggest for the means. Minima of the cost are found first;
-those that may be likely are then refined on the objective that the shape is integrated out of.
+It starts from poses that the keypoints suggest for the means. Few steps on the plain cost tell the
+promising ones; from these it descends on the objective that the shape is integrated out of. Minima
+of the cost are no starts for that: some lie so near the camera that the descent ends in another
+minimum.
 """
 
 from __future__ import annotations

@@ -91,7 +91,9 @@ class KernelCache(FunctionCache):
         )
 
     def _index_key(self, signature: Any, codegen: Any) -> Any:
-        return *super()._index_key(signature, codegen), self._use, _sources_of(signature)
+        # Types as text: an index that another version wrote must not ask for classes of that one.
+        types, *others = super()._index_key(signature, codegen)
+        return repr(types), *others, self._use, _sources_of(signature)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for a signature, None if there is none.

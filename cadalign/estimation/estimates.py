@@ -22,9 +22,10 @@ from cadalign.geometry.symmetry_group import Equal, group_of
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.marginal.equations import force_of
 from cadalign.solvers.marginal.moments import Likely, Moments, moments_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
-from cadalign.solvers.marginal.search import ViewMinima
+from cadalign.solvers.search import Minima
 
 Held = tuple[bool, bool, bool]
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
@@ -253,17 +254,17 @@ def with_box(
 
 
 def with_boxes(
-    mixture: Mixture, seen: Seen, minima: ViewMinima, count: int, margins: BoxMargins
-) -> tuple[Mixture, ViewMinima]:
+    mixture: Mixture, seen: Seen, minima: Minima, count: int, margins: BoxMargins
+) -> tuple[Mixture, Minima]:
     """A component for each of the first minima, with the box that `with_box` gives."""
     if not mixture.covariances.any():
         return mixture, minima
-    component = minima.component[:count]
+    component = minima.label[:count]
     means, covariances = mixture.means[component], mixture.covariances[component]
     rows, axes = np.unique(seen.points), np.arange(3)
     box = 3 * means.shape[1] - np.arange(6, 0, -1).reshape(2, 3)
     for k in range(count):
-        points = shape_at(mixture, component[k], seen, minima.forces[k])
+        points = shape_at(mixture, component[k], seen, force_of(minima.states[k]))
         bounds = margins.bounds(points[-2:], points[rows])
         determined = bounds != points[-2:]
         outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
@@ -272,6 +273,6 @@ def with_boxes(
         means[k, -2:] += np.where(determined, bounds - points[outermost, axes], 0.0)
         covariances[k, box.ravel()] = covariances[k, own.ravel()]
         covariances[k, :, box.ravel()] = covariances[k, :, own.ravel()]
-    numbers = np.arange(count, dtype=minima.component.dtype)
+    numbers = np.arange(count, dtype=minima.label.dtype)
     placed = Mixture(means, covariances, mixture.penalties[component])
-    return placed, minima._replace(component=numbers)
+    return placed, minima._replace(label=numbers)

@@ -32,8 +32,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.marginal.directions import find_directions
-from cadalign.solvers.marginal.equations import POSE_UNKNOWNS
+from cadalign.solvers.marginal.equations import POSE, POSE_UNKNOWNS, force_of
 from cadalign.solvers.marginal.moments import moments_of
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture, Seen
@@ -116,14 +115,14 @@ def align_single(
     means, covariances, weights = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = _seen(view, rows, options)
-    minima, count, iterations, hypotheses = search_view(mixture, seen, _given(init))
+    minima, hypotheses = search_view(mixture, seen, _given(init))
+    count, iterations = minima.counts.tolist()
     if not count:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
             fix="give `init`, and check which keypoint is which",
         )
-    minima, count = find_directions(mixture, seen, minima, count)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
@@ -154,7 +153,7 @@ def align_single(
     if seen.loss == LINEAR:
         warnings += misfits(float(minima.costs[0]), 2 * len(rows) - POSE_UNKNOWNS)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
-    component = int(minima.component[0])
+    component = int(minima.label[0])
     statistics = Stated(
         moments.covariance,
         likely.covariances[0],
@@ -164,7 +163,12 @@ def align_single(
         evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
         degrees_of_freedom=model.degrees_of_freedom,
         basis=SingleBasis(
-            model, view, options, component, minima.poses[0].copy(), minima.forces[0].copy()
+            model,
+            view,
+            options,
+            component,
+            minima.states[0, :POSE].copy(),
+            force_of(minima.states[0]),
         ),
     )
     observed = cast(FloatArray, view.points_2d)

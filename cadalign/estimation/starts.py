@@ -16,8 +16,8 @@ from cadalign.estimation.metric_starts import metric_starts
 from cadalign.estimation.uncertainty.contradictions import count_equations
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
-from cadalign.solvers.marginal.problem import Target
-from cadalign.solvers.marginal.starts import after_motion, half_turns
+from cadalign.solvers.marginal.problem import GaussianTarget
+from cadalign.solvers.marginal.search import after_motion, half_turns
 
 _MOST_STARTS = 24
 _MOST_CARRIED = 3  # stretches of the other view
@@ -241,5 +241,5 @@ def half_turned(evidence: Evidence, view: int, poses: Sequence[FloatArray]) -> l
         return []
     modes = shape.modes[:, names].reshape(len(shape.modes), 3 * len(names))
     covariance = modes.T @ modes + np.diag(np.repeat(shape.spread[names] ** 2, 3))
-    motions = half_turns(Target(shape.mean[names], covariance))
+    motions = half_turns(GaussianTarget(shape.mean[names], covariance))
     return [after_motion(pose, motion) for motion in motions for pose in poses]

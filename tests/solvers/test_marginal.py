@@ -10,11 +10,21 @@ from scipy.spatial.transform import Rotation
 
 from cadalign.arrays import FloatArray
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
-from cadalign.solvers.marginal.equations import empty_equations, evaluate
+from cadalign.solvers.marginal.equations import (
+    POSE,
+    Posed,
+    evaluate_posed,
+    force_of,
+    posed_cost,
+    posed_room,
+    state_at,
+)
 from cadalign.solvers.marginal.posterior import posterior_of
-from cadalign.solvers.marginal.problem import Guess, Mixture, Seen, guess_at, shape_at, target_of
-from cadalign.solvers.marginal.refine import refine_pose
+from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at, target_of
 from cadalign.solvers.marginal.search import search_view
+from cadalign.solvers.refine import refine
+from cadalign.solvers.system import accept, move, solve
+from cadalign.solvers.unknowns import move_rigid
 
 KEYPOINTS, COMPONENTS = 9, 2
 
@@ -37,44 +47,95 @@ def problem_of(seed: int, loss: int = LINEAR) -> tuple[Mixture, Seen, FloatArray
     return Mixture(means, covariances, penalties), Seen(seen, rays, whitening, loss, 2.0), pose
 
 
-def stacked_cost(mixture: Mixture, seen: Seen, pose: FloatArray, offset: FloatArray) -> float:
-    """Squared residuals and the prior of the shape, written out."""
-    target = target_of(mixture, 0, seen)
-    camera = (target.mean + offset) @ pose[:9].reshape(3, 3).T + pose[9:]
+def stacked_cost(system: Posed, state: FloatArray) -> float:
+    """Squared residuals and the prior of the shape, written out, and log det M."""
+    (mean, covariance), seen = system.target, system.seen
+    flat = state[POSE : POSE + mean.size]
+    rotation = state[:9].reshape(3, 3)
+    camera = (mean + flat.reshape(-1, 3)) @ rotation.T + state[9:POSE]
     errors = (camera[:, :2] / camera[:, 2:] - seen.rays) * seen.whitening[:, ::2]
-    flat = offset.ravel()
-    return float((errors**2).sum() + flat @ np.linalg.solve(target.covariance, flat))
+    cost = float((errors**2).sum() + flat @ np.linalg.solve(covariance, flat))
+    if not system.integrates:
+        return cost
+    rows = np.zeros((mean.shape[0], 2, mean.size))
+    for n, ((x, y, z), (a, _, c)) in enumerate(zip(camera, seen.whitening, strict=True)):
+        by_camera = np.array([[a / z, 0, -a * x / z**2], [0, c / z, -c * y / z**2]])
+        rows[n, :, 3 * n : 3 * n + 3] = by_camera @ rotation
+    by_shape = rows.reshape(-1, mean.size)
+    matrix = np.eye(len(by_shape)) + by_shape @ covariance @ by_shape.T
+    return cost + float(np.linalg.slogdet(matrix)[1])
+
+
+def moved(state: FloatArray, step: FloatArray, offset: FloatArray) -> FloatArray:
+    """A state after a step (6,) of the pose and one (3 n,) of the offsets."""
+    found = state.copy()
+    move_rigid(state, step, found)
+    found[POSE : POSE + offset.size] += offset
+    return found
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(0, 1000))
-def test_a_minimum_is_one_of_pose_and_shape_together(seed: int) -> None:
+@given(st.integers(0, 1000), st.booleans())
+def test_a_minimum_is_one_of_pose_and_shape_together(seed: int, integrates: bool) -> None:
     mixture, seen, pose = problem_of(seed)
-    guess = guess_at(pose, 7)
-    cost, _, _, converged = refine_pose(target_of(mixture, 0, seen), seen, 100, guess)
+    system = Posed(target_of(mixture, 0, seen), seen, integrates)
+    state = state_at(pose, 7)
+    cost, _, converged = refine(system, 100, state)
     assert converged
-    assert cost == pytest.approx(stacked_cost(mixture, seen, guess.pose, guess.offset), rel=1e-6)
+    assert cost == pytest.approx(stacked_cost(system, state), rel=1e-6)
+    assert cost == pytest.approx(posed_cost(system, state))
     rng = np.random.default_rng(seed)
     for _ in range(20):
-        turn = Rotation.from_rotvec(rng.normal(0, 1e-3, 3)).as_matrix()
-        moved = np.concatenate(
-            [
-                (turn @ guess.pose[:9].reshape(3, 3)).ravel(),
-                guess.pose[9:] + rng.normal(0, 1e-3, 3),
-            ]
-        )
-        offset = guess.offset + rng.normal(0, 1e-3, (7, 3))
-        assert stacked_cost(mixture, seen, moved, offset) > cost
+        near = moved(state, rng.normal(0, 1e-3, 6), rng.normal(0, 1e-3, 21))
+        assert stacked_cost(system, near) > cost
+
+
+@pytest.mark.parametrize("loss", [LINEAR, HUBER, CAUCHY])
+def test_the_derivatives_of_the_determinant_are_finite_differences(loss: int) -> None:
+    mixture, seen, pose = problem_of(2, loss)
+    seen.rays[0] += 0.02  # an outlier
+    system = Posed(target_of(mixture, 0, seen), seen, True)
+    state = state_at(pose, 7)
+    force = np.random.default_rng(2).normal(0, 0.5, 21)
+    state[POSE:] = np.concatenate([system.target.covariance @ force, force])
+    room = posed_room(system)
+
+    def log_determinant(step: FloatArray) -> float:
+        evaluate_posed(system, moved(state, step[:6], step[6:]), room)
+        return float(room.new.sums[1])
+
+    by_difference = [
+        (log_determinant(step) - log_determinant(-step)) / 4e-5 for step in 1e-5 * np.eye(27)
+    ]
+    evaluate_posed(system, state, room)
+    derivatives = np.concatenate([room.new.turned, room.new.slope])
+    assert derivatives == pytest.approx(np.array(by_difference), rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("integrates", [False, True])
+def test_the_predicted_decrease_is_that_of_a_small_step(integrates: bool) -> None:
+    mixture, seen, pose = problem_of(4)
+    system = Posed(target_of(mixture, 0, seen), seen, integrates)
+    state = state_at(pose, 7)
+    refine(system, 100, state)
+    near = moved(state, 1e-4 * np.ones(6), np.zeros(21))
+    room, step, trial = posed_room(system), np.zeros(6), near.copy()
+    cost = evaluate_posed(system, near, room)
+    accept(system, near, room)
+    expected = solve(system, room, 0.0, step)
+    move(system, near, room, 0.0, step, trial)
+    assert cost - posed_cost(system, trial) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("loss", [LINEAR, HUBER, CAUCHY])
 def test_the_search_finds_the_pose_and_its_component(loss: int) -> None:
     for seed in range(5):
         mixture, seen, pose = problem_of(seed, loss)
-        minima, count, _, _ = search_view(mixture, seen, np.empty((0, 12)))
+        minima, _ = search_view(mixture, seen, np.empty((0, 12)))
+        count = minima.counts[0]
         assert count > 0
-        assert minima.component[0] == 0
-        best = minima.poses[0, :9].reshape(3, 3)
+        assert minima.label[0] == 0
+        best = minima.states[0, :9].reshape(3, 3)
         cosine = (np.trace(best.T @ pose[:9].reshape(3, 3)) - 1) / 2
         assert np.degrees(np.arccos(min(cosine, 1.0))) < 6
         assert (np.diff(minima.scores[:count]) >= 0).all()
@@ -82,24 +143,24 @@ def test_the_search_finds_the_pose_and_its_component(loss: int) -> None:
 
 def test_a_given_start_is_searched_from() -> None:
     mixture, seen, pose = problem_of(3)
-    without, _, _, starts = search_view(mixture, seen, np.empty((0, 12)))
-    given_one, _, _, more = search_view(mixture, seen, pose[None])
+    without, starts = search_view(mixture, seen, np.empty((0, 12)))
+    given_one, more = search_view(mixture, seen, pose[None])
     assert more == starts + 1
     assert given_one.scores[0] <= without.scores[0] + 1e-6
 
 
 def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
     mixture, seen, pose = problem_of(1)
-    guess = guess_at(pose, 7)
-    refine_pose(target_of(mixture, 0, seen), seen, 100, guess)
-    points, covariance, of_points, of_seen = posterior_of(mixture, 0, seen, guess, 1.0)
-    assert points == pytest.approx(shape_at(mixture, 0, seen, guess.force))
+    state = state_at(pose, 7)
+    refine(Posed(target_of(mixture, 0, seen), seen, False), 100, state)
+    points, covariance, of_points, of_seen = posterior_of(mixture, 0, seen, state, 1.0)
+    assert points == pytest.approx(shape_at(mixture, 0, seen, force_of(state)))
     size = mixture.means[0].size
-    rotation = guess.pose[:9].reshape(3, 3)
+    rotation = state[:9].reshape(3, 3)
     rows = np.zeros((14, 6 + size))
     for n, point in enumerate(seen.points):
         turned = rotation @ points[point]
-        x, y, z = turned + guess.pose[9:]
+        x, y, z = turned + state[9:POSE]
         by_camera = 1e3 * np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
         by_turn = np.cross(np.eye(3), turned).T  # columns: axis x turned
         rows[2 * n : 2 * n + 2, :3] = by_camera @ by_turn
@@ -127,7 +188,8 @@ def test_the_posterior_is_the_inverse_information_of_pose_and_shape() -> None:
 
 def test_points_behind_the_camera_have_no_cost() -> None:
     mixture, seen, pose = problem_of(0)
-    behind = np.concatenate([pose[:9], -pose[9:]])
-    guess = Guess(behind, np.zeros((7, 3)), np.zeros((7, 3)))
-    assert evaluate(target_of(mixture, 0, seen), seen, guess, empty_equations(7)) == np.inf
-    assert refine_pose(target_of(mixture, 0, seen), seen, 10, guess)[0] == np.inf
+    behind = state_at(np.concatenate([pose[:9], -pose[9:]]), 7)
+    system = Posed(target_of(mixture, 0, seen), seen, True)
+    assert evaluate_posed(system, behind, posed_room(system)) == np.inf
+    assert posed_cost(system, behind) == np.inf
+    assert refine(system, 10, behind)[0] == np.inf

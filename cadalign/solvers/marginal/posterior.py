@@ -10,14 +10,17 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.linalg import cholesky, multiply_3, solve_cholesky
 from cadalign.solvers.marginal.equations import (
+    POSE,
     POSE_UNKNOWNS,
-    Equations,
-    empty_equations,
-    evaluate,
+    Posed,
+    Whitened,
+    evaluate_posed,
+    force_of,
+    posed_room,
 )
 from cadalign.solvers.marginal.moments import Likely
-from cadalign.solvers.marginal.problem import Guess, Mixture, Seen, Target, shape_at, target_of
-from cadalign.solvers.marginal.search import ViewMinima
+from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, shape_at, target_of
+from cadalign.solvers.search import Minima
 
 
 class Posterior(NamedTuple):
@@ -36,20 +39,20 @@ class Posterior(NamedTuple):
 
 @kernel
 def posterior_of(
-    mixture: Mixture, component: int, seen: Seen, guess: Guess, inflation: float
+    mixture: Mixture, component: int, seen: Seen, state: FloatArray, inflation: float
 ) -> Posterior:
     """The posterior under a prior whose deviations are widened by a factor.
 
     Infinite where the pose is not determined.
     """
-    points = shape_at(mixture, component, seen, guess.force)
+    points = shape_at(mixture, component, seen, force_of(state))
     m = points.shape[0]
     target = target_of(mixture, component, seen)
     square = inflation * inflation
-    wide = Target(target.mean, square * target.covariance)
-    equations = empty_equations(seen.points.shape[0])
-    cost = evaluate(wide, seen, guess, equations)
-    factor = equations.hessian.copy()
+    wide = Posed(GaussianTarget(target.mean, square * target.covariance), seen, False)
+    room = posed_room(wide)
+    cost = evaluate_posed(wide, state, room)
+    equations, factor = room.new, room.normal.new_hessian
     if not cost < np.inf or not cholesky(factor, POSE_UNKNOWNS, 0.0):
         unknown = np.full((m, 3, 3), np.inf)
         return Posterior(points, np.full((9, 9), np.inf), unknown, unknown.copy())
@@ -59,7 +62,7 @@ def posterior_of(
     whole = mixture.covariances[component]
     told = _whitened_by_points(whole, seen, equations, square)
     by_pose = _points_by_pose(told, equations)
-    rotation = guess.pose[:9].copy().reshape((3, 3))
+    rotation = state[:9].copy().reshape((3, 3))
     turned_back = rotation.T.copy()
     of_points, of_seen = np.empty((m, 3, 3)), np.empty((m, 3, 3))
     for i in range(m):
@@ -68,7 +71,7 @@ def posterior_of(
         of_points[i] = rest
         _add_pose(rows, pose, of_points[i])
         of_seen[i] = multiply_3(multiply_3(rotation, rest), turned_back)
-        _add_pose(_moved(guess.pose, points[i], rows), pose, of_seen[i])
+        _add_pose(_moved(state, points[i], rows), pose, of_seen[i])
     low, high = m - 2, m - 1
     covariance = np.zeros((9, 9))
     covariance[:6, :6] = pose
@@ -129,7 +132,7 @@ def _add_pose(rows: FloatArray, pose: FloatArray, covariance: FloatArray) -> Non
 
 @kernel
 def posteriors_of(
-    mixture: Mixture, seen: Seen, minima: ViewMinima, likelihoods: FloatArray, inflation: float
+    mixture: Mixture, seen: Seen, minima: Minima, likelihoods: FloatArray, inflation: float
 ) -> Likely:
     """The posteriors of the first minima, as many as there are ``likelihoods`` (L,).
 
@@ -137,7 +140,7 @@ def posteriors_of(
     """
     count, m = likelihoods.shape[0], mixture.means.shape[1]
     likely = Likely(
-        minima.poses[:count].copy(),
+        minima.states[:count, :POSE].copy(),
         np.empty((count, m, 3)),
         np.empty((count, 3)),
         np.empty((count, 9, 9)),
@@ -146,8 +149,7 @@ def posteriors_of(
         likelihoods,
     )
     for k in range(count):
-        guess = Guess(minima.poses[k], minima.offsets[k], minima.forces[k])
-        found = posterior_of(mixture, minima.component[k], seen, guess, inflation)
+        found = posterior_of(mixture, minima.label[k], seen, minima.states[k], inflation)
         likely.points[k] = found.points
         for a in range(3):
             for i in seen.points:
@@ -161,7 +163,7 @@ def posteriors_of(
 
 @fast_sums
 def _whitened_by_points(
-    whole: FloatArray, seen: Seen, equations: Equations, square: float
+    whole: FloatArray, seen: Seen, equations: Whitened, square: float
 ) -> FloatArray:
     """Whitened covariance (3 m, 2 n) of all points with the keypoints' residuals."""
     size, count = equations.factor.shape[0], whole.shape[0]
@@ -170,19 +172,20 @@ def _whitened_by_points(
     for p in range(count):
         for c in range(size):
             first = 3 * seen.points[c // 2]
-            total = square * (
+            told[p, c] = square * (
                 by_shape[c, 0] * whole[p, first]
                 + by_shape[c, 1] * whole[p, first + 1]
                 + by_shape[c, 2] * whole[p, first + 2]
             )
-            for k in range(c):
-                total -= factor[c, k] * told[p, k]
-            told[p, c] = total * factor[c, c]
+        for c in range(size):
+            told[p, c] *= factor[c, c]
+            for k in range(c + 1, size):
+                told[p, k] -= factor[c, k] * told[p, c]
     return told
 
 
 @fast_sums
-def _points_by_pose(told: FloatArray, equations: Equations) -> FloatArray:
+def _points_by_pose(told: FloatArray, equations: Whitened) -> FloatArray:
     """Derivatives (3 m, 6) of the likeliest points by the pose."""
     found = np.empty((told.shape[0], POSE_UNKNOWNS))
     for p in range(told.shape[0]):

@@ -40,26 +40,15 @@ class Seen(NamedTuple):
     loss_scale: float
 
 
-class Target(NamedTuple):
+class GaussianTarget(NamedTuple):
     """One Gaussian at the keypoints: mean (n, 3) and covariance (3 n, 3 n)."""
 
     mean: FloatArray
     covariance: FloatArray
 
 
-class Guess(NamedTuple):
-    """A pose (12,), offsets (n, 3) of the keypoints from the mean, and w (n, 3): ``S w = offset``.
-
-    The pose is the rotation row by row and the translation.
-    """
-
-    pose: FloatArray
-    offset: FloatArray
-    force: FloatArray
-
-
 @kernel
-def target_of(mixture: Mixture, component: int, seen: Seen) -> Target:
+def target_of(mixture: Mixture, component: int, seen: Seen) -> GaussianTarget:
     """A component at the keypoints."""
     n = seen.points.shape[0]
     whole = mixture.covariances[component]
@@ -73,13 +62,7 @@ def target_of(mixture: Mixture, component: int, seen: Seen) -> Target:
                 q = seen.points[j]
                 for b in range(3):
                     covariance[3 * i + a, 3 * j + b] = whole[3 * p + a, 3 * q + b]
-    return Target(mean, covariance)
-
-
-@kernel
-def guess_at(pose: FloatArray, keypoints: int) -> Guess:
-    """The mean at a pose."""
-    return Guess(pose.copy(), np.zeros((keypoints, 3)), np.zeros((keypoints, 3)))
+    return GaussianTarget(mean, covariance)
 
 
 @fast_sums

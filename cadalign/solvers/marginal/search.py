@@ -1,58 +1,53 @@
-"""Search for the minima of one view's keypoints under a mixture of Gaussian shapes."""
+"""Search for the poses of one view's keypoints under a mixture of Gaussian shapes.
+
+It starts from poses that the keypoints suggest for the means. Few steps on the plain cost tell the
+promising ones; from these it descends on the objective that the shape is integrated out of. Minima
+of the cost are no starts for that: some lie so near the camera that the descent ends in another
+minimum.
+"""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.marginal.problem import (
-    Guess,
-    Mixture,
-    Seen,
-    Target,
-    guess_at,
-    target_of,
-)
-from cadalign.solvers.marginal.refine import refine_pose
-from cadalign.solvers.marginal.starts import after_motion, half_turns, is_among, mean_starts
+from cadalign.solvers.alignment import Objective, evaluate_cost
+from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS
+from cadalign.solvers.covariance import center_and_unit
+from cadalign.solvers.evidence import Keypoints, ScalePrior
+from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
+from cadalign.solvers.marginal.equations import Posed, state_at
+from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
+from cadalign.solvers.refine import refine
+from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
+from cadalign.solvers.starts import rotation_starts
+from cadalign.solvers.system import are_same, cost_at, score_of
+from cadalign.solvers.unknowns import orthonormalize, uncenter
 
-_PROBE_ITERATIONS = 3
-_MAX_ITERATIONS = 200
+_PROBE_ITERATIONS = 2
+_MAX_ITERATIONS = 30
 _SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
-_SAME_CHORD = 1e-3
-_UNLIKELY = 40.0  # excess score, after the probe, at which a start is given up
+_UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
+_LESS_LIKELY = 20.0  # excess score at which a start is given up, refined no further
 _MOST_STARTS = 64
 _MOST = 32
-
-
-class ViewMinima(NamedTuple):
-    """Minima, the best score first.
-
-    Their ``component`` (M,), ``poses`` (M, 12), ``forces`` (M, n, 3) on the keypoints (see `Guess`)
-    and their ``offsets`` (M, n, 3). The ``costs`` (M,) are the whitened squared residuals and the
-    prior of the shape; the ``scores`` (M,) are -2 log of the probability by Laplace's
-    approximation, up to a constant.
-    """
-
-    component: IntArray
-    poses: FloatArray
-    offsets: FloatArray
-    forces: FloatArray
-    costs: FloatArray
-    scores: FloatArray
+_ROTATIONS = 96
+_REFINED = 16
+_ITERATIONS = 4
+_SAME_CHORD = 0.3
+_LEAST_DEPTH = 1e-9
+_UNLIKELY_SHAPE = 60.0  # squared distance of a start from the mean, in deviations
+_FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
 
 @kernel
-def search_view(
-    mixture: Mixture, seen: Seen, given: FloatArray
-) -> tuple[ViewMinima, int, int, int]:
+def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima, int]:
     """Search from all starts, ``given`` poses (k, 12) among them.
 
-    Returns the minima, their number, and the numbers of iterations and of starts. The components
-    share their starts: what the mean of one suggests may be the best of another.
+    Returns the minima of F, whose ``label`` is the component and whose ``costs`` are without log
+    det M, and the number of starts. The components share their starts: what the mean of one
+    suggests may be the best of another.
     """
     components, n = mixture.means.shape[0], seen.points.shape[0]
     targets = [target_of(mixture, g, seen) for g in range(components)]
@@ -64,26 +59,50 @@ def search_view(
         firsts[g] = count
         count = _add_starts(targets[g], seen, starts, count)
     firsts[components] = count
-    component = np.empty(components * count, dtype=np.int64)
-    guesses = [guess_at(starts[0], n) for _ in range(0)]
+    likely = room_for_minima(_MOST, 12 + 6 * n)
     for g in range(components):
-        for s in _chosen(starts[:count], given.shape[0], firsts[g], firsts[g + 1]):
-            component[len(guesses)] = g
-            guesses.append(guess_at(starts[s], n))
-    minima = ViewMinima(
-        np.zeros(_MOST, dtype=np.int64),
-        np.empty((_MOST, 12)),
-        np.empty((_MOST, n, 3)),
-        np.empty((_MOST, n, 3)),
-        np.full(_MOST, np.inf),
-        np.full(_MOST, np.inf),
-    )
-    found, iterations = _descend(targets, mixture.penalties, seen, guesses, component, minima)
-    return minima, found, iterations, count
+        chosen = _chosen(starts[:count], given.shape[0], firsts[g], firsts[g + 1])
+        states = np.empty((chosen.shape[0], 12 + 6 * n))
+        for s in range(chosen.shape[0]):
+            states[s] = state_at(starts[chosen[s]], n)
+        effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, 0, _UNLIKELY)
+        search(Posed(targets[g], seen, False), states, effort, g, mixture.penalties[g], likely)
+    return _integrated(mixture, targets, seen, likely), count
 
 
 @kernel
-def _add_starts(target: Target, seen: Seen, starts: FloatArray, count: int) -> int:
+def _integrated(
+    mixture: Mixture, targets: list[GaussianTarget], seen: Seen, likely: Minima
+) -> Minima:
+    """The minima of F that states of a low cost lead to, the most promising first."""
+    count = likely.counts[0]
+    minima = room_for_minima(max(count, 1), likely.states.shape[1])
+    minima.counts[1] = likely.counts[1]
+    scores = np.empty(count)
+    for k in range(count):
+        system = Posed(targets[likely.label[k]], seen, True)
+        scores[k] = score_of(system, likely.states[k], 0.0) + mixture.penalties[likely.label[k]]
+    for k in np.argsort(scores):
+        if not scores[k] < minima.scores[0] + _LESS_LIKELY:
+            break
+        g, state = likely.label[k], likely.states[k]
+        system = Posed(targets[g], seen, True)
+        is_new = True
+        for j in range(minima.counts[0]):
+            if minima.label[j] == g and are_same(system, state, minima.states[j]):
+                is_new = False
+        if is_new:
+            cost, used, _ = refine(system, _MAX_ITERATIONS, state)
+            minima.counts[1] += used
+            add_minimum(system, state, cost, g, mixture.penalties[g], minima)
+    for k in range(minima.counts[0]):
+        system = Posed(targets[minima.label[k]], seen, False)
+        minima.costs[k] = cost_at(system, minima.states[k])
+    return minima
+
+
+@kernel
+def _add_starts(target: GaussianTarget, seen: Seen, starts: FloatArray, count: int) -> int:
     """Append the starts of one component, and those half a turn away; returns the new number."""
     own = mean_starts(target, seen)
     motions = half_turns(target)
@@ -116,75 +135,154 @@ def _chosen(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
 
 
 @kernel
-def _descend(
-    targets: list[Target],
-    penalties: FloatArray,
-    seen: Seen,
-    guesses: list[Guess],
-    component: IntArray,
-    minima: ViewMinima,
-) -> tuple[int, int]:
-    """Refine guesses, the most promising first; returns the number of minima and iterations."""
-    count = len(guesses)
-    probed, converged = np.full(count, np.inf), np.zeros(count, dtype=np.bool_)
-    costs = np.full(count, np.inf)
-    iterations = 0
-    for s in range(count):
-        g = component[s]
-        costs[s], score, used, converged[s] = refine_pose(
-            targets[g], seen, _PROBE_ITERATIONS, guesses[s]
-        )
-        probed[s] = score + penalties[g]
-        iterations += used
+def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
+    """Poses (S, 12) of the mean, the likeliest first.
+
+    Of poses at evenly spread rotations the best are improved by a few steps. The shape's
+    uncertainty, seen from the distance at which the mean has the size of its image, widens the
+    keypoints' own.
+    """
+    center, unit = center_and_unit(target.mean)
+    if not unit > 0:
+        return np.empty((0, 12))
+    points = (target.mean - center) / unit
+    free = np.ones(UNKNOWNS)
+    free[6:] = 0.0
+    whitening = _widened(target, seen)
+    keypoints = Keypoints(points, seen.rays, whitening, seen.loss, seen.loss_scale)
+    objective = Objective(free, keypoints, ScalePrior(0.0))
+    grid = np.empty((_ROTATIONS, POSE_SIZE))
+    count = rotation_starts(points, seen.rays, grid)
+    costs = np.empty(count)
+    for k in range(count):
+        costs[k] = evaluate_cost(objective, grid[k])
+    order = np.argsort(costs)[: min(count, _REFINED)]
+    refined = np.full(len(order), np.inf)
+    for r in range(len(order)):
+        if costs[order[r]] < np.inf:
+            refined[r], _, _ = refine(objective, _ITERATIONS, grid[order[r]])
+    poses = np.empty((len(order), 12))
     found = 0
-    best = np.inf
-    for s in np.argsort(probed):
-        guess, g = guesses[s], component[s]
-        if not probed[s] < min(best, probed.min()) + _UNLIKELY or found == _MOST:
-            break
-        if _is_found(guess, g, minima, found):
-            continue
-        cost, score = costs[s], probed[s]
-        if not converged[s]:
-            cost, score, used, _ = refine_pose(targets[g], seen, _MAX_ITERATIONS, guess)
-            score += penalties[g]
-            iterations += used
-        if not score < np.inf or _is_found(guess, g, minima, found):
-            continue
-        best = min(best, score)
-        _insert(guess, g, cost, score, minima, found)
-        found += 1
-    return found, iterations
+    for r in np.argsort(refined):
+        if refined[r] < np.inf and not is_among(grid[order[r]], poses[:found], _SAME_CHORD):
+            pose = grid[order[r]]
+            orthonormalize(pose)
+            uncenter(pose, center, unit)
+            poses[found] = pose[:12]
+            found += 1
+    return poses[:found].copy()
 
 
 @kernel
-def _is_found(guess: Guess, component: int, minima: ViewMinima, found: int) -> bool:
-    """True if a guess coincides with a minimum of its component."""
-    for k in range(found):
-        if minima.component[k] == component and is_among(
-            guess.pose, minima.poses[k : k + 1], _SAME_CHORD
-        ):
+def is_among(pose: FloatArray, poses: FloatArray, chord: float) -> bool:
+    """True if the rotation of a pose is close to that of one of some poses (k, 12)."""
+    for k in range(poses.shape[0]):
+        square = 0.0
+        for i in range(9):
+            square += (poses[k, i] - pose[i]) ** 2
+        if square < chord * chord:
             return True
     return False
 
 
 @kernel
-def _insert(
-    guess: Guess, component: int, cost: float, score: float, minima: ViewMinima, found: int
-) -> None:
-    """Insert a minimum by its score."""
-    row = found
-    while row > 0 and minima.scores[row - 1] > score:
-        minima.component[row] = minima.component[row - 1]
-        minima.poses[row] = minima.poses[row - 1]
-        minima.offsets[row] = minima.offsets[row - 1]
-        minima.forces[row] = minima.forces[row - 1]
-        minima.costs[row] = minima.costs[row - 1]
-        minima.scores[row] = minima.scores[row - 1]
-        row -= 1
-    minima.component[row] = component
-    minima.poses[row] = guess.pose
-    minima.offsets[row] = guess.offset
-    minima.forces[row] = guess.force
-    minima.costs[row] = cost
-    minima.scores[row] = score
+def _widened(target: GaussianTarget, seen: Seen) -> FloatArray:
+    """Whitening (n, 3) of the keypoints about the mean's projection."""
+    n = seen.points.shape[0]
+    whitening = np.empty((n, 3))
+    extent, size = _square_spread(target.mean), _square_spread(seen.rays)
+    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
+    for i in range(n):
+        variance = 0.0
+        for a in range(3):
+            variance += target.covariance[3 * i + a, 3 * i + a] / 3.0
+        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
+        information = (seen.whitening[i, 0] ** 2 + seen.whitening[i, 2] ** 2) / 2.0
+        whitening[i] = seen.whitening[i] / np.sqrt(1.0 + variance / depth**2 * information)
+    return whitening
+
+
+@kernel
+def _square_spread(rows: FloatArray) -> float:
+    """Sum of the variances of the columns of a matrix."""
+    total = 0.0
+    for a in range(rows.shape[1]):
+        mean = 0.0
+        for n in range(rows.shape[0]):
+            mean += rows[n, a] / rows.shape[0]
+        for n in range(rows.shape[0]):
+            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
+    return total
+
+
+@kernel
+def half_turns(target: GaussianTarget) -> FloatArray:
+    """Motions (T, 12) of the model by half a turn that leave the keypoints a likely shape.
+
+    The mean does not show such an ambiguity: a blade whose width varies more than it measures looks
+    much the same from behind, with its edge and its back exchanged.
+    """
+    n = target.mean.shape[0]
+    center = np.zeros(3)
+    for i in range(n):
+        center += target.mean[i] / n
+    offsets = target.mean - center
+    scatter, axes = np.zeros((4, 4)), np.empty((4, 4))
+    extent = 0.0
+    for i in range(n):
+        square = 0.0
+        for a in range(3):
+            square += offsets[i, a] ** 2
+            for b in range(3):
+                scatter[a, b] += offsets[i, a] * offsets[i, b]
+        extent = max(extent, square)
+    eigenvectors_4(scatter, axes)
+    factor = target.covariance.copy()
+    for k in range(3 * n):
+        factor[k, k] += _FLATNESS**2 * extent
+    if not factorize(factor):
+        return np.empty((0, 12))
+    motions = np.empty((3, 12))
+    found = 0
+    for column in range(3):
+        axis = axes[:3, column].copy()
+        moved, solved = np.empty(3 * n), np.empty(3 * n)
+        for i in range(n):
+            along = 2.0 * (
+                axis[0] * offsets[i, 0] + axis[1] * offsets[i, 1] + axis[2] * offsets[i, 2]
+            )
+            for a in range(3):
+                moved[3 * i + a] = along * axis[a] - 2.0 * offsets[i, a]
+        solved[:] = moved
+        solve_factor(factor, solved)
+        square = 0.0
+        distance = 0.0
+        for k in range(3 * n):
+            square += moved[k] * moved[k]
+            distance += moved[k] * solved[k]
+        if not (square > 0.0 and distance < _UNLIKELY_SHAPE):
+            continue
+        for a in range(3):
+            motions[found, 9 + a] = center[a]
+            for b in range(3):
+                turn = 2.0 * axis[a] * axis[b] - (1.0 if a == b else 0.0)
+                motions[found, 3 * a + b] = turn
+                motions[found, 9 + a] -= turn * center[b]
+        found += 1
+    return motions[:found].copy()
+
+
+@kernel
+def after_motion(pose: FloatArray, motion: FloatArray) -> FloatArray:
+    """The pose (12,) of a model that was moved first."""
+    moved = np.empty(12)
+    for a in range(3):
+        moved[9 + a] = pose[9 + a]
+        for b in range(3):
+            moved[9 + a] += pose[3 * a + b] * motion[9 + b]
+            moved[3 * a + b] = (
+                pose[3 * a] * motion[b]
+                + pose[3 * a + 1] * motion[3 + b]
+                + pose[3 * a + 2] * motion[6 + b]
+            )
+    return moved

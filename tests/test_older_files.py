@@ -164,6 +164,15 @@ def assert_align_result(result: AlignResult, said: dict[str, Any]) -> None:
     assert str(result)
 
 
+@pytest.mark.parametrize("name", ["fit/behind", "align/rig_with_size"])
+def test_results_are_exported_and_written_anew(name: str, tmp_path: Path) -> None:
+    result = FitResult.load(FOLDER / f"{name}.json")
+    assert result.export(tmp_path / "lines.lines.ply").is_file()
+    again = FitResult.from_json(result.to_json())
+    assert str(again) == str(result)
+    assert again.to_json() == result.to_json()
+
+
 def test_align_results_are_of_all_kinds() -> None:
     said = {path.stem: AlignResult.load(path) for path in ALIGNMENTS}
     assert len(said["two_views_unknown_motion"].poses) == 2

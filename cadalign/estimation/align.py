@@ -19,7 +19,8 @@ from cadalign.estimation.model import Model, Size
 from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.result import FitStats, Result
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import Problem, find_minima
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single

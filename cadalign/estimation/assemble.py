@@ -24,7 +24,8 @@ from cadalign.estimation.estimates import (
 )
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import stretched_axes

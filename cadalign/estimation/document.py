@@ -16,7 +16,8 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.older_document import completed, upgraded
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pixel_information
-from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.uncertainty.misfit import Misfit
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary
@@ -197,7 +198,7 @@ def _written_view(view: ViewResult) -> dict[str, Any]:
     return {
         "camera": view.camera.to_dict(),
         "alignment": view.alignment.to_dict(),
-        "ids": list(view.ids),
+        "ids": list(view.ids) if len(view.ids) == len(view.residuals) else None,
         "points_2d": _finite_rows(view.points_2d),
         "residuals": _finite_rows(view.residuals),
         "inliers": view.inliers.tolist(),

@@ -16,7 +16,8 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import ByteImage
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result import Result, ViewResult
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.result_parts import ViewResult
 
 Photo = Path | str | ByteImage | None
 
@@ -71,7 +72,7 @@ object_of_fit = object_of_align = object_of
 
 
 def _exported(view: ViewResult, photo: Photo) -> ExportView:
-    """A view without the keypoints behind its camera."""
-    ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))
+    """A view without the keypoints behind its camera, and those whose ids an older file lacks."""
+    ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))[: len(view.ids)]
     ids = tuple(view.ids[row] for row in ahead.tolist())
     return ExportView(view.camera, view.alignment, photo, view.points_2d[ahead], ids)

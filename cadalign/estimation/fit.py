@@ -244,6 +244,7 @@ def fit_batch(
         if ransac is None and not options.estimates_in_rounds:
             start = time.perf_counter()
             solutions = solve(some, options, own)
+            solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
             return SolvedTable(some, solutions, options, own, symmetry, seconds).results
         trusted = None if confidences is None else confidences[part[0] : part[1]]

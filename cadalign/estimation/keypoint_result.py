@@ -10,7 +10,8 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions, full_covariance
-from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult, quickly
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult, quickly
 from cadalign.estimation.solve import alternatives_of, camera_of
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.geometry.alignment import Alignment

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,14 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result_parts import (
+    NO_STATS,
+    Alternative,
+    FitStats,
+    ViewResult,
+    extent,
+    rms_of,
+)
 from cadalign.estimation.symmetry import equal_text, held_axes
 from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
 from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of
@@ -39,114 +47,6 @@ if TYPE_CHECKING:
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import NearestShape
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """Another estimate that the evidence cannot tell from the best one.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        In the first view's camera.
-    relative_likelihood : float
-        Its likelihood over that of the best one, 1 for an equally good one.
-    camera : Camera
-        The camera that goes with it; the best one's, unless the focal length was estimated.
-    points_3d : (m, 3) float
-        Its keypoints in the model's frame.
-    own_bounds : (2, 3) float, optional
-        Its box in the model's frame; None for that of the keypoints.
-    """
-
-    alignment: Alignment
-    relative_likelihood: float
-    camera: Camera
-    points_3d: FloatArray
-    own_bounds: FloatArray | None = field(default=None, repr=False)
-
-    @property
-    def bounds(self) -> FloatArray:
-        """Its box (2, 3) in the model's frame."""
-        return _extent(self.points_3d) if self.own_bounds is None else self.own_bounds
-
-    @property
-    def box(self) -> Box:
-        """Its box in the first camera's frame."""
-        return Box.from_model(self.bounds, self.alignment)
-
-
-@dataclass(frozen=True)
-class FitStats:
-    """Effort of an estimate.
-
-    Parameters
-    ----------
-    iterations : int
-        Refinement steps over all starts; samples, where inliers were searched for.
-    hypotheses : int
-        Alignments from which a refinement could start.
-    seconds : float
-    inlier_ratio : float, optional
-        Share of the keypoints that were kept, where they were searched for.
-    score : float, optional
-        Of the robust search: sum of squared errors, each at most the threshold's square [px^2].
-    """
-
-    iterations: int
-    hypotheses: int
-    seconds: float
-    inlier_ratio: float | None = None
-    score: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ViewResult:
-    """Estimate of one view.
-
-    Parameters
-    ----------
-    camera : Camera
-        Its camera; with the estimated focal length, where that was unknown.
-    alignment : Alignment
-        Pose in that camera, and scale.
-    ids : sequence of int or str
-        Ids of its keypoints.
-    points_2d : (n, 2) float
-        Observed keypoints [px].
-    residuals : (n, 2) float
-        Projected minus observed keypoints [px]; infinite, and null in JSON, for one that was
-        rejected and lies behind the camera.
-    inliers : (n,) bool
-        The keypoints that the estimate rests on.
-    statistics : Statistics
-        States the ``covariance``.
-    """
-
-    camera: Camera
-    alignment: Alignment
-    ids: Sequence[Hashable]
-    points_2d: FloatArray
-    residuals: FloatArray
-    inliers: BoolArray
-    statistics: Statistics = field(repr=False)
-
-    @property
-    def covariance(self) -> FloatArray | None:
-        """Covariance in this camera's frame; see `Result.covariance`."""
-        return self.statistics.covariance
-
-    @property
-    def std(self) -> Uncertainty | None:
-        """Standard deviations from ``covariance``; None for methods that have none."""
-        return None if self.covariance is None else uncertainty_of(self.covariance)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square length of the inliers' residuals [px]."""
-        return rms_of(self.residuals, self.inliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +116,7 @@ class Result:
     sigma: float | None = None
     cost: float | None = None
     alternatives: tuple[Alternative, ...] = ()
-    stats: FitStats = FitStats(0, 0, 0.0)
+    stats: FitStats = NO_STATS
     options: FitOptions | None = None
     symmetry: Symmetry | None = None
     model: Model | ShapeModel | None = None
@@ -363,7 +263,7 @@ class Result:
 
         Those of the keypoints where the model has no others.
         """
-        return _extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+        return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
 
     @property
     def box(self) -> Box:
@@ -644,23 +544,3 @@ class Result:
 
 FitResult = AlignResult = Result
 """Names of earlier versions."""
-
-
-def quickly(kind: type[T], fields: dict[str, Any]) -> T:
-    """A frozen dataclass with these fields, unchecked; those left out have their defaults.
-
-    Setting them one by one takes longer than solving a small problem linearly.
-    """
-    made = object.__new__(kind)
-    made.__dict__.update(fields)
-    return made
-
-
-def rms_of(residuals: FloatArray, inliers: BoolArray) -> float:
-    """Root mean square length of residuals (n, 2), of the inliers (n,) alone."""
-    kept = residuals[inliers]
-    return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
-
-
-def _extent(points: FloatArray) -> FloatArray:
-    return np.array([points.min(axis=0), points.max(axis=0)])

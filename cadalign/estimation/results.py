@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -239,11 +239,6 @@ class Results(Sequence[Result | CadalignError]):
             name: None if each[0] is None else np.concatenate(each)
             for name, each in columns.items()
         }
-
-        def single(k: int) -> Result:
-            number = int(np.searchsorted(firsts, k, side="right")) - 1
-            return parts[number].single(k - int(firsts[number]))
-
         return cls(
             **arrays,
             offsets=np.concatenate([[0], np.cumsum(sizes)]),
@@ -252,7 +247,7 @@ class Results(Sequence[Result | CadalignError]):
                 for part, first in zip(parts, firsts, strict=False)
                 for b, error in part.errors.items()
             },
-            single=single,
+            single=partial(_single, parts, firsts),
             is_single=all(part.is_single for part in parts),
         )
 
@@ -384,6 +379,12 @@ def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
                 raise InputError(what, where=f"results[{number}]")
         results = Results.of(results)
     return results.to_dataframe()
+
+
+def _single(parts: Sequence[Results], firsts: IntArray, k: int) -> Result:
+    """The result of problem k of parts that begin with the problems ``firsts``."""
+    number = int(np.searchsorted(firsts, k, side="right")) - 1
+    return parts[number].single(k - int(firsts[number]))
 
 
 def _split(poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -13,7 +13,8 @@ from cadalign.estimation.focal_search import focal_views, log_focal_prior
 from cadalign.estimation.keypoint_result import result_of_keypoints
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
-from cadalign.estimation.result import FitStats, Result
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective

@@ -21,7 +21,8 @@ from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import prior_of, rows_among
 from cadalign.estimation.problems import rays_of, whitening_of
-from cadalign.estimation.result import Alternative, FitStats, Result, ViewResult
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import canonical_result
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints

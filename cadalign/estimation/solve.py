@@ -12,7 +12,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, check_sigmas, rays_of, whitening_of
-from cadalign.estimation.result import Alternative
+from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW

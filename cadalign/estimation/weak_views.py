@@ -14,7 +14,8 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.result import Result, ViewResult
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

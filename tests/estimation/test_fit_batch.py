@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,17 @@ def test_batch_is_identical_to_single_fits(options: dict[str, Any], workers: int
     assert batch.errors == {}
     assert batch.solved.all()
     assert_like_single_fits(batch, RAGGED, **options)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("ransac", [None, RansacOptions()])
+def test_results_go_to_other_processes(workers: int, ransac: RansacOptions | None) -> None:
+    batch = run(problems_of([20, 20, 20]), workers=workers, ransac=ransac)
+    again = pickle.loads(pickle.dumps(batch))
+    for result, single in zip(again, batch, strict=True):
+        assert isinstance(result, Result)
+        assert isinstance(single, Result)
+        assert result.to_dict() == single.to_dict()
 
 
 def test_points_behind_a_lens_are_handled_alike() -> None:

@@ -13,7 +13,7 @@ from support.problems import fit_problem, problem_of
 from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import Alternative, FitStats, ViewResult
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
 

@@ -18,7 +18,8 @@ from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_c
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
-from cadalign.estimation.result import Result, ViewResult
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation import plots
 from cadalign.evaluation.accuracy.methods import fit_options

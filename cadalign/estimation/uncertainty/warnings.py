@@ -24,7 +24,7 @@ from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import search_joint
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result import Alternative
+    from cadalign.estimation.result_parts import Alternative
 
 _WRONG_UNIT = 100.0  # factor of depths, or of the size that they give the object
 _LIKELY = 0.1  # probability of an alternative that is worth a warning

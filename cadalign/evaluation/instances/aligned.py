@@ -16,7 +16,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result import Alternative, Result
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.result_parts import Alternative
 
 _LEAST_SCALE = 1e-6
 

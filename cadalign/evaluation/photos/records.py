@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.errors import CadalignError
-from cadalign.estimation.result import Alternative, Result
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative
 from cadalign.evaluation.instances.aligned import (
     AlignedAlternative,
     AlignedShape,

@@ -13,21 +13,24 @@ from cadalign.estimation.uncertainty.weakness import Uncertainty
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
 
-_HEADS = ("standard deviations", "rotation", "position", "x", "y", "z")
+_HEADS = ("standard deviations", "rotation", "position", "x", "y", "z", "focal length")
 
 
 def tabulate_contributions(result: Result) -> str:
     """Table of standard deviations with all evidence and without each piece; empty for one piece.
 
-    Rotation [degrees], position [units of the translation] and lengths along x, y, z [%].
+    Rotation [degrees], position [units of the translation], lengths along x, y, z [%] and, where
+    it is estimated, the focal length [%].
     """
     pieces = result.contributions()
     if len(pieces) < 2 or result.std is None:
         return ""
-    rows = [_HEADS, ("with all evidence", *_cells(result.std))]
+    rows: list[tuple[str, ...]] = [_HEADS, ("with all evidence", *_cells(result.std))]
     several = len(result.views) > 1
     rows += [(f"without {_label(piece, several)}", *_cells(piece.without)) for piece in pieces]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADS))]
+    if result.focal == "known":
+        rows = [row[:-1] for row in rows]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "  ".join(
             [row[0].ljust(widths[0])]
@@ -65,7 +68,7 @@ def _label(piece: Contribution, several: bool) -> str:
 
 def _cells(std: Uncertainty) -> tuple[str, ...]:
     position = float(np.linalg.norm(std.translation))
-    lengths = [_text(100 * each, " %") for each in std.scale]
+    lengths = [_text(100 * each, " %") for each in (*std.scale, std.focal)]
     return _text(std.rotation_deg, " deg"), _text(position, ""), *lengths
 
 

@@ -5,24 +5,21 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.progress import track
 
+from cadalign.cli.fitted import FittedFile
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import NOTHING_WORKED, SOME_FAILED, SUCCESS, print_json, print_table
 from cadalign.errors import CadalignError, DataError
 from cadalign.io.documents import read_json
 from cadalign.io.files import write_text
 from cadalign.web import asset, fill
-
-if TYPE_CHECKING:
-    from cadalign.cli.fit import Fit, FittedFile
 
 _COLUMNS = ("file", "keypoints", "rms_px", "rotation_std_deg", "scale_x", "scale_y", "scale_z",
             "warnings", "error")  # fmt: skip
@@ -40,41 +37,78 @@ class _Row:
         return str(self.values["error"])
 
 
-def fit_many(command: Fit) -> int:
-    """Fit every file of a command; returns the exit code, 3 where some have failed."""
-    files = [path for given in command.observations for path in _files(given)]
-    first = command.observations[0]
-    out = command.out or first.with_name(f"{first.resolve().name}_fit" if first.is_dir() else "fit")
+def fit_many(
+    observations: Sequence[Path],
+    fit_one: Callable[[Path, Any], FittedFile],
+    *,
+    out: Path | None,
+    picture: bool,
+    overlay: Path | None,
+    json: bool,
+) -> int:
+    """Fit every file, or every one of a folder; returns the exit code, 3 where some have failed.
+
+    Parameters
+    ----------
+    observations : sequence of Path
+    fit_one : callable
+        Fits a file, of which the parsed content is given where it is known.
+    out : Path, optional
+        Folder to write to; by default beside the first file or folder.
+    picture : bool
+        Write the page of all pictures.
+    overlay : Path, optional
+        Name of the overlays in the files' folders.
+    json : bool
+        Print the table as JSON.
+    """
+    found = [file for given in observations for file in _files(given)]
+    files, first = [path for path, _ in found], observations[0]
+    out = out or first.with_name(f"{first.resolve().name}_fit" if first.is_dir() else "fit")
     make_folder(out)
     console = new_console()
     shown = track(
-        list(zip(files, _names(files), strict=True)),
+        list(zip(found, _names(files), strict=True)),
         "fitting",
         console=console,
         transient=True,
         disable=not console.is_terminal,
     )
-    rows = [_fit_one(replace(command, observations=(path,)), name, out) for path, name in shown]
+    rows = []
+    for (path, data), name in shown:
+        try:
+            fitted = fit_one(path, data)
+        except CadalignError as error:
+            failure = {"file": str(path), "error": str(error)}
+            rows.append(_Row(dict.fromkeys(_COLUMNS, None) | failure))
+            continue
+        own = None if overlay is None else out / name / overlay.name
+        paths = fitted.write(out / name, overlay=own)
+        rows.append(_Row(_values(str(path), fitted), f"{name}/{paths[0].name}" if paths else None))
     write_text(out / "results.csv", _csv(rows))
-    if command.picture:
+    if picture:
         write_text(out / "index.html", _page(rows, title=f"Alignments of {first.name}"))
     failed = sum(bool(row.error) for row in rows)
-    if command.json:
+    if json:
         print_json([row.values for row in rows])
     else:
         print_table(_table(rows))
-    written = f"Page: {out / 'index.html'}" if command.picture else f"Table: {out / 'results.csv'}"
+    written = f"Page: {out / 'index.html'}" if picture else f"Table: {out / 'results.csv'}"
     console.print(f"{written} ({failed} of {len(rows)} failed)", markup=False)
     if failed == len(rows):
         return NOTHING_WORKED
     return SOME_FAILED if failed else SUCCESS
 
 
-def _files(given: Path) -> list[Path]:
-    """The observation files of a folder, or the file itself."""
+def _files(given: Path) -> list[tuple[Path, Any]]:
+    """The observation files of a folder with their content, or the file itself.
+
+    The content is None where it is still to be read, or cannot be.
+    """
     if not given.is_dir():
-        return [given]
-    found = [path for path in sorted(given.glob("*.json")) if _is_observation(path)]
+        return [(given, None)]
+    parsed = [(path, _parsed(path)) for path in sorted(given.glob("*.json"))]
+    found = [(path, data) for path, data in parsed if data is None or _is_observation(data)]
     if not found:
         raise DataError(
             "the folder holds no observation",
@@ -84,12 +118,16 @@ def _files(given: Path) -> list[Path]:
     return found
 
 
-def _is_observation(path: Path) -> bool:
-    """True for a file that is meant as one, damaged ones too."""
+def _parsed(path: Path) -> Any:
+    """A file's content; None for a damaged one, of which the fit tells."""
     try:
-        data = read_json(path)
+        return read_json(path) or {}
     except DataError:
-        return True
+        return None
+
+
+def _is_observation(data: Any) -> bool:
+    """True for what is meant as one."""
     return isinstance(data, dict) and ("views" in data or {"camera", "keypoints"} <= set(data))
 
 
@@ -102,17 +140,6 @@ def _names(files: Sequence[Path]) -> list[str]:
         again = counts[path.stem] > 1
         names.append(f"{path.stem}_{seen[path.stem]}" if again else path.stem)
     return names
-
-
-def _fit_one(command: Fit, name: str, out: Path) -> _Row:
-    file = str(command.observation)
-    try:
-        fitted = command.fit_file(nullcontext())
-    except CadalignError as error:
-        return _Row(dict.fromkeys(_COLUMNS, None) | {"file": file, "error": str(error)})
-    overlay = None if command.overlay is None else out / name / command.overlay.name
-    paths = fitted.write(out / name, overlay=overlay)
-    return _Row(_values(file, fitted), f"{name}/{paths[0].name}" if paths else None)
 
 
 def _values(file: str, fitted: FittedFile) -> dict[str, Any]:

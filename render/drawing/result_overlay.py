@@ -34,6 +34,7 @@ def draw_result(
     image: ObservedImage,
     result: Result,
     *,
+    photo: ByteImage | None = None,
     mesh: Mesh | None = None,
     bounds: FloatArray | None = None,
     mask: npt.NDArray[Any] | None = None,
@@ -49,6 +50,8 @@ def draw_result(
     image : ObservedImage
         Its photo is drawn on, or grey where there is none.
     result : Result
+    photo : (h, w, 3) uint8, optional
+        Its photo, if it has been read already.
     mesh : Mesh, optional
         The object's, in the model's frame before the stretch; see `mesh_of`.
     bounds : (2, 3) float, optional
@@ -60,7 +63,7 @@ def draw_result(
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment
-    photo = photo_of(image, camera)
+    photo = photo_of(image, camera) if photo is None else photo
     in_camera = alignment.apply(result.points_3d)
     ahead = in_camera[:, 2] > 0
     seen = set(view.ids)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
+from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from support.refusals import refusal_line
 from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
 
-from cadalign import Alignment, Model, Result, Size, View, align
+from cadalign import Alignment, Camera, Model, Result, Size, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import rotation_from_vector
@@ -149,6 +154,67 @@ def test_depths_of_keypoints_are_used(tmp_path: Path) -> None:
     assert found == expected.alignment
 
 
+def without_focal(path: Path) -> Path:
+    """Take the focal lengths away from the cameras of a file."""
+    data = json.loads(path.read_text())
+    for image in data.get("views", [data]):
+        image["camera"] = {"width": 640, "height": 480}
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_unknown_focal_length_of_two_views_is_estimated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = without_focal(write(tmp_path, observed(0.0), observed(25.0)))
+    assert main(["fit", str(path)]) == 0
+    unknown = Camera.without_focal(640, 480)
+    views = [View(unknown, observed(angle).points_2d) for angle in (0.0, 25.0)]
+    expected = align(Model(points_3d=POINTS), views, focal="estimate")
+    found = result_in(tmp_path)
+    assert found.cameras == expected.cameras
+    assert found.alignment == expected.alignment
+    assert found.std is not None
+    assert abs(np.log(found.camera.fx / CAMERA.fx)) < 4 * found.std.focal
+    out = capsys.readouterr().out
+    assert out.startswith(f"{expected}\n")
+    head, everything, *without = out[len(str(expected)) :].strip("\n").split("\n")
+    assert head.endswith("focal length")
+    assert everything.endswith(f"{100 * found.std.focal:.2g} %")
+    assert len(without) == 2
+    assert (tmp_path / "a_fit" / "overlay_1.png").exists()
+
+
+def test_similar_models_noise_is_estimated_beside_evidence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, observed(up=UP))
+    assert main(["fit", str(path), "--similar"]) == 0
+    view = View(CAMERA, observed().points_2d, up=UP, sigma=None)
+    expected = align(Model(points_3d=POINTS, scale_prior_sigma=0.2), view)
+    assert capsys.readouterr().out.startswith(f"{expected}\n")
+
+
+@pytest.mark.parametrize(("second", "used"), [(28, True), (35, False)])
+def test_prior_of_the_photos_is_used_where_they_agree(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], second: int, *, used: bool
+) -> None:
+    images = []
+    for row, focal in enumerate((28, second)):
+        photo = tmp_path / f"{row}.jpg"
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = focal  # focal length in 35 mm film
+        Image.new("RGB", (640, 480)).save(photo, exif=exif)
+        images.append(replace(observed(25.0 * row), image=photo))
+    path = without_focal(write(tmp_path, *images))
+    assert main(["fit", str(path), "--no-picture"]) == 0
+    said = capsys.readouterr().err
+    assert ("Focal length from the photo's EXIF data" in said) == used
+    assert ("The photos' EXIF data differ" in said) != used
+    assert main(["fit", str(path), "--no-picture", "--no-exif"]) == 0
+    assert "EXIF" not in capsys.readouterr().err
+
+
 def write_box(folder: Path, truth: Alignment) -> np.ndarray:
     """Write box.obj and the mask.png of its pose; returns its corners (8, 3)."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
@@ -186,6 +252,47 @@ def test_start_is_where_keypoints_are_aligned_from(tmp_path: Path) -> None:
     found = result_in(tmp_path).alignment
     expected = align(Model(points_3d=POINTS), View(CAMERA, observed().points_2d), init=TRUTH)
     assert found == expected.alignment
+
+
+@pytest.mark.long
+def test_mask_goes_with_an_unknown_focal_length(tmp_path: Path) -> None:
+    truth = truth_of((1.0, 0.7, 1.5))
+    corners = write_box(tmp_path, truth)
+    noise = np.random.default_rng(0).normal(0, 1, (7, 2))
+    evidence = ImageEvidence(mask=tmp_path / "mask.png")
+    pixels = CAMERA.project(truth.apply(corners[:7])) + noise
+    image = ObservedImage(corners[:7], pixels, CAMERA, evidence=evidence)
+    path = without_focal(write(tmp_path, image, model=tmp_path / "box.obj"))
+    overlay = tmp_path / "model.png"
+    assert main(["fit", str(path), "--overlay", str(overlay), "--overlay-mode", "lines"]) == 0
+    found = result_in(tmp_path)
+    assert found.focal == "estimate"
+    assert found.std is not None
+    assert abs(np.log(found.camera.fx / CAMERA.fx)) < 4 * found.std.focal < 0.8
+    np.testing.assert_allclose(found.alignment.scale, truth.scale, rtol=0.05)
+    assert overlay.exists()
+
+
+def _note_opened(opened: list[str], folder: str, event: str, arguments: Any) -> None:
+    if event == "open" and str(arguments[0]).startswith(folder):
+        opened.append(str(arguments[0]))
+
+
+def test_every_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_box(tmp_path, TRUTH)
+    cv2.imwrite(str(tmp_path / "photo.png"), np.full((480, 640, 3), 90, dtype=np.uint8))
+    named = replace(observed(mask=tmp_path / "mask.png"), image=tmp_path / "photo.png")
+    write(tmp_path, named, model=tmp_path / "box.obj")
+    shutil.move(tmp_path / "a.json", tmp_path / "with_mask.json")
+    write(tmp_path, replace(named, evidence=ImageEvidence()), model=tmp_path / "box.obj")
+    for folder in (tmp_path, tmp_path / "a.json"):
+        opened: list[str] = []
+        sys.addaudithook(partial(_note_opened, opened, str(tmp_path)))
+        flags = ["--overlay", str(tmp_path / "drawn.png")]
+        assert main(["fit", str(folder), *flags, "--out", str(tmp_path / "out")]) == 0
+        counts = Counter(Path(each).name for each in opened)
+        assert counts["a.json"] == 1
+        assert counts["box.obj"] == counts["photo.png"] == (2 if folder is tmp_path else 1)
 
 
 @pytest.mark.slow
@@ -255,25 +362,10 @@ def test_one_keypoint_at_two_points_is_refused(
     )
 
 
-@pytest.mark.parametrize(
-    "flags", [["--similar"], ["--focal", "known"], ["--no-exif"], ["--method", "aepnp"]]
-)
 def test_options_without_effect_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
-) -> None:
-    path = write(tmp_path, observed(up=UP))
-    assert refusal_line(capsys, "fit", path, *flags) == (
-        f"{flags[0]}: has no effect together with the file's up; leave out one of the two"
-    )
-
-
-def test_unknown_focal_length_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write(tmp_path, observed(up=UP))
-    data = json.loads(path.read_text())
-    path.write_text(json.dumps(data | {"camera": {"width": 640, "height": 480}}))
-    assert refusal_line(capsys, "fit", path).startswith(
-        f"{path}: camera: the focal length is unknown, and is not estimated together with the "
-        "file's up; "
+    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
+        "--method: has no effect together with the file's up; leave out one of the two"
     )

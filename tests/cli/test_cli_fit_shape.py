@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,17 @@ import pytest
 from support.files import TETRAHEDRON
 from support.refusals import refusal_line
 
-from cadalign import Alignment, Camera, Model, RansacOptions, Result, ShapeModel, View, align
+from cadalign import (
+    Alignment,
+    Camera,
+    FocalPrior,
+    Model,
+    RansacOptions,
+    Result,
+    ShapeModel,
+    View,
+    align,
+)
 from cadalign.cli import main
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.keypoint_layer import UNSEEN_COLOR
@@ -165,6 +176,78 @@ def test_robust_search_works_with_shapes(
     assert expected.inliers.tolist() == [k != 2 for k in range(8)]
 
 
+def without_focal(path: Path) -> Path:
+    return edit(path, camera={"width": 640, "height": 480})
+
+
+@pytest.mark.parametrize("shape", ["learned", "similar"])
+def test_an_unknown_focal_length_is_estimated_with_a_shape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel, shape: str
+) -> None:
+    path = without_focal(write(tmp_path, 8))
+    numbered.save(tmp_path / "box.shape")
+    learned = ["--shape", str(tmp_path / "box.shape")]
+    flags = learned if shape == "learned" else ["--shape-sigma", "0.05"]
+    assert main(["fit", str(path), *flags]) == 0
+    seen = Observation.load(path)
+    model = numbered if shape == "learned" else Model(points_3d=CORNERS, shape_sigma=0.05)
+    expected = align(model, View(seen.camera, seen.points_2d), focal="estimate")
+    assert capsys.readouterr().out == f"{expected}\n"
+    assert "focal" in str(expected)
+    written = Result.from_dict(json.loads((tmp_path / "box_fit" / "fit.json").read_text()))
+    assert written.camera == expected.camera
+    assert expected.std is not None
+    assert abs(np.log(written.camera.fx / 900)) < 4 * expected.std.focal
+
+
+def test_prior_on_a_focal_length_is_that_of_the_file_and_flags_say_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    prior = FocalPrior(905.0, 0.01)
+    stored = {"focal": "estimate", "focal_prior": asdict(prior), "loss": "huber"}
+    path = write(tmp_path, 8, fit_options=stored, shape=tmp_path / "box.shape")
+    view = View(CAMERA, Observation.load(path).points_2d)
+    assert main(["fit", str(path)]) == 0
+    printed = capsys.readouterr()
+    found = align(numbered, view, loss="huber", focal="estimate", focal_prior=prior)
+    assert printed.out == f"{found}\n"
+    assert "Focal length from the file's prior: 905 px +-1 %" in printed.err
+    assert main(["fit", str(path), "--focal", "known"]) == 0
+    assert capsys.readouterr().out == f"{align(numbered, view, loss='huber')}\n"
+    path = without_focal(path)
+    assert refusal_line(capsys, "fit", path, "--focal", "known") == (
+        f"{path}: camera: the focal length is unknown; "
+        "give --focal estimate, or a calibrated camera"
+    )
+
+
+def test_noise_is_estimated_where_the_file_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    path = write(tmp_path, 8, fit_options={"sigma": None}, shape=tmp_path / "box.shape")
+    assert main(["fit", str(path)]) == 0
+    view = View(CAMERA, Observation.load(path).points_2d, sigma=None)
+    assert capsys.readouterr().out == f"{align(numbered, view)}\n"
+
+
+def test_options_of_the_robust_search_and_confidences_count_with_a_shape(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+) -> None:
+    numbered.save(tmp_path / "box.shape")
+    confidences = np.array([0.9, 0.8, 0.1, 0.9, 0.8, 0.9, 0.7, 0.9])
+    path = write(tmp_path, 8, shape=tmp_path / "box.shape", confidences=confidences)
+    data = json.loads(path.read_text())
+    data["keypoints"][2]["uv"] = [20.0, 400.0]
+    path.write_text(json.dumps(data))
+    flags = ["--robust", "--max-iterations", "20", "--min-iterations", "5", "--no-refine"]
+    assert main(["fit", str(path), *flags]) == 0
+    ransac = RansacOptions(max_iterations=20, min_iterations=5, refine=False)
+    view = View(CAMERA, Observation.load(path).points_2d, confidences=confidences)
+    assert capsys.readouterr().out == f"{align(numbered, view, ransac=ransac)}\n"
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("source", ["observation", "training"])
 def test_warped_mesh_is_drawn(tmp_path: Path, source: str) -> None:
@@ -256,18 +339,6 @@ def test_shape_sigma_whose_square_is_no_number(
     )
 
 
-def test_unknown_focal_length(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
-) -> None:
-    numbered.save(tmp_path / "box.shape")
-    path = edit(write(tmp_path), camera={"width": 640, "height": 480})
-    for flags in (["--shape", tmp_path / "box.shape"], ["--shape-sigma", "0.1"]):
-        assert refusal_line(capsys, "fit", path, *flags) == (
-            f"{path}: camera: the focal length is unknown, and is not estimated together with a "
-            "shape; write into the file what `cadalign fit` without a shape estimates"
-        )
-
-
 def test_shape_file_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     missing = tmp_path / "none.shape"
     line = refusal_line(capsys, "fit", write(tmp_path), "--shape", missing)
@@ -287,15 +358,8 @@ def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     "flags",
     [
         ["--similar"],
-        ["--focal", "known"],
-        ["--no-exif"],
         ["--no-scale-prior"],
         ["--method", "aepnp"],
-        ["--no-refine"],
-        ["--minimal", "aepnp"],
-        ["--success-prob", "0.9"],
-        ["--min-iterations", "7"],
-        ["--max-iterations", "7"],
     ],
 )
 @pytest.mark.parametrize("shape", [["--shape", "box.shape"], ["--shape-sigma", "0.1"]])

@@ -324,10 +324,9 @@ def _deviations(evidence: Evidence, state: State) -> Uncertainty:
     distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))
     x, y, z = (_or_infinite(each, _UNKNOWN_SCALE * distance) for each in deviations[3:6])
-    sx, sy, sz = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:])
-    return Uncertainty(
-        _or_infinite(rotation, _UNKNOWN_ROTATION_DEG), (x, y, z), (sx, sy, sz), focal=0.0
-    )
+    sx, sy, sz, *focal = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:])
+    rotation = _or_infinite(rotation, _UNKNOWN_ROTATION_DEG)
+    return Uncertainty(rotation, (x, y, z), (sx, sy, sz), focal=focal[0] if focal else 0.0)
 
 
 def _or_infinite(deviation: float, limit: float) -> float:

@@ -160,7 +160,7 @@ def _priors(session: Session, state: PhotoState) -> dict[str, Any]:
     priors = state.document.priors
     likely = priors.focal or state.intrinsics.likely_focal
     source = "EXIF" if likely == state.intrinsics.prior else "usual lenses"
-    is_estimated = not state.document.focal.known and not session.is_joint(state)
+    is_estimated = state.lead is None and session.estimates_focal(state)
     return {
         "stretch": None if priors.stretch is None else round(100 * priors.stretch, 4),
         "likely": 100 * LIKELY_STRETCH,

@@ -64,9 +64,13 @@ def facts_of_shape(live: LiveShape, shape: ObjectShape | None) -> tuple[Fact, ..
     if result.std is not None:
         facts.append(_rotation(result.std.rotation_deg))
     facts.append(_distance(result, shape))
-    facts.append(
-        Fact("Focal length", f"{camera.fx:.0f} px", "assumed" if live.provisional else "as given")
-    )
+    if result.focal == "known":
+        note = "assumed" if live.provisional else "as given"
+        facts.append(Fact("Focal length", f"{camera.fx:.0f} px", note))
+    elif camera == result.camera:
+        facts.append(_focal(result))
+    else:  # that of another lens, whose deviation is not in the covariance
+        facts.append(Fact("Focal length", f"{camera.fx:.0f} px", "estimated"))
     if live.counts.sum() > 3:
         off = f"points off by {short(live.sigma)} px" if live.sigma > 1 else "clicks of 1 px"
         note = f"rms; the standard deviations above are for {off}"

@@ -24,7 +24,7 @@ from cadalign.annotate.masks import draw_mask
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects.deletions import Deletions
-from cadalign.annotate.objects.joint import tells_something, with_other_views
+from cadalign.annotate.objects.joint import tells_something, views_in_order, with_other_views
 from cadalign.annotate.objects.listing import shown_objects
 from cadalign.annotate.objects.models import Models
 from cadalign.annotate.objects.state import Live, PhotoState
@@ -230,12 +230,37 @@ class Session:
             further=self.further(state),
             scale_prior_sigma=prior,
             anchors={label: point for label, point in own.items() if label is not None},
-            assumed_focal=tuple(
-                "" if view is state else view.photo.path.name
-                for view in state.all_views
-                if not view.document.focal.known and (view is state or self.tells(view))
-            ),
+            **self._focal_of(state),
         )
+
+    def _focal_of(self, state: PhotoState) -> dict[str, Any]:
+        """The fields of `Known` about the focal lengths of an object's photos."""
+        used = [view for view in state.all_views if view is state or self.tells(view)]
+        unknown = [view for view in used if not view.document.focal.known]
+        if unknown and self.estimates_focal(state):
+            prior = state.owner.document.priors.focal
+            return {"estimates_focal": True, "focal_prior": prior}
+        names = ("" if view is state else view.photo.path.name for view in unknown)
+        return {"assumed_focal": tuple(names)}
+
+    def estimates_focal(self, state: PhotoState) -> bool:
+        """True if the focal lengths of an object's photos are estimated.
+
+        Not where that of some photo is known, or the photos' EXIF data differ: `cadalign.align`
+        estimates those of all views, with one prior.
+        """
+        if state.document.focal.known:
+            return False
+        used = [view for view in state.all_views if view is state or self.tells(view)]
+        stored = views_in_order(state.owner)
+        cameras = [view.camera for view in stored if isinstance(view, ObservedImage)]
+        if any(view.document.focal.known for view in used) or any(
+            camera.focal_known for camera in cameras
+        ):
+            return False
+        priors = [view.intrinsics.prior for view in used]
+        known = [prior for prior in priors if prior is not None]
+        return all(prior.is_like(known[0]) for prior in known)
 
     def observed(self, state: PhotoState) -> Observation | None:
         """The pairs that count, with the evidence beside them."""

@@ -11,11 +11,13 @@ import numpy as np
 from cadalign.annotate.alignment import LEAST_SIGMA, ExpectedNoise
 from cadalign.annotate.further import FurtherEvidence
 from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.photos import without_focal
 from cadalign.annotate.wireframe import Wireframe
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.observed import model_of, size_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -79,9 +81,10 @@ class LiveShape:
 
 def warm_up_joint(points_3d: FloatArray, points_2d: FloatArray, camera: Camera) -> None:
     """Compile or load what `align_shape` calls, by aligning points (n, 3) with (n, 2) [px]."""
-    view = View(camera, points_2d)
+    view, model = View(camera, points_2d), Model(points_3d=points_3d, shape_sigma=0.01)
     for ransac in (None, RansacOptions()):
-        align(Model(points_3d=points_3d, shape_sigma=0.01), view, ransac=ransac)
+        align(model, view, ransac=ransac)
+    align(model, view, focal="estimate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +101,20 @@ class Known:
     anchors : mapping
         The model's keypoints that the shape knows, by their ids there.
     assumed_focal : tuple of str
-        Photos whose focal length is neither measured nor chosen, this one by an empty name.
+        Photos whose focal length is neither known nor estimated, this one by an empty name.
+    estimates_focal : bool
+        Estimate the focal lengths of all views.
+    focal_prior : FocalPrior, optional
+        On these.
     """
 
     shape: ObjectShape | None
     further: FurtherEvidence
     scale_prior_sigma: float | None
     anchors: Mapping[Any, ModelKeypoint]
-    assumed_focal: tuple[str, ...]
+    assumed_focal: tuple[str, ...] = ()
+    estimates_focal: bool = False
+    focal_prior: FocalPrior | None = None
 
     def model_for(self, observation: Observation, mesh: Mesh) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation."""
@@ -142,41 +151,75 @@ class Known:
 class JointEstimate:
     """An alignment from all photos of an object, and what it was computed from.
 
-    ``sigma`` is the deviation [px] that the estimate took for all keypoints, None for their own.
+    ``sigma`` is the deviation [px] that the estimate took for all keypoints, None for their own;
+    ``assumes_focal`` is True where the evidence did not suffice to estimate focal lengths.
     """
 
     model: Model | ShapeModel
     views: tuple[View, ...]
     result: Result
     sigma: float | None
+    assumes_focal: bool = False
 
     @classmethod
     def of(cls, known: Known, mesh: Mesh, observation: Observation) -> JointEstimate:
-        """Align as `cadalign fit` does; raises a CadalignError if that is impossible."""
-        model, size = known.model_for(observation, mesh), size_of(observation)
-        sigma = known.further.sigma
-        views = views_of(observation, model, sigma=sigma)
-        if sigma is not None or not known.has_open_sigma(observation):
-            return cls(model, views, align(model, views, size=size), sigma)
-        sigma = _explaining_sigma(model, views, size)
-        used = [replace(view, sigma=sigma) for view in views]
-        return cls(model, views, align(model, used, size=size), sigma)
+        """Align as `cadalign fit` does; raises a CadalignError if that is impossible.
+
+        With too little evidence for focal lengths, at those of the observation's cameras.
+        """
+        model = known.model_for(observation, mesh)
+        views = views_of(observation, model, sigma=known.further.sigma)
+        if known.estimates_focal:
+            unknown = tuple(replace(view, camera=without_focal(view.camera)) for view in views)
+            lens = {"focal": "estimate", "focal_prior": known.focal_prior}
+            try:
+                return cls._of(known, observation, model, unknown, lens)
+            except DegenerateError:
+                estimate = cls._of(known, observation, model, views, {})
+                return replace(estimate, assumes_focal=True)
+        return cls._of(known, observation, model, views, {})
+
+    @classmethod
+    def _of(
+        cls,
+        known: Known,
+        observation: Observation,
+        model: Model | ShapeModel,
+        views: tuple[View, ...],
+        lens: Mapping[str, Any],
+    ) -> JointEstimate:
+        """Align views, ``lens`` being the options of `align` for focal lengths."""
+        size, sigma, used = size_of(observation), known.further.sigma, views
+        if sigma is None and known.has_open_sigma(observation):
+            sigma = _explaining_sigma(model, views, size, lens)
+            used = tuple(replace(view, sigma=sigma) for view in views)
+        return cls(model, views, align(model, used, size=size, **lens), sigma)
 
 
-def _explaining_sigma(model: Model | ShapeModel, views: Sequence[View], size: Size | None) -> float:
+def _explaining_sigma(
+    model: Model | ShapeModel,
+    views: Sequence[View],
+    size: Size | None,
+    lens: Mapping[str, Any],
+) -> float:
     """The deviation of keypoints [px] that explains what a model which is only similar leaves.
 
     The fixed point of its estimate, from the expected one. Without masks, which take longer than
-    all the rest.
+    all the rest, and with focal lengths as the first round finds them, ``lens`` being the options
+    of `align` for them.
     """
     noise = ExpectedNoise.of(*(view.camera for view in views))
     sigma = noise.sigma
+    views = [replace(view, mask=None, mask_sigma=None) for view in views]
     for _ in range(_NOISE_ROUNDS):
-        used = [replace(view, mask=None, mask_sigma=None, sigma=sigma) for view in views]
+        used = [replace(view, sigma=sigma) for view in views]
         try:
-            result = align(model, used, size=size)
+            result = align(model, used, size=size, **lens)
         except CadalignError:  # it takes the masks
             break
+        if lens:
+            pairs = zip(views, result.cameras, strict=True)
+            views, lens = [replace(view, camera=camera) for view, camera in pairs], {}
         residuals = result.residuals
         redundancy = max(0, residuals.size - _UNKNOWNS)
         before = sigma
@@ -223,18 +266,21 @@ def align_shape(
     model, result = estimate.model, estimate.result
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
     warped = _warp(wireframe, result, model, known, free)
-    photo = observation.views[further.place]
+    camera = result.cameras[further.place]
     residuals = np.empty((len(points), 2))
     residuals[counts] = result.views[further.place].residuals
-    seen = photo.camera.project(result.poses[further.place].apply(warped.carried))
+    seen = camera.project(result.poses[further.place].apply(warped.carried))
     residuals[~counts] = seen - uv[~counts]
     rows = np.flatnonzero(counts)
-    contradicting = _contradicting(model, estimate.views[further.place])
+    too_few = ""
+    if estimate.assumes_focal:
+        too_few = "The focal length is assumed: add a pair elsewhere to have it estimated."
+    contradicting = _contradicting(model, replace(estimate.views[further.place], camera=camera))
     return LiveShape(
         shown=result,
-        message=_assumption(known.assumed_focal, photo.camera),
-        provisional=bool(known.assumed_focal),
-        camera=photo.camera,
+        message=_assumption(known.assumed_focal, camera) or too_few,
+        provisional=bool(known.assumed_focal or too_few),
+        camera=camera,
         counts=counts,
         residuals=residuals,
         outliers={int(rows[row]): off for row, off in contradicting.items()},

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from cadalign.io.observation import Observation
 
 _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks
-_SAME_LENS = 0.01  # relative difference of focal lengths
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ def _prior_of_photos(observation: Observation) -> FocalPrior | None:
         other = None if first is None or view.image is None else FocalPrior.from_exif(view.image)
         if first is None or other is None:
             continue
-        if abs(other.focal / first.focal - 1) > _SAME_LENS:
+        if not first.is_like(other):
             say(
                 f"The photos' EXIF data differ ({first.focal:.4g} and {other.focal:.4g} px): unused"
             )

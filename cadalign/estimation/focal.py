@@ -23,6 +23,7 @@ SHORTEST, LONGEST = 0.1, 50.0
 _GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
 
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
+_SAME_LENS = 0.01
 _CONTRADICTION = 1.25
 _CONTRADICTING_SIGMAS = 3.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -66,6 +67,10 @@ class FocalPrior:
         for name in ("focal", "relative_sigma"):
             value = getattr(self, name)
             object.__setattr__(self, name, as_positive(value, name=f"focal_prior.{name}"))
+
+    def is_like(self, other: FocalPrior) -> bool:
+        """True if both can be of one lens: the focal lengths differ by less than 1 %."""
+        return abs(math.log(self.focal / other.focal)) < _SAME_LENS
 
     @classmethod
     def from_exif(

@@ -203,14 +203,16 @@ def test_options_of_a_single_photo_are_refused_for_a_folder(case: Case) -> None:
         case.open(image=case.folder, size={"width": 1.0})
 
 
-def test_unknown_focal_length_is_assumed_beside_evidence(case: Case) -> None:
+def test_unknown_focal_length_is_estimated_beside_evidence(case: Case) -> None:
     whole = observed(case, "up")
     camera = whole.camera
     unknown = Camera.without_focal(camera.width, camera.height)
     replace(whole, camera=unknown).save(case.observation)
     session = case.open(camera=None)
     shown = page_state(session, 0)["alignment"]
-    assert any("focal length is assumed" in note for note in shown["notes"])
+    facts = {fact["label"]: fact for fact in shown["facts"]}
+    assert facts["Focal length"]["note"] == "estimated"
+    assert not any("focal length is assumed" in note for note in shown["notes"])
     perform(session, 0, {"do": "focal", "known": True, "pixels": camera.fx})
     assert "gravity" in page_state(session, 0)["alignment"]["also_used"]
     assert (case.folder / "photo_fit" / "fit.json").exists()

@@ -213,15 +213,57 @@ def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
     np.testing.assert_allclose(fitted.covariance, page.shown.covariance, rtol=1e-9, atol=1e-15)
 
 
-def test_assumed_focal_length_is_shown_and_not_saved(case: Case, shape_file: Path) -> None:
-    session = case.open(shape=shape_file, camera=None)
-    state = place_all(session, case)
-    assert "The focal length is assumed" in state["alignment"]["notes"][0]
-    assert not (case.folder / "photo_fit/fit.json").exists()
+@pytest.mark.parametrize("kind", ["learned", "similar"])
+def test_unknown_focal_length_is_estimated_with_the_shape(
+    case: Case, tmp_path: Path, shape_file: Path, kind: str
+) -> None:
+    session = case.open(**options_of(kind, shape_file), camera=None)
+    shown = place_all(session, case)["alignment"]
+    (fact,) = (fact for fact in shown["facts"] if fact["label"] == "Focal length")
+    found = live_shape(session).shown
+    assert found is not None
+    assert found.std is not None
+    assert found.focal == "estimate"
+    assert found.focal_prior == session.photos[0].intrinsics.likely_focal
+    assert fact["note"] == "estimated"
+    assert fact["value"].startswith(f"{found.camera.fx:.0f} ± ")
+    assert shown["focal"] == found.camera.fx
+    off = np.log(found.camera.fx / case.instance.camera.fx)
+    assert abs(off) < 3 * found.std.focal
+    assert page_state(session, 0)["priors"]["has_focal"]
     assert not Observation.load(case.observation).camera.focal_known
+    saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
+    assert saved.camera == found.camera
+    assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
+    fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
+    assert fitted.camera.fx == pytest.approx(found.camera.fx, rel=1e-9)
+    np.testing.assert_allclose(fitted.covariance, found.covariance, rtol=1e-6, atol=1e-12)
     perform(session, 0, {"do": "focal", "known": True})
-    assert (case.folder / "photo_fit/fit.json").exists()
     assert Observation.load(case.observation).camera.focal_known
+    known = live_shape(session).shown
+    assert known is not None
+    assert known.focal == "known"
+
+
+@pytest.mark.parametrize("kind", ["learned", "similar"])
+@pytest.mark.parametrize("prior", [True, False])
+def test_three_pairs_leave_an_unknown_focal_length_to_its_prior(
+    case: Case, shape_file: Path, kind: str, *, prior: bool
+) -> None:
+    session = case.open(**options_of(kind, shape_file), camera=None)
+    perform(session, 0, {"do": "prior", "stretch": None, "focal": prior})
+    numbers = {point.semantic_id: number for number, point in session.registry}
+    for semantic_id, uv in case.clicks[LACKING : LACKING + 3]:
+        place(session, numbers[semantic_id], uv)
+    live = live_shape(session)
+    assert live.shown is not None
+    assert live.provisional != prior
+    assert (case.folder / "photo_fit/fit.json").exists() == prior
+    if not prior:
+        assert live.message.startswith("The focal length is assumed: add a pair")
+        assert live.camera is not None
+        likely = session.photos[0].intrinsics.likely_focal
+        assert live.camera.fx == pytest.approx(likely.focal)
 
 
 def test_contradicting_pair_is_named(case: Case, shape_file: Path) -> None:

@@ -17,7 +17,9 @@ from cadalign.annotate.claims import Claims
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.cli import main
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.observation import Observation
 
@@ -242,6 +244,24 @@ def test_a_photo_of_an_object_can_have_objects_of_its_own(both: Session, case: C
     again = opened(case)
     labels = {each["label"] for each in page_state(again, 1, slot=1)["objects"]}
     assert labels == {"lamp", "object 1 of photo.png"}
+
+
+def test_photos_of_one_camera_share_an_estimated_focal_length(case: Case, tmp_path: Path) -> None:
+    session = opened(case, camera=None)
+    put(session, case, 7)
+    perform(session, 0, ADD)
+    put(session, case, 6, photo=1, slot=1)
+    first, second = (
+        page_state(session, number, slot=slot)["alignment"] for number, slot in ((0, 0), (1, 1))
+    )
+    assert first["focal"] == second["focal"]
+    labels = {fact["label"]: fact for fact in second["facts"]}
+    assert labels["Focal length"]["note"] == "estimated"
+    saved = Result.from_dict(json.loads((case.folder / "photo_fit" / "fit.json").read_text()))
+    assert saved.cameras[0].fx == saved.cameras[1].fx == first["focal"]
+    assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
+    fitted = Result.from_dict(json.loads((tmp_path / "x" / "fit.json").read_text()))
+    assert fitted.camera.fx == pytest.approx(first["focal"], rel=1e-6)
 
 
 def test_an_assumed_focal_length_of_one_photo_keeps_the_alignment_from_being_saved(

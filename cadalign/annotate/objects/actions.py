@@ -163,9 +163,8 @@ def _add_object(session: Session, photo: int, model: OpenedModel, name: str) -> 
         for number in range(2, len(states) + 3)
         if number not in taken and not object_file(first, number).exists()
     )
-    priors = Priors(focal=like.intrinsics.prior)
-    if session.shape is None:
-        priors = Priors(LIKELY_STRETCH, like.intrinsics.likely_focal)
+    stretch = LIKELY_STRETCH if session.shape is None else None
+    priors = Priors(stretch, like.intrinsics.likely_focal)
     document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
     files = AnnotationFiles(object_file(first, number), like.photo.path, model.path)
     added = PhotoState(like.photo, files, like.intrinsics, History(document), model)

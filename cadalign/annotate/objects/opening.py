@@ -119,11 +119,10 @@ def open_object(
     stored = files.read(registry, diagonal, shape)
     own = stored.camera
     intrinsics, focal = _intrinsics(photo, own, camera)
-    if shape is not None:  # which has priors of its own
-        priors = Priors(focal=intrinsics.prior)
-    else:
-        likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
-        priors = stored.priors_or(likely, exif=intrinsics.prior)
+    likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
+    priors = stored.priors_or(likely, exif=intrinsics.prior)
+    if shape is not None:  # which has a prior of its own on the stretch
+        priors = replace(priors, stretch=None)
     further = with_options(stored.further)
     evidence = MarkedEvidence.of(further)
     document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)

@@ -13,6 +13,7 @@ from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
 from cadalign.cli.output import make_folder, new_console
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import Sigma
 from cadalign.io.images import read_image
 from cadalign.retrieval import Match
@@ -46,7 +47,8 @@ class Retrieve(ObservationCommand):
     """File that `cadalign library build` wrote."""
     shape: tuple[Path, ...] = ()
     """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
-    shape estimated from the keypoints, for objects that are not in the library."""
+    shape estimated from the keypoints, for objects that are not in the library. An unknown focal
+    length is estimated with it, with the photo's EXIF data as a prior."""
     robust: bool = False
     """Not available here: use --loss cauchy against outliers."""
     mask: Path | None = None
@@ -76,6 +78,16 @@ class Retrieve(ObservationCommand):
         library = Library.open(self.library)
         shape = _open_shapes(self.shape)
         camera = query.camera
+        prior = None
+        if not camera.focal_known:
+            if shape is None:
+                raise InputError(
+                    "the focal length is unknown, without which no model's pose is searched",
+                    where=f"{self.observation}: camera",
+                    fix="rank by --shape, which estimates it, or give a calibrated camera",
+                )
+            if query.image is not None:
+                prior = FocalPrior.from_exif(query.image)
         mask = None if self.mask is None else read_mask(self.mask, camera)
         image = read_opacity(query.image, camera) if self.silhouette else None
         # The table needs no photo, which may have been moved.
@@ -91,10 +103,15 @@ class Retrieve(ObservationCommand):
                 camera,
                 **vars(replace(self.ranking, sigma=self.sigma_of(query))),
                 shape=shape,
+                focal_prior=prior,
                 mask=mask,
                 image=image,
                 workers=self.workers,
             )
+        found = matches[0].camera if matches else None
+        if not camera.focal_known and found is not None:
+            camera = found
+            console.print(f"Focal length: estimated as {camera.fx:.4g} px", markup=False)
         if self.json:
             print_json([match.to_dict() for match in matches])
         else:

@@ -15,15 +15,17 @@ Keypoints that a model lacks are filled in with those that the category leads to
 several categories, each has the probability that its shape model gives to the image's keypoints.
 All models are ranked, but those that would reach behind the camera; none is searched for a pose.
 Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
-box closest to the estimated ones. Of the options, ``scale_prior_sigma`` and ``exhaustive`` have no
+box closest to the estimated ones. An unknown focal length is estimated with the shape of the most
+probable category. Of the options, ``scale_prior_sigma`` and ``exhaustive`` have no
 effect.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.align import align
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.shape_posterior import (
     ShapePosterior,
@@ -38,6 +41,7 @@ from cadalign.estimation.uncertainty.shape_posterior import (
     shape_posterior,
 )
 from cadalign.estimation.view import View
+from cadalign.geometry.camera import Camera
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
@@ -149,11 +153,7 @@ def rank_by_shape(
             known = _shapes_of(table, category, shape)
             parts.append(_rank_category(rows, models, known, observed, options, shape))
     if not parts:
-        raise InputError(
-            f"no shape model has {_LEAST_KEYPOINTS} of the keypoints",
-            where="semantic_ids",
-            fix="check them, or rank without shape",
-        )
+        raise _no_shape()
     logs = np.concatenate([part.logs for part in parts])
     if not len(logs):
         raise DegenerateError(
@@ -169,6 +169,50 @@ def rank_by_shape(
         logs[order],
         weights / weights.sum(),
         0,
+    )
+
+
+def camera_by_shape(
+    observed: Observed,
+    options: RetrievalOptions,
+    shapes: Mapping[str, ShapeModel],
+    prior: FocalPrior | None,
+) -> Camera:
+    """The image's camera at the focal length that the most probable category's shape gives.
+
+    Raises
+    ------
+    InputError
+        If no shape model has 3 of the image's keypoints.
+    DegenerateError
+        If the keypoints do not determine the focal length.
+    """
+    found: list[tuple[float, Camera]] = []
+    size = observed.camera
+    unknown = Camera.without_focal(
+        size.width, size.height, cx=size.cx, cy=size.cy, distortion=size.distortion
+    )
+    loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
+    for _, shape in sorted(shapes.items()):
+        in_image = np.isin(observed.query.ids, shape.ids)
+        if in_image.sum() < _LEAST_KEYPOINTS:
+            continue
+        view = replace(_view(observed, in_image, options), camera=unknown)
+        free = align(shape, view, focal="estimate", focal_prior=prior, **loss)
+        view = replace(view, camera=free.camera)
+        posterior = shape_posterior(align(shape, view, **loss), view, **loss)
+        gains = float(observed.query.gains[in_image].sum())
+        found.append((posterior.log_evidence + gains, free.camera))
+    if not found:
+        raise _no_shape()
+    return max(found, key=lambda each: each[0])[1]
+
+
+def _no_shape() -> InputError:
+    return InputError(
+        f"no shape model has {_LEAST_KEYPOINTS} of the keypoints",
+        where="semantic_ids",
+        fix="check them, or rank without shape",
     )
 
 

@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.absence import none_probability
-from cadalign.retrieval.by_shape import rank_by_shape, shapes_by_category
+from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
@@ -164,6 +165,7 @@ class Library:
         camera: Camera,
         *,
         shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
+        focal_prior: FocalPrior | None = None,
         mask: npt.ArrayLike | None = None,
         image: npt.ArrayLike | None = None,
         exclude: Collection[ModelKey] = (),
@@ -186,11 +188,14 @@ class Library:
             Semantic ids of the keypoints, without repetition. Ids differ by category: without
             ``category`` each model reads them in its own category's sense.
         camera : Camera
-            The calibrated camera. Lens distortion is honoured.
+            The calibrated camera. Lens distortion is honoured. With ``shape`` it may lack a focal
+            length, which is then estimated: ``match.camera`` has it.
         shape : ShapeModel or mapping of category to ShapeModel, optional
             Rank by the shape that these estimate from the image, for objects that no model of the
             library is, not even stretched: only models of these categories, a single shape model
             being that of ``category``, if given. See `cadalign.retrieval.by_shape`.
+        focal_prior : FocalPrior, optional
+            Prior on an unknown focal length, with ``shape``.
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
@@ -217,7 +222,8 @@ class Library:
         ------
         InputError
             If the library is empty, shapes don't match, a value is NaN or infinite, a semantic id
-            is unknown or occurs twice, or an option is invalid.
+            is unknown or occurs twice, an option is invalid, or the focal length is unknown without
+            ``shape``.
         DegenerateError
             If no model shares at least 4 keypoints with the image, or none can be aligned.
         """
@@ -226,6 +232,12 @@ class Library:
         except TypeError as error:
             raise InputError(f"unknown option ({error})", where="options") from None
         if shape is None:
+            if isinstance(camera, Camera) and not camera.focal_known:
+                raise InputError(
+                    "the focal length is unknown, without which no model's pose is searched",
+                    where="camera",
+                    fix="rank by shape=, which estimates it, or give it: camera.with_focal(...)",
+                )
             observed = observe(points_2d, semantic_ids, camera, chosen)
             candidates = gather_candidates(self._table, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
@@ -235,6 +247,10 @@ class Library:
             category = next(iter(shapes)) if len(shapes) == 1 else None
             # The deviation of shapes is no noise of the keypoints here.
             plain = replace(chosen, shape_sigma=0.0, category=category)
+            if isinstance(camera, Camera) and not camera.focal_known:
+                some = camera.with_focal(max(camera.width, camera.height))  # which rays need
+                observed = observe(points_2d, semantic_ids, some, plain)
+                camera = camera_by_shape(observed, chosen, shapes, focal_prior)
             observed = observe(points_2d, semantic_ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.refusals import refusal_line
 
-from cadalign import Alignment, Box, Camera, Library, ShapeModel, View, align
+from cadalign import Alignment, Box, Camera, FocalPrior, Library, ShapeModel, View, align
 from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.geometry.metrics import box_iou_up_to_scale
@@ -291,3 +291,62 @@ class TestCommand:
             *("--shape", folder / "mug.shape"),
         )
         assert line == "--shape: unknown category 'mug'; known are table"
+
+
+# --- without a focal length --------------------------------------------------------------------
+
+UNKNOWN = Camera.without_focal(640, 480)
+
+
+def test_an_unknown_focal_length_is_estimated_with_the_shape() -> None:
+    model, prior = OBJECTS[0], FocalPrior(900.0, 0.1)
+    pixels = seen(model, 1.0)
+    found = LIBRARY.retrieve(
+        pixels, model.semantic_ids, UNKNOWN, shape=SHAPE, sigma=1.0, focal_prior=prior
+    )
+    view = View(UNKNOWN, pixels, sigma=1.0)
+    expected = align(SHAPE, view, focal="estimate", focal_prior=prior)
+    assert {match.camera for match in found} == {expected.camera}
+    assert found[0].model_id == first(model).model_id or found[0].score < 0.9
+    assert iou(found[0], model) > 0.6
+
+
+def test_the_most_probable_category_gives_the_focal_length() -> None:
+    other = [make_table(number + 5000, "stool") for number in range(40)]
+    squashed = [replace(each, xyz=each.xyz * [3.0, 0.2, 1.0]) for each in other]
+    library, model = Library.from_models(MODELS + squashed), OBJECTS[1]
+    shapes = {"table": SHAPE, "stool": learn(squashed)}
+    asked: dict[str, Any] = {"sigma": 1.0, "focal_prior": FocalPrior(935.0, 0.05)}
+    pixels = seen(model, 1.0)
+    both = library.retrieve(pixels, model.semantic_ids, UNKNOWN, shape=shapes, **asked)
+    alone = LIBRARY.retrieve(pixels, model.semantic_ids, UNKNOWN, shape=SHAPE, **asked)
+    assert both[0].category == "table"
+    assert both[0].camera == alone[0].camera
+
+
+def test_models_themselves_are_not_ranked_without_a_focal_length() -> None:
+    with pytest.raises(InputError) as caught:
+        LIBRARY.retrieve(seen(OBJECTS[0]), OBJECTS[0].semantic_ids, UNKNOWN)
+    assert str(caught.value) == (
+        "camera: the focal length is unknown, without which no model's pose is searched; "
+        "rank by shape=, which estimates it, or give it: camera.with_focal(...)"
+    )
+
+
+def test_command_estimates_a_focal_length_with_the_shape_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = OBJECTS[0]
+    SHAPE.save(tmp_path / "table.shape")
+    LIBRARY.save(tmp_path / "tables.library")
+    query = tmp_path / "query.json"
+    Observation(model.xyz, seen(model), UNKNOWN, semantic_ids=model.semantic_ids).save(query)
+    command = ["retrieve", str(query), "--library", str(tmp_path / "tables.library")]
+    assert refusal_line(capsys, *command) == (
+        f"{query}: camera: the focal length is unknown, without which no model's pose is searched; "
+        "rank by --shape, which estimates it, or give a calibrated camera"
+    )
+    out = ["--shape", str(tmp_path / "table.shape"), "--out", str(tmp_path / "out")]
+    assert main([*command, *out, "--top", "2"]) == 0
+    assert "Focal length: estimated as" in capsys.readouterr().err
+    assert (tmp_path / "out" / "index.html").exists()

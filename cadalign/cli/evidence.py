@@ -12,7 +12,6 @@ import tyro
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import convert
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SizeFields, read_size
@@ -33,6 +32,8 @@ class CameraOptions:
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera of --camera; ``size`` is the photo's, for a file of a matrix alone."""
         if self.camera is not None:
+            from cadalign.io.camera_file import read_camera
+
             return read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
         if self.pixel_origin is not None:
             raise InputError("given without --camera", where="--pixel-origin", fix="give both")

@@ -13,7 +13,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.older_document import completed, upgraded
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pixel_information
 from cadalign.estimation.result import Result
@@ -231,6 +230,8 @@ def read_result(data: Mapping[str, Any]) -> Result:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             if isinstance(data, Mapping) and "version" not in data:
+                from cadalign.estimation.older_document import completed, upgraded
+
                 return completed(_result(convert(upgraded(data, VERSION), _Result)))
             return _result(convert(data, _Result))
     except CadalignError as error:

@@ -8,7 +8,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,11 +20,13 @@ from cadalign.estimation.keypoint_result import result_of_solution, with_keypoin
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.results import Results, SolvedTable
 from cadalign.estimation.solve import solve
 from cadalign.estimation.symmetry import canonical_result, checked_symmetry
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
+
+if TYPE_CHECKING:
+    from cadalign.estimation.results import Results
 
 _INLIER_ROUNDS = 5
 
@@ -214,6 +216,8 @@ def fit_batch(
     >>> batch.scale.shape
     (2, 3)
     """
+    from cadalign.estimation.results import Results, SolvedTable  # only here: one fit has no table
+
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     options = FitOptions(
         method=method,

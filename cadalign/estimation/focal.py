@@ -14,7 +14,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.images import open_photo
 
 logger = logging.getLogger("cadalign")
 
@@ -99,6 +98,8 @@ class FocalPrior:
         DataError
             If the file is missing or not an image.
         """
+        from cadalign.io.images import open_photo  # only here: a known focal length needs none
+
         with open_photo(path) as image:
             tags = dict(image.getexif().get_ifd(_EXIF_IFD))
             width, height = image.size

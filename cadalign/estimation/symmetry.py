@@ -20,11 +20,11 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.uncertainty.stated import KeypointStatistics
+    from cadalign.geometry.symmetry_group import Equal, SymmetryGroup
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
@@ -45,6 +45,8 @@ def checked_symmetry(symmetry: object) -> Symmetry | None:
     if not isinstance(symmetry, Symmetry):
         what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
         raise InputError(what, where="symmetry", fix="see cadalign.Symmetry.from_dict")
+    from cadalign.geometry.symmetry_group import group_of  # only here: most models have none
+
     group_of(symmetry)
     return symmetry
 
@@ -109,6 +111,8 @@ def equal_text(
     """A clause about the alignments that are equal to one; empty without a symmetry."""
     if symmetry is None or symmetry.is_trivial:
         return ""
+    from cadalign.geometry.symmetry_group import group_of
+
     group = group_of(symmetry)
     found = group.canonical(alignment, held=held)
     if len(found.free) > 1:
@@ -124,6 +128,8 @@ def equal_text(
 
 def canonical_result(result: Result, symmetry: Symmetry) -> Result:
     """A result of keypoints in one view as its canonical one, with alternatives that are others."""
+    from cadalign.geometry.symmetry_group import group_of
+
     group = group_of(symmetry)
     held = held_axes(result.stretched_axes)
     best = group.canonical(result.alignment, held=held)

@@ -15,8 +15,6 @@ from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.camera_form import read_form, read_matrix, write_form
 from cadalign.geometry.distortion import distort, perspective, undistort
 from cadalign.geometry.pixels import PixelOrigin
-from cadalign.notebook.axes import photo_axes
-from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -363,6 +361,9 @@ class Camera:
                                               / (self.fx, self.fy)))  # fmt: skip
             focal, angle = f"{self.fx:.5g}, {self.fy:.5g} px", "{:.3g}° x {:.3g}°".format(*angles)
         lens = ", ".join(f"{value:.3g}" for value in self.distortion)
+        from cadalign.notebook.axes import photo_axes
+        from cadalign.notebook.html import card, draw_picture
+
         rows = [
             ("image", f"{self.width} x {self.height} px"),
             ("focal length", focal),

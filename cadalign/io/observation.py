@@ -28,7 +28,8 @@ relative to the file. ``fit`` holds options for `cadalign.fit` where they are no
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
 ``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
 ``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``null`` for none, by default that of
-the photo's EXIF data); and ``shape_sigma`` of `cadalign.Model`, for a model that is only similar.
+the first photo's EXIF data, unless another photo's differ); and ``shape_sigma`` of
+`cadalign.Model`, for a model that is only similar.
 
 ``object`` is the object's name, to tell the objects of a photo apart.
 

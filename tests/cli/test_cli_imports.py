@@ -24,11 +24,12 @@ HEAVY = {
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *("starlette", "trimesh", "uvicorn"),
 }
+MODULES_OF_A_FIT = 74  # of cadalign
 IN_EVERY_FIT = {"numba", "numpy"}
 
 
-def imported_by(*arguments: str, code: int = 0) -> set[str]:
-    """Of the heavy packages, those that a command imports in a process of its own."""
+def modules_of(*arguments: str, code: int = 0) -> set[str]:
+    """The modules that a command imports in a process of its own."""
     program = (
         "import json, sys\nfrom cadalign.cli import main\n"
         "try:\n    code = main(sys.argv[1:])\nexcept SystemExit as stop:\n    code = stop.code\n"
@@ -40,7 +41,12 @@ def imported_by(*arguments: str, code: int = 0) -> set[str]:
     assert done.returncode == 0, done.stderr
     found, modules = json.loads(done.stdout.splitlines()[-1])
     assert (found or 0) == code, done.stderr
-    return HEAVY & set(modules)
+    return set(modules)
+
+
+def imported_by(*arguments: str, code: int = 0) -> set[str]:
+    """Of the heavy packages, those that a command imports in a process of its own."""
+    return HEAVY & modules_of(*arguments, code=code)
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +85,12 @@ def test_the_list_of_commands_has_the_first_sentence_of_each() -> None:
 
 def test_a_fit_without_picture_imports_the_solvers_alone(observation: Path) -> None:
     assert imported_by("fit", str(observation), "--json", "--no-picture") == IN_EVERY_FIT
+
+
+def test_following_a_fit_takes_few_modules(observation: Path) -> None:
+    modules = modules_of("fit", str(observation), "--json", "--no-picture")
+    own = {name for name in modules if name.split(".")[0] == "cadalign"}
+    assert len(own) <= MODULES_OF_A_FIT, sorted(own)
 
 
 def test_a_fit_imports_what_draws_its_picture_besides(observation: Path) -> None:

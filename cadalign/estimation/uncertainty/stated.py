@@ -21,7 +21,6 @@ from cadalign.estimation.uncertainty.weakness import uncertainty_of, warnings_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.evidence import AnyBasis
@@ -85,6 +84,8 @@ class KeypointStatistics:
         if self.symmetry is None:
             return covariance
         held = held_axes(self.options.stretched_axes)
+        from cadalign.geometry.symmetry_group import group_of
+
         best = group_of(self.symmetry).canonical(self.alignment, held=held)
         return without_free_turns(covariance, best)
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import Problems, Solutions, full_covariance
+from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult, quickly
-from cadalign.estimation.solve import alternatives_of, camera_of
+from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
+from cadalign.estimation.symmetry import carried, held_axes, is_same
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-
-_NUMBER = int | float
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
 
 
 def result_of_solution(
@@ -25,69 +26,38 @@ def result_of_solution(
 ) -> Result:
     """The result of the only problem, which has a solution."""
     minima, iterations, hypotheses, _ = solutions.info[0].tolist()
-    sigma = None
-    if solutions.sigmas is not None:
-        sigma = float(solutions.sigmas[0])
-    elif options.method == "optimal" and isinstance(options.sigma, _NUMBER):
-        sigma = float(options.sigma)
-    inliers = np.empty(len(problems.points_3d), dtype=bool)
-    inliers.fill(True)
+    fitted = fitted_fields(problems, solutions, options)
     effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
-    covariance = None
-    if solutions.covariances is not None:
-        covariance = full_covariance(solutions.covariances[0], options.known_axis)
     return result_of_keypoints(
-        problems,
-        options,
-        alignment=Alignment.from_packed(solutions.poses[0, 0]),
-        camera=camera_of(problems, solutions, 0),
-        residuals=solutions.residuals,
-        inliers=inliers,
+        problems.points_2d,
+        fitted,
         method=options.method,
         stats=quickly(FitStats, effort),
-        sigma=sigma,
-        covariance=covariance,
-        cost=None if covariance is None else solutions.costs.item(0),
-        alternatives=alternatives_of(problems, solutions, minima, options) if minima > 1 else (),
+        cost=None if fitted["fisher_covariance"] is None else solutions.costs.item(0),
+        alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
     )
 
 
 def result_of_keypoints(
-    problems: Problems,
-    options: FitOptions,
+    points_2d: FloatArray,
+    fitted: dict[str, Any],
     *,
-    alignment: Alignment,
-    camera: Camera,
-    residuals: FloatArray,
-    inliers: BoolArray,
     method: str,
     stats: FitStats,
-    sigma: float | None = None,
-    covariance: FloatArray | None = None,
     cost: float | None = None,
     alternatives: tuple[Alternative, ...] = (),
 ) -> Result:
-    """The result of the only problem, with the inverse Fisher information (9, 9) or (10, 10)."""
-    points = problems.points_3d.copy()  # the caller may go on to change theirs
+    """The result of keypoints in one view, from the fields of their `FittedKeypoints`."""
+    points, options = fitted["points_3d"], fitted["options"]
     ids = _rows(len(points))
-    of_keypoints = {
-        "points_3d": points,
-        "alignment": alignment,
-        "camera": camera,
-        "residuals": residuals,
-        "inliers": inliers,
-        "options": options,
-        "sigma": sigma,
-        "fisher_covariance": covariance,
-    }
-    statistics = quickly(KeypointStatistics, of_keypoints)
+    statistics = quickly(KeypointStatistics, fitted)
     of_view = {
-        "camera": camera,
-        "alignment": alignment,
+        "camera": fitted["camera"],
+        "alignment": fitted["alignment"],
         "ids": ids,
-        "points_2d": problems.points_2d.copy(),
-        "residuals": residuals,
-        "inliers": inliers,
+        "points_2d": points_2d.copy(),  # the caller may go on to change theirs
+        "residuals": fitted["residuals"],
+        "inliers": fitted["inliers"],
         "statistics": statistics,
     }
     of_result = {
@@ -100,7 +70,7 @@ def result_of_keypoints(
         "stretched_axes": options.stretched_axes,
         "focal": options.focal,
         "focal_prior": options.focal_prior,
-        "sigma": sigma,
+        "sigma": fitted.get("sigma"),
         "cost": cost,
         "alternatives": alternatives,
         "stats": stats,
@@ -118,22 +88,79 @@ def with_keypoints(
     stats: FitStats,
 ) -> Result:
     """A result of some of the only problem's keypoints as that of all, with their inliers."""
-    found = result_of_keypoints(
-        problems,
-        options,
-        alignment=result.alignment,
-        camera=result.camera,
-        residuals=residuals,
-        inliers=inliers,
+    points = problems.points_3d.copy()
+    fitted = {
+        "points_3d": points,
+        "residuals": residuals,
+        "inliers": inliers,
+        "alignment": result.alignment,
+        "camera": result.camera,
+        "options": options,
+        "sigma": result.sigma,
+        "fisher_covariance": result.fisher_covariance,
+    }
+    return result_of_keypoints(
+        problems.points_2d,
+        fitted,
         method=f"ransac-{result.method}",
         stats=stats,
-        sigma=result.sigma,
-        covariance=result.fisher_covariance,
         cost=result.cost,
+        alternatives=tuple(replace(each, points_3d=points) for each in result.alternatives),
     )
-    points = found.points_3d
-    others = tuple(replace(each, points_3d=points) for each in result.alternatives)
-    return replace(found, alternatives=others)
+
+
+def _alternatives(
+    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
+) -> tuple[Alternative, ...]:
+    """The other minima that are likely enough."""
+    costs = solutions.costs[0, :minima]
+    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
+        # Costs are in units of sigma^2; below 1 they are those of exact fits.
+        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
+    else:
+        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    points = problems.points_3d.copy()
+    return tuple(
+        Alternative(
+            Alignment.from_packed(solutions.poses[0, k]),
+            float(ratios[k]),
+            camera_of(problems, solutions, k),
+            points,
+        )
+        for k in range(1, minima)
+        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
+    )
+
+
+def canonical_result(result: Result, symmetry: Symmetry) -> Result:
+    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
+    group = group_of(symmetry)
+    held = held_axes(result.stretched_axes)
+    best = group.canonical(result.alignment, held=held)
+    statistics = cast("KeypointStatistics", result.statistics)
+    covariance = statistics.fisher_covariance
+    if covariance is not None:
+        covariance = carried(covariance, result.alignment, best, held)
+    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
+    statistics = replace(
+        statistics,
+        alignment=best.alignment,
+        points_3d=best.relabelled(statistics.points_3d),
+        fisher_covariance=covariance,
+        symmetry=symmetry,
+    )
+    return replace(
+        result,
+        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
+        points_3d=best.relabelled(result.points_3d),
+        statistics=statistics,
+        alternatives=tuple(
+            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
+            for equal, each in canonical
+            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+        ),
+        symmetry=symmetry,
+    )
 
 
 @lru_cache(maxsize=64)

@@ -121,16 +121,16 @@ def find_consensus(
             inliers=support,
         )
     stats = FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score))
-    return result_of_keypoints(
-        problems,
-        options,
-        alignment=alignment,
-        camera=camera,
-        residuals=residuals,
-        inliers=kept,
-        method=f"ransac-{ransac.minimal}",
-        stats=stats,
-    )
+    fitted = {
+        "points_3d": problems.points_3d.copy(),
+        "residuals": residuals,
+        "inliers": kept,
+        "alignment": alignment,
+        "camera": camera,
+        "options": options,
+    }
+    method = f"ransac-{ransac.minimal}"
+    return result_of_keypoints(problems.points_2d, fitted, method=method, stats=stats)
 
 
 def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:

@@ -16,6 +16,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import curvature_of_rotations, is_other, stretch_of, with_boxes
 from cadalign.estimation.fit import fit
+from cadalign.estimation.keypoint_result import canonical_result
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
@@ -24,7 +25,6 @@ from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import canonical_result
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.warnings import another_pose, misfits, weaknesses

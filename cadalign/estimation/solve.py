@@ -5,14 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
-from cadalign.estimation.problems import Problems, Solutions, check_sigmas, rays_of, whitening_of
-from cadalign.estimation.result_parts import Alternative
+from cadalign.estimation.problems import (
+    Problems,
+    Solutions,
+    check_sigmas,
+    full_covariance,
+    rays_of,
+    whitening_of,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
@@ -28,6 +35,7 @@ _LEAST_SIGMA = 1e-6
 _HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
 _EXACT_COST = 1e-6
 _TINY = 1e-100
+_NUMBER = int | float
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
 _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
 _NO_COST = read_only(np.array([[np.inf]]))
@@ -370,30 +378,44 @@ def no_redundancy_error(count: int) -> DegenerateError:
     )
 
 
+def solve_one(problems: Problems, options: FitOptions) -> Solutions:
+    """Solve the only problem.
+
+    Raises
+    ------
+    CadalignError
+        If it has no solution.
+    """
+    solutions = solve(problems, options)
+    if solutions.errors:
+        raise solutions.errors[0]
+    return solutions
+
+
 def camera_of(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
     """The camera that goes with a minimum of the only problem."""
     camera = problems.cameras[0]
     return camera if solutions.focals is None else camera.with_focal(solutions.focals[0, minimum])
 
 
-def alternatives_of(
-    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
-) -> tuple[Alternative, ...]:
-    """The other minima that are likely enough."""
-    costs = solutions.costs[0, :minima]
-    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        # Costs are in units of sigma^2; below 1 they are those of exact fits.
-        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
-    else:
-        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
-    points = problems.points_3d.copy()
-    return tuple(
-        Alternative(
-            Alignment.from_packed(solutions.poses[0, k]),
-            float(ratios[k]),
-            camera_of(problems, solutions, k),
-            points,
-        )
-        for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
-    )
+def fitted_fields(problems: Problems, solutions: Solutions, options: FitOptions) -> dict[str, Any]:
+    """The fields of `FittedKeypoints` of the only problem, which has a solution."""
+    sigma = covariance = None
+    if solutions.sigmas is not None:
+        sigma = float(solutions.sigmas[0])
+    elif options.method == "optimal" and isinstance(options.sigma, _NUMBER):
+        sigma = float(options.sigma)
+    if solutions.covariances is not None:
+        covariance = full_covariance(solutions.covariances[0], options.known_axis)
+    inliers = np.empty(len(problems.points_3d), dtype=bool)
+    inliers.fill(True)
+    return {
+        "points_3d": problems.points_3d.copy(),  # the caller may go on to change theirs
+        "residuals": solutions.residuals,
+        "inliers": inliers,
+        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "camera": camera_of(problems, solutions, 0),
+        "options": options,
+        "sigma": sigma,
+        "fisher_covariance": covariance,
+    }

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,10 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import Result
+from cadalign.estimation.problems import pack_one
+from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
-from cadalign.estimation.uncertainty.posterior import Likelihood
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
+from cadalign.estimation.uncertainty.likelihood import FittedKeypoints, Likelihood
 from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -33,7 +33,20 @@ _MOST_NAMED = 5
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _UNKNOWNS = 10  # of a result's covariance, focal length included
 Rows = npt.NDArray[np.intp]
-FitRows = Callable[[Rows, bool], Result]
+
+
+class Fit(Protocol):
+    """A fit of keypoints, such as `cadalign.Result`."""
+
+    @property
+    def alignment(self) -> Alignment: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def fisher_covariance(self) -> FloatArray | None: ...
+
+
+FitRows = Callable[[Rows, bool], Fit]
 """Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
 True."""
 
@@ -98,7 +111,7 @@ class Misfit:
         )
 
 
-def find_misfit(result: KeypointStatistics) -> Misfit | None:
+def find_misfit(result: FittedKeypoints) -> Misfit | None:
     """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
 
     The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
@@ -120,7 +133,7 @@ def find_misfit(result: KeypointStatistics) -> Misfit | None:
     return Misfit(tested.chi_square, tested.redundancy, outliers=_outliers(tested))
 
 
-def unverified_stretch(result: KeypointStatistics) -> str | None:
+def unverified_stretch(result: FittedKeypoints) -> str | None:
     """Warn about scales held at 1 where the keypoints would not contradict another value.
 
     None where nothing is held, sigma is estimated, or the free scales are not determined at all,
@@ -158,7 +171,7 @@ class _Tested:
     chi_square: float
 
     @classmethod
-    def of(cls, result: KeypointStatistics) -> _Tested:
+    def of(cls, result: FittedKeypoints) -> _Tested:
         rows = np.flatnonzero(result.inliers)
         points_3d, residuals = result.points_3d[rows], result.residuals[rows]
         projected = result.camera.project(result.alignment.apply(points_3d))
@@ -188,12 +201,13 @@ class _Tested:
         redundancy = self.redundancy
         return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
 
-    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> Result:
+    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FittedKeypoints:
         """Fit some of the keypoints anew, with changed options."""
-        from cadalign.estimation.fit import fit
-
-        chosen = {**vars(self.options), "sigma": self.covariances[rows], **changes}
-        return fit(self.points_3d[rows], self.points_2d[rows], self.camera, **chosen)
+        options = replace(self.options, sigma=self.covariances[rows], **changes)
+        problems = pack_one(self.points_3d[rows], self.points_2d[rows], self.camera)
+        with np.errstate(all="ignore"):
+            solutions = solve_one(problems, options)
+        return FittedKeypoints(**fitted_fields(problems, solutions, options))
 
 
 def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
@@ -203,7 +217,7 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
         return None
     try:
         free = tested.fit(stretch=None, scale_prior_sigma=None)
-        decrease = tested.chi_square - _retested(free).chi_square
+        decrease = tested.chi_square - _Tested.of(free).chi_square
     except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
         return None
     if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
@@ -212,16 +226,10 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _retested(result: Result) -> _Tested:
-    """The test of another fit."""
-    assert isinstance(result.statistics, KeypointStatistics)
-    return _Tested.of(result.statistics)
-
-
 def _outliers(tested: _Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
-    def fit_rows(rows: Rows, robust: bool) -> Result:
+    def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
         loss = "cauchy" if robust else "linear"
         return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
 
@@ -236,7 +244,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
     rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
-    if not _retested(rest).passes:
+    if not _Tested.of(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}
 
@@ -356,7 +364,7 @@ class _Search:
         squares = _squares(residuals, expected) / 2
         return squares / self.level.variance(total, redundancy), redundancy
 
-    def residuals(self, result: Result) -> FloatArray:
+    def residuals(self, result: Fit) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
         in_camera = result.alignment.apply(self.points_3d)
         ahead = in_camera[:, 2] > 0

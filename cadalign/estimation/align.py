@@ -12,8 +12,8 @@ import numpy as np
 
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.assemble import assemble
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
@@ -154,7 +154,7 @@ def align(
     if lacks_sigma:
         minima = widened_by_noise(problem, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = assemble(model, prior, given, minima, stats)
+    result = result_of_minima(model, prior, given, minima, stats)
     if lacks_sigma:
         result = replace(result, sigma=problem.noise)
     return result if masks is None else masks.noted_in(result)

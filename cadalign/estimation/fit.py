@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.assemble import canonical_result, result_of_solution, with_keypoints
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.keypoint_result import canonical_result, result_of_solution, with_keypoints
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result

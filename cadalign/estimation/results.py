@@ -273,7 +273,7 @@ class SolvedTable:
 
     def single(self, b: int) -> Result:
         """The result of one problem, as `cadalign.fit` gives it."""
-        from cadalign.estimation.keypoint_result import canonical_result, result_of_solution
+        from cadalign.estimation.assemble import canonical_result, result_of_solution
 
         all_of_them, rows = self.solutions, self.problems.rows(b)
         of_problem: dict[str, Any] = {

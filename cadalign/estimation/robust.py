@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.focal_search import focal_views, log_focal_prior
-from cadalign.estimation.keypoint_result import result_of_keypoints
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
 from cadalign.estimation.result import Result

@@ -18,7 +18,7 @@ from cadalign.estimation.options import pixel_information
 from cadalign.estimation.symmetry import held_axes, without_free_turns
 from cadalign.estimation.uncertainty.likelihood import FittedKeypoints
 from cadalign.estimation.uncertainty.summary import EvidenceSummary
-from cadalign.estimation.uncertainty.weakness import uncertainty_of, warnings_of
+from cadalign.estimation.uncertainty.weakness import uncertainty_of, weaknesses_of_keypoints
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry_group import group_of
 
@@ -83,7 +83,7 @@ class KeypointStatistics(FittedKeypoints):
             return ()
         kept, options = self.points_3d[self.inliers], self.options
         is_estimated = options.focal == "estimate"
-        return self._contradictions() + warnings_of(
+        return self._contradictions() + weaknesses_of_keypoints(
             kept,
             self.alignment,
             uncertainty_of(self.covariance),

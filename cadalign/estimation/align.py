@@ -88,6 +88,8 @@ def align(
         If an argument is invalid, or a view names a keypoint that the model lacks.
     DegenerateError
         If the keypoints are too few, or no estimate has them all in front of the cameras.
+    NoConsensusError
+        With ``ransac``: if no estimate has more support by keypoints than chance gives.
 
     Examples
     --------

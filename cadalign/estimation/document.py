@@ -17,9 +17,8 @@ from cadalign.estimation.older_document import completed, upgraded
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.uncertainty.misfit import Misfit
 from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry

@@ -31,10 +31,10 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.uncertainty.misfit import Misfit
     from cadalign.estimation.uncertainty.summary import (
         EvidenceSummary,
         MaskResiduals,
+        Misfit,
     )
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel

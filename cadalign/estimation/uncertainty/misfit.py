@@ -6,8 +6,8 @@ An outlier is far from where the other keypoints predict it, by the covariance o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
 from cadalign.estimation.uncertainty.likelihood import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.summary import Misfit
 from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -29,7 +30,6 @@ from cadalign.solvers.projection import ray_derivatives
 _FALSE_ALARMS = 0.004
 _FALSE_STRETCH_ALARMS = 0.002
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
-_MOST_NAMED = 5
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _UNKNOWNS = 10  # of a result's covariance, focal length included
 Rows = npt.NDArray[np.intp]
@@ -51,64 +51,6 @@ FitRows = Callable[[Rows, bool], Fit]
 True."""
 
 _FALSE_OUTLIER_ALARMS = 0.01
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """Residuals that are larger than the standard deviations of the keypoints explain.
-
-    Parameters
-    ----------
-    chi_square : float
-        Sum of the losses on the whitened residuals: of their squares, with the linear loss.
-    redundancy : int
-        What is expected of it: the equations minus the unknowns.
-    free_scale : tuple of 3 float, optional
-        The scales without the constraints on them (stretch=, scale_prior_sigma), where it is these
-        that contradict the keypoints.
-    outliers : mapping of int to float
-        The keypoints without which the others fit, and their distances from where the others put
-        them [px]; empty where no few keypoints are to blame.
-    """
-
-    chi_square: float
-    redundancy: int
-    free_scale: tuple[float, float, float] | None = None
-    outliers: Mapping[int, float] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON."""
-        outliers = [{"row": row, "distance_px": px} for row, px in self.outliers.items()]
-        return {
-            "chi_square": self.chi_square,
-            "redundancy": self.redundancy,
-            "free_scale": None if self.free_scale is None else list(self.free_scale),
-            "outliers": outliers,
-        }
-
-    def __str__(self) -> str:
-        if self.free_scale is not None:
-            scale = ", ".join(f"{value:.3g}" for value in self.free_scale)
-            return (
-                f"the keypoints contradict the constraint on the stretch: without it they fit "
-                f"better, with the scale ({scale})"
-            )
-        ratio = math.sqrt(self.chi_square / self.redundancy)
-        text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
-        if not self.outliers:
-            return text + (
-                "the keypoints do not fit the model together (wrong pairs, model, stretch or "
-                "camera), or sigma is too small; sigma=None suits a model that is only similar"
-            )
-        worst = sorted(self.outliers, key=lambda row: -self.outliers[row])[:_MOST_NAMED]
-        named = ", ".join(f"{row} ({self.outliers[row]:.3g} px)" for row in worst)
-        if len(worst) < len(self.outliers):
-            named += f" and {len(self.outliers) - len(worst)} more"
-        one = len(self.outliers) == 1
-        return text + (
-            f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
-            "(counted from 0, with the distance from where those put it)"
-        )
 
 
 def find_misfit(result: FittedKeypoints) -> Misfit | None:

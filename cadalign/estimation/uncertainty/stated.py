@@ -17,14 +17,13 @@ from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
 from cadalign.estimation.symmetry import held_axes, without_free_turns
 from cadalign.estimation.uncertainty.likelihood import FittedKeypoints
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
 from cadalign.estimation.uncertainty.weakness import uncertainty_of, weaknesses_of_keypoints
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.evidence import AnyBasis
-    from cadalign.estimation.uncertainty.misfit import Misfit
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
 from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
@@ -147,9 +146,5 @@ def _are_in_one_plane(points: FloatArray) -> bool:
 
 def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> FloatArray:
     """Projected minus observed keypoints (n, 2) of the only problem; infinite behind the camera."""
-    in_camera = alignment.apply(problems.points_3d)
-    ahead = in_camera[:, 2] > 0
-    residuals = np.full((len(in_camera), 2), np.inf)
-    projected = camera.pixels_from_normalized(perspective(in_camera[ahead]))
-    residuals[ahead] = projected - problems.points_2d[ahead]
-    return residuals
+    projected = camera.project_where_ahead(alignment.apply(problems.points_3d))
+    return projected - problems.points_2d

@@ -43,11 +43,20 @@ _LEAST_POINTS = 3
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and an exact model is given."""
-    if not isinstance(model, Model) or model.shape_sigma is not None or len(views) != 1:
+    return isinstance(model, Model) and model.shape_sigma is None and _has_keypoints_alone(views)
+
+
+def is_single(model: object, views: Sequence[View]) -> bool:
+    """True where nothing but the keypoints of one view and a learned shape is given."""
+    if not isinstance(model, ShapeModel) or not _has_keypoints_alone(views):
         return False
+    return views[0].sigma is not None and len(views[0].keypoint_ids) >= _LEAST_POINTS
+
+
+def _has_keypoints_alone(views: Sequence[View]) -> bool:
     view = views[0]
     others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
-    return all(each is None for each in others)
+    return len(views) == 1 and all(each is None for each in others)
 
 
 def align_plain(
@@ -55,24 +64,18 @@ def align_plain(
 ) -> Result:
     """The result of `fit`, with all keypoints of the model."""
     prior = prior_of(model)
-    points = cast(FloatArray, model.points_3d)
+    points, bounds = cast(FloatArray, model.points_3d), cast(FloatArray, model.bounds)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
+    shape = ("stretch", "scale_prior_sigma", "known_axis")
+    chosen = vars(options) | {name: getattr(model, name) for name in shape}
     found = fit(
         points[rows],
         cast(FloatArray, view.points_2d),
         view.camera,
-        sigma=view.sigma,
-        loss=options.loss,
-        loss_scale=options.loss_scale,
-        focal=options.focal,
-        focal_prior=options.focal_prior,
-        stretch=model.stretch,
-        scale_prior_sigma=model.scale_prior_sigma,
-        known_axis=model.known_axis,
+        **{**chosen, "sigma": view.sigma},
         ransac=ransac,
         confidences=view.confidences if ransac is not None else None,
     )
-    bounds = cast(FloatArray, model.bounds)
     found = replace(
         found,
         views=(replace(found.views[0], ids=view.keypoint_ids),),
@@ -85,17 +88,6 @@ def align_plain(
         own_bounds=bounds,
     )
     return found if model.symmetry is None else canonical_result(found, model.symmetry)
-
-
-def is_single(model: object, views: Sequence[View]) -> bool:
-    """True where nothing but the keypoints of one view and a learned shape is given."""
-    if not isinstance(model, ShapeModel) or len(views) != 1:
-        return False
-    view = views[0]
-    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
-    if view.sigma is None:
-        return False
-    return len(view.keypoint_ids) >= _LEAST_POINTS and all(each is None for each in others)
 
 
 def align_single(

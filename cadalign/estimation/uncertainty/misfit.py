@@ -309,10 +309,7 @@ class _Search:
     def residuals(self, result: Fit) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
         in_camera = result.alignment.apply(self.points_3d)
-        ahead = in_camera[:, 2] > 0
-        residuals = np.full((len(in_camera), 2), np.inf)
-        residuals[ahead] = result.camera.project(in_camera[ahead]) - self.points_2d[ahead]
-        return residuals
+        return result.camera.project_where_ahead(in_camera) - self.points_2d
 
 
 def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import Problem, find_minima
+from cadalign.estimation.search import JointProblem, find_minima
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (
@@ -134,7 +134,7 @@ def align(
                 focal_prior=focal_prior,
             )
         return with_views_left_out(found_by_used, prior, given, left_out)
-    problem = Problem(prior, given, size, options, lenses)
+    problem = JointProblem(prior, given, size, options, lenses)
     lacks_sigma = any(view.sigma is None and len(view.keypoint_ids) for view in given)
     if lacks_sigma:
         problem, minima, iterations, hypotheses = find_minima_and_noise(problem, inits, ransac)

@@ -11,6 +11,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.consensus import Support, area_of, check_support, order_of_confidence
+from cadalign.estimation.degeneracy import are_in_one_plane
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.focal_search import focal_views
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
@@ -25,7 +26,6 @@ from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, View
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
-_FLAT = 1e-6  # thickness over extent of what counts as a plane
 
 
 def find_consensus(
@@ -91,7 +91,7 @@ def find_consensus(
         pose,
         inliers,
     )
-    if not hypotheses and _are_in_one_plane(points):
+    if not hypotheses and are_in_one_plane(points):
         raise DegenerateError(
             "all keypoints lie in one plane, where the samples of ransac determine nothing",
             where="points_3d",
@@ -136,12 +136,6 @@ def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
     camera.require_focal()
     rays = rays_of(points_2d, camera)
     return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
-
-
-def _are_in_one_plane(points: FloatArray) -> bool:
-    """True for points that do not all coincide and lie in a plane or on a line."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[0] > 0 and spread[2] <= _FLAT * spread[0])
 
 
 def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> FloatArray:

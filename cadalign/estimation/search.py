@@ -37,7 +37,7 @@ Inits = Sequence[Alignment | None]
 """Given starts: one for each view of unknown motion, or one in the frame that the views share."""
 
 
-class Problem(NamedTuple):
+class JointProblem(NamedTuple):
     """Views of an object with a prior shape, in the terms of the user."""
 
     prior: ShapePrior
@@ -77,7 +77,7 @@ class Minimum(NamedTuple):
 
 
 def find_minima(
-    problem: Problem, init: Inits, ransac: RansacOptions | None
+    problem: JointProblem, init: Inits, ransac: RansacOptions | None
 ) -> tuple[list[Minimum], int, int]:
     """Minima, the likeliest first, and the numbers of iterations and of starts.
 
@@ -113,7 +113,9 @@ def find_minima(
     return minima, iterations, hypotheses
 
 
-def _starts(problem: Problem, shape: Shape, init: Inits, ransac: RansacOptions | None) -> Starts:
+def _starts(
+    problem: JointProblem, shape: Shape, init: Inits, ransac: RansacOptions | None
+) -> Starts:
     """Starts at every focal length of the grid, or at those that are known."""
     lenses = problem.lenses
     found = []
@@ -146,7 +148,7 @@ def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
     return found, iterations
 
 
-def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
+def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
     score = minimum.score - score_state(minimum.evidence, minimum.state)
     for _ in range(ROUNDS):
@@ -164,7 +166,7 @@ def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
     return minimum._replace(score=score_state(minimum.evidence, minimum.state) + score)
 
 
-def _check_support(problem: Problem, best: Minimum, max_reproj_error: float) -> None:
+def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float) -> None:
     """Refuse a minimum that chance gives as well; few keypoints leave that to other evidence."""
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
     limits = _thresholds(best.evidence, best.lenses, 1.0)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import CadalignError
+from cadalign.estimation.degeneracy import no_redundancy_error, solver_error
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import (
     Problems,
@@ -22,8 +23,8 @@ from cadalign.estimation.problems import (
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
-from cadalign.solvers.linear import aepnp_batch, aepnp_error, describe_plane, out_of_range_error
+from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
+from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.projection import pinhole_rays, reproject_batch
 
@@ -41,7 +42,6 @@ _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
 _NO_COST = read_only(np.array([[np.inf]]))
 
 Errors = dict[int, CadalignError]
-_FLAT = 1e-6  # extent across a line over that along it
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
 
@@ -316,66 +316,6 @@ def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
         swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: covariances.shape[1]]
         covariances = covariances[:, swapped][:, :, swapped]
     return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)
-
-
-def solver_error(
-    status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
-) -> DegenerateError:
-    """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
-    if status == TOO_FEW:
-        method = f"the method {options.method!r}"
-        fix = f"give at least {options.min_points}"
-        if options.method == "optimal":
-            method = f"{options.unknowns} unknowns"
-            fix += ", fewer unknowns by stretch=, or a prior"
-        what = f"{len(points_3d)} keypoints are too few for {method}"
-        return DegenerateError(what, where="points_3d", fix=fix)
-    if status == OUT_OF_RANGE:
-        return out_of_range_error()
-    if status == NOT_FOUND:
-        return DegenerateError(
-            "no alignment with all keypoints in front of the camera was found",
-            where="points_2d",
-            fix="check that points_3d and points_2d correspond, row by row, and the camera",
-        )
-    if undetermined < 0:
-        return aepnp_error(points_3d)
-    reason = describe_plane(points_3d)
-    if undetermined < 3:
-        missing = "the rotation"
-    elif undetermined < 6:
-        missing = f"the translation along the camera's {'xyz'[undetermined - 3]}"
-    else:
-        missing = f"the scale s_{'xyz'[options.axis_order[undetermined - 5]]}"
-    if reason is None and 2 * len(points_3d) <= options.unknowns:
-        return DegenerateError(
-            f"no alignment reprojects the {len(points_3d)} keypoints exactly, and the nearest one "
-            f"leaves {missing} open",
-            where="points_3d",
-            fix="give more keypoints, or a scale_prior_sigma",
-        )
-    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
-    if undetermined < 3 and _are_on_a_line(points_3d):
-        fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
-    return DegenerateError(
-        f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
-        where="points_3d",
-        fix=fix,
-    )
-
-
-def _are_on_a_line(points: FloatArray) -> bool:
-    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(sizes[1] <= _FLAT * sizes[0])
-
-
-def no_redundancy_error(count: int) -> DegenerateError:
-    """The error for a noise that is to be estimated from keypoints that always fit."""
-    return DegenerateError(
-        f"{count} keypoints fit exactly, so their noise cannot be estimated",
-        where="sigma",
-        fix="give sigma, or more keypoints",
-    )
 
 
 def solve_one(problems: Problems, options: FitOptions) -> Solutions:

@@ -35,7 +35,7 @@ _UNKNOWNS = 10  # of a result's covariance, focal length included
 Rows = npt.NDArray[np.intp]
 
 
-class Fit(Protocol):
+class PoseFit(Protocol):
     """A fit of keypoints, such as `cadalign.Result`."""
 
     @property
@@ -46,7 +46,7 @@ class Fit(Protocol):
     def fisher_covariance(self) -> FloatArray | None: ...
 
 
-FitRows = Callable[[Rows, bool], Fit]
+FitRows = Callable[[Rows, bool], PoseFit]
 """Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
 True."""
 
@@ -306,7 +306,7 @@ class _Search:
         squares = _squares(residuals, expected) / 2
         return squares / self.level.variance(total, redundancy), redundancy
 
-    def residuals(self, result: Fit) -> FloatArray:
+    def residuals(self, result: PoseFit) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
         in_camera = result.alignment.apply(self.points_3d)
         return result.camera.project_where_ahead(in_camera) - self.points_2d

@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.metric_starts import metric_starts
-from cadalign.estimation.uncertainty.contradictions import count_equations
+from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget

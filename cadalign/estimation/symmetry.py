@@ -10,9 +10,6 @@ deviations are stated without that step, such that points on the axis keep their
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, cast
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
@@ -21,10 +18,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
-
-if TYPE_CHECKING:
-    from cadalign.estimation.result import Result
-    from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
@@ -120,37 +113,6 @@ def equal_text(
     if count == 1:
         return "the stretch leaves no other alignment equal under the model's symmetry"
     return f"{count} alignments are equal under the model's symmetry"
-
-
-def canonical_result(result: Result, symmetry: Symmetry) -> Result:
-    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
-    group = group_of(symmetry)
-    held = held_axes(result.stretched_axes)
-    best = group.canonical(result.alignment, held=held)
-    statistics = cast("KeypointStatistics", result.statistics)
-    covariance = statistics.fisher_covariance
-    if covariance is not None:
-        covariance = carried(covariance, result.alignment, best, held)
-    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
-    statistics = replace(
-        statistics,
-        alignment=best.alignment,
-        points_3d=best.relabelled(statistics.points_3d),
-        fisher_covariance=covariance,
-        symmetry=symmetry,
-    )
-    return replace(
-        result,
-        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
-        points_3d=best.relabelled(result.points_3d),
-        statistics=statistics,
-        alternatives=tuple(
-            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
-            for equal, each in canonical
-            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
-        ),
-        symmetry=symmetry,
-    )
 
 
 def carried(

@@ -26,8 +26,10 @@ from cadalign.solvers.joint.evidence import (
     points_of,
     unpacked,
 )
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.search import refine_joint
-from cadalign.solvers.joint.system import joint_cost, joint_room
+from cadalign.solvers.joint.system import Joint, joint_cost, joint_room
+from cadalign.solvers.refine import refine
 from cadalign.solvers.system import accept, evaluate, move
 
 POINTS, MODES, VIEWS = 7, 3, 2
@@ -91,18 +93,24 @@ def evidence_of(
     return Evidence(shape, sightings, rig, lenses, up, lengths, heights, planes, scales)
 
 
-def gradient_of(evidence: Evidence, state: State) -> np.ndarray:
-    room = joint_room(evidence)
-    assert evaluate(evidence, packed(state), room) < np.inf
+def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
+    system = Joint(evidence, integrates)
+    room = joint_room(system)
+    assert evaluate(system, packed(state), room) < np.inf
     return room.new.gradient
 
 
+def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> float:
+    return joint_cost(Joint(evidence, integrates), packed(state))
+
+
 def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
-    row, room = packed(state), joint_room(evidence)
-    evaluate(evidence, row, room)
-    accept(evidence, row, room)
+    system = Joint(evidence, False)
+    row, room = packed(state), joint_room(system)
+    evaluate(system, row, room)
+    accept(system, row, room)
     there = row.copy()
-    move(evidence, row, room, 0.0, step, there)
+    move(system, row, room, 0.0, step, there)
     return unpacked(evidence, there)
 
 
@@ -148,17 +156,76 @@ def test_the_gradient_is_that_of_the_cost(
     slopes = np.empty(len(gradient))
     for k in range(len(slopes)):
         step = 1e-6 * np.eye(len(slopes))[k]
-        costs = [joint_cost(evidence, packed(moved(evidence, state, s))) for s in (step, -step)]
+        costs = [cost_of(evidence, moved(evidence, state, s)) for s in (step, -step)]
         slopes[k] = (costs[0] - costs[1]) / 4e-6  # the cost has no factor 1/2
     assert np.allclose(slopes, gradient, rtol=1e-5, atol=1e-7 * np.abs(slopes).max())
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    poses=st.sampled_from([(0, 0), (0, 1)]),
+    focals=st.sampled_from([0, 1]),
+    spread=st.sampled_from([0.0, 0.05]),
+)
+def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
+    seed: int, poses: tuple[int, int], focals: int, spread: float
+) -> None:
+    spread *= poses == (0, 0)  # displacements of several poses are modes
+    evidence = with_sightings_alone(
+        evidence_of(seed, spread=spread, poses=poses, loss=LINEAR, focals=focals)
+    )
+    state = state_of(seed, max(poses) + 1, focals)
+    state.displacements[:] *= spread > 0
+    evidence = seen_from(evidence, state)
+    gradient = gradient_of(evidence, state, integrates=True)
+    plain = gradient_of(evidence, state)
+    displaced = spread > 0
+    unknowns = len(gradient) - (MODES if displaced else 0)  # these move displacements, too
+    slopes = np.empty(unknowns)
+    for k in range(unknowns):
+        step = 1e-5 * np.eye(len(gradient))[k]
+        ends = [moved(evidence, state, each) for each in (step, -step)]
+        if displaced:
+            ends = [each._replace(displacements=state.displacements) for each in ends]
+        volumes = [
+            cost_of(evidence, each, integrates=True) - cost_of(evidence, each) for each in ends
+        ]
+        slopes[k] = (volumes[0] - volumes[1]) / 4e-5
+    found = (gradient - plain)[:unknowns]
+    if displaced:  # what the shifted means add to the pose's equations
+        found -= shifts_of(evidence, state)[:unknowns]
+    assert np.allclose(slopes, found, rtol=1e-4, atol=1e-5 * np.abs(slopes).max())
+
+
+def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
+    """The change of the gradient by the prior means that the log determinant moves."""
+    system = Joint(evidence, True)
+    room = joint_room(system)
+    evaluate(system, packed(state), room)
+    shifted = room.rows[-4].copy()
+    plain = joint_room(Joint(evidence, False))
+    evaluate(Joint(evidence, False), packed(state), plain)
+    return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
+
+
+def with_sightings_alone(evidence: Evidence) -> Evidence:
+    return evidence._replace(
+        lengths=Lengths(*(column[:0] for column in evidence.lengths)),
+        heights=Heights(*(column[:0] for column in evidence.heights)),
+        planes=Planes(*(column[:0] for column in evidence.planes)),
+    )
 
 
 @pytest.mark.parametrize("poses", [(0, 0), (0, 1)])
 def test_the_minimum_has_no_slope_in_displacements_either(poses: tuple[int, int]) -> None:
     evidence = evidence_of(3, spread=0.05, poses=poses, loss=LINEAR)
     evidence = seen_from(evidence, state_of(3, max(poses) + 1))
-    cost, state, _, converged = refine_joint(evidence, 300, state_of(3, max(poses) + 1))
+    reduction = reduce_modes(evidence)
+    row = packed(reduced_state(reduction, evidence.shape, state_of(3, max(poses) + 1)))
+    cost, _, converged = refine(Joint(reduction.evidence, False), 300, row)
     assert converged
+    state = whole_state(reduction, evidence.shape, unpacked(reduction.evidence, row))
     assert cost < np.inf
     for i in range(POINTS):
         for a in range(3):
@@ -179,10 +246,8 @@ def displaced_cost(evidence: Evidence, state: State) -> float:
     prior = float((state.displacements / shape.spread[:, None]).ravel() ** 2 @ np.ones(3 * POINTS))
     rest = state._replace(displacements=np.zeros((POINTS, 3)))
     others = evidence._replace(sightings=Sightings(*(c[:0] for c in evidence.sightings)))
-    named = joint_cost(others, packed(rest))
-    seen = joint_cost(still, packed(rest)) - joint_cost(
-        others._replace(shape=still.shape), packed(rest)
-    )
+    named = cost_of(others, rest)
+    seen = cost_of(still, rest) - cost_of(others._replace(shape=still.shape), rest)
     return named + seen + prior
 
 

@@ -24,7 +24,7 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.reduction import reduce_modes, used_points
 from cadalign.solvers.joint.search import search_joint
-from cadalign.solvers.joint.system import joint_room
+from cadalign.solvers.joint.system import Joint, joint_room
 from cadalign.solvers.system import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
@@ -101,8 +101,9 @@ def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: in
 def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
-    room = joint_room(evidence)
-    evaluate(evidence, packed(state), room)
+    system = Joint(evidence, True)
+    room = joint_room(system)
+    evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.new.gradient)
     assert room.new.gradient @ slope < 1e-9 * max(cost, 1.0)
     assert score == pytest.approx(cost + np.linalg.slogdet(information)[1], rel=1e-9)

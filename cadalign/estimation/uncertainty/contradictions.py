@@ -28,7 +28,7 @@ from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, packed
 from cadalign.solvers.joint.reduction import reduced
 from cadalign.solvers.joint.search import refine_joint
-from cadalign.solvers.joint.system import joint_cost
+from cadalign.solvers.joint.system import Joint, joint_cost
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
 _REFITTING = 12  # iterations that show if a piece contradicts the others
@@ -114,7 +114,7 @@ def _worst(evidence: Evidence, state: State, pieces: list[Piece]) -> list[Piece]
     if len(pieces) <= _MOST_TESTED:
         return pieces
     trials = [without(evidence, state, piece) for piece in pieces]
-    rests = [joint_cost(rest, packed(start)) for rest, start in trials]
+    rests = [joint_cost(Joint(rest, False), packed(start)) for rest, start in trials]
     return [pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())]
 
 

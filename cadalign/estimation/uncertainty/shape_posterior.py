@@ -91,7 +91,15 @@ def shape_posterior(
     right = rows @ estimate - rest @ residuals
     pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
     posterior = _conditioned(gaussians_of(result.model), rows, right)
-    return ShapePosterior(posterior.shapes, posterior.log_evidence - pose_volume)
+    # The estimate's objective has the log determinant of the shape, linear here: a slope by the
+    # keypoints, which moves the means. The box of an estimate is widened to hold what is seen.
+    shapes, keypoints = posterior.shapes, result.points_3d.size
+    gap = (estimate - shapes.means[result.component])[:keypoints]
+    own = shapes.covariances[result.component][:keypoints, :keypoints]
+    slope = np.linalg.pinv(own, hermitian=True) @ gap
+    shifts = shapes.covariances[:, :, :keypoints] @ slope
+    moved = Gaussians(shapes.weights, shapes.means + shifts, shapes.covariances)
+    return ShapePosterior(moved, posterior.log_evidence - pose_volume)
 
 
 def gaussians_of(model: ShapeModel) -> Gaussians:

@@ -18,7 +18,7 @@ from cadalign.solvers.joint.blocks import first_scale
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked, unstretched
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
 from cadalign.solvers.joint.rows import count_equations
-from cadalign.solvers.joint.system import Equations, evaluate_joint, joint_room
+from cadalign.solvers.joint.system import Joint, JointEquations, evaluate_joint, joint_room
 
 
 class JointCovariance(NamedTuple):
@@ -50,8 +50,9 @@ def _covariance_of(
     evidence: Evidence, reduced: Evidence, basis: FloatArray, row: FloatArray
 ) -> JointCovariance:
     """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
-    equations = joint_room(reduced)
-    evaluate_joint(reduced, row, equations)
+    system = Joint(reduced, False)
+    equations = joint_room(system)
+    evaluate_joint(system, row, equations)
     state = unpacked(reduced, row)
     arrow = equations.new
     poses, points = state.poses.shape[0], evidence.shape.mean.shape[0]
@@ -129,7 +130,7 @@ def _border_of_all_modes(border: FloatArray, basis: FloatArray, first: int) -> F
 
 @kernel
 def _points_by_unknowns(
-    evidence: Evidence, reduced: Evidence, state: State, equations: Equations
+    evidence: Evidence, reduced: Evidence, state: State, equations: JointEquations
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives (m, 3, 6 + b) of all points by a pose and the border, covariances of the rest.
 
@@ -180,7 +181,7 @@ def _add_rest(
 
 @kernel
 def _columns_of_points(
-    evidence: Evidence, equations: Equations, points: int
+    evidence: Evidence, equations: JointEquations, points: int
 ) -> tuple[IntArray, IntArray]:
     """The first column of each point's equations (m,) and the one after its last (m,).
 
@@ -253,8 +254,9 @@ def _cam_from_model(evidence: Evidence, state: State) -> FloatArray:
 
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """The cost at a state, and the information (U, U) about all unknowns, border last."""
-    equations = joint_room(evidence)
-    cost = evaluate_joint(evidence, packed(state), equations)
+    system = Joint(evidence, False)
+    equations = joint_room(system)
+    cost = evaluate_joint(system, packed(state), equations)
     arrow = equations.new
     poses, size = len(arrow.blocks), len(arrow.border)
     first = 6 * poses

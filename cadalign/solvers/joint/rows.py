@@ -30,15 +30,20 @@ def count_equations(sightings: Sightings, n: int) -> int:
 
 @kernel
 def write_rows(
-    evidence: Evidence, state: State, chosen: IntArray, rows: FloatArray, seen: FloatArray
+    evidence: Evidence,
+    state: State,
+    chosen: IntArray,
+    rows: FloatArray,
+    seen: FloatArray,
+    first_seen: int,
 ) -> float:
     """Write whitened, loss-weighted derivatives and residuals of sightings; returns the cost.
 
     The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
     that pose and of the border, the residual, and the displacement of the point; columns are those
-    of `count_equations`, sighting after sighting. ``seen`` (7, C) receives the vector by which the
-    residual changes with the point in the camera, the point's depth and its place in the rig's
-    frame relative to the pose's translation.
+    of `count_equations`, sighting after sighting. ``seen`` (7, N) receives, from column
+    ``first_seen`` on, the vector by which the residual changes with the point in the rig's frame,
+    the camera's z there over the depth (none for equations in depth), and the loss's root.
     """
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     rows[:] = 0.0
@@ -121,9 +126,9 @@ def write_rows(
                 rows[first + a, column] = by_model[a] * stretched[a] * evidence.scales.free[a]
                 by_model[a] *= scale[a]
                 rows[last + 1 + a, column] = by_model[a]
-                seen[a, column] = by_camera[q, a]
-                seen[4 + a, column] = rotated[a]
-            seen[3, column] = z
+                seen[a, first_seen + column] = by_rig[a]
+                # What lies farther is seen smaller; a depth is not.
+                seen[3 + a, first_seen + column] = camera[6 + a] / z if q < 2 else 0.0
             for k in range(modes):
                 rows[first + 3 + k, column] = (
                     by_model[0] * shape.modes[k, i, 0]

@@ -9,12 +9,14 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
-from cadalign.solvers.joint.system import joint_score
+from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
 from cadalign.solvers.refine import refine
-from cadalign.solvers.search import Effort, room_for_minima, search
+from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
+_FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
+_LESS_LIKELY = 20.0  # excess score of a start that is refined no further
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
 
 
@@ -38,8 +40,13 @@ def search_joint(
     unmoved = np.zeros((count, len(reduced.shape.modes) + reduced.shape.mean.size))
     starts = np.concatenate([poses.reshape(count, -1), log_focals, log_scales, unmoved], axis=1)
     minima = room_for_minima(max(count, 1), starts.shape[1])
-    effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
-    search(reduced, starts, effort, 0, 0.0, minima)
+    if has_latent(reduced):
+        effort = Effort(count, _FEW_ITERATIONS, 0, _UNLIKELY)
+        search(Joint(reduced, False), starts, effort, 0, 0.0, minima)
+        minima = _integrated(reduced, minima)
+    else:
+        effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
+        search(Joint(reduced, False), starts, effort, 0, 0.0, minima)
     found = int(minima.counts[0])
     states = [
         whole_state(reduction, evidence.shape, unpacked(reduced, row))
@@ -47,6 +54,33 @@ def search_joint(
     ]
     costs, scores = minima.costs[:found], minima.scores[:found]
     return JointMinima(states, costs, scores), int(minima.counts[1])
+
+
+def has_latent(evidence: Evidence) -> bool:
+    """True if the evidence rests on a shape that may vary."""
+    sighted = evidence.shape.spread[evidence.sightings.point]
+    return bool(len(evidence.shape.modes) or sighted.any())
+
+
+def _integrated(evidence: Evidence, likely: Minima) -> Minima:
+    """The minima with the shape integrated out that states of a low cost lead to.
+
+    Minima of the plain cost are no starts: some lie too near the camera.
+    """
+    system = Joint(evidence, True)
+    count = int(likely.counts[0])
+    minima = room_for_minima(max(count, 1), likely.states.shape[1])
+    minima.counts[1] = likely.counts[1]
+    for k in range(count):
+        if not likely.scores[k] < minima.scores[0] + _LESS_LIKELY:
+            break
+        state = likely.states[k]
+        cost, used, _ = refine(system, _MAX_ITERATIONS, state)
+        minima.counts[1] += used
+        add_minimum(system, state, cost, 0, 0.0, minima)
+    for k in range(int(minima.counts[0])):
+        minima.costs[k] = joint_cost(Joint(evidence, False), minima.states[k])
+    return minima
 
 
 def refine_joint(
@@ -58,7 +92,10 @@ def refine_joint(
     """
     reduction = reduce_modes(evidence)
     row = packed(reduced_state(reduction, evidence.shape, state))
-    cost, iterations, converged = refine(reduction.evidence, max_iterations, row)
+    system = Joint(reduction.evidence, has_latent(reduction.evidence))
+    cost, iterations, converged = refine(system, max_iterations, row)
+    if system.integrates and cost < np.inf:
+        cost = joint_cost(Joint(reduction.evidence, False), row)
     found = whole_state(reduction, evidence.shape, unpacked(reduction.evidence, row))
     return cost, found, iterations, converged
 
@@ -67,4 +104,4 @@ def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     reduction = reduce_modes(evidence)
     row = packed(reduced_state(reduction, evidence.shape, state))
-    return float(joint_score(reduction.evidence, row, 0.0))
+    return float(joint_score(Joint(reduction.evidence, False), row, 0.0))

@@ -163,7 +163,10 @@ def _sized(
 
 
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
-    """Median of measured over predicted lengths, where every view has a pose of its own."""
+    """Median of measured over predicted lengths, where every view has a pose of its own.
+
+    NaN where nothing is measured.
+    """
     sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
     lengths, heights = evidence.lengths, evidence.heights
 
@@ -186,7 +189,8 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
         lengths.value / extents,
         heights.value / below,
     ]
-    return float(np.median(np.concatenate(ratios)))
+    told = np.concatenate(ratios)
+    return float(np.median(told)) if len(told) else float("nan")
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

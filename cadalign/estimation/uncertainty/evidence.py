@@ -339,9 +339,10 @@ def _deviations(evidence: Evidence, state: State) -> Uncertainty:
     distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))
     x, y, z = (_or_infinite(each, _UNKNOWN_SCALE * distance) for each in deviations[3:6])
-    sx, sy, sz = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:])
+    sx, sy, sz = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:9])
+    focal = _or_infinite(float(deviations[9:].sum()), _UNKNOWN_SCALE)  # none where it is known
     return Uncertainty(
-        _or_infinite(rotation, _UNKNOWN_ROTATION_DEG), (x, y, z), (sx, sy, sz), focal=0.0
+        _or_infinite(rotation, _UNKNOWN_ROTATION_DEG), (x, y, z), (sx, sy, sz), focal
     )
 
 

@@ -39,6 +39,7 @@ bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio
 	$(BIN)/python scripts/benchmark_cold.py --json bench/cold.ratios.json
 	$(BIN)/python scripts/benchmark_calls.py --json bench/calls.ratios.json
 	$(BIN)/python scripts/benchmark_focal.py
+	$(BIN)/python scripts/benchmark_focal_shapes.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
 	$(BIN)/python scripts/benchmark_calibration.py
 	$(BIN)/python scripts/benchmark_render.py
 	$(BIN)/python scripts/benchmark_annotator.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)

@@ -1,4 +1,4 @@
-"""The README's list of layers: every module imports only what stands above it."""
+"""Layers and circles: modules import what the README lists above them, and not each other."""
 
 from __future__ import annotations
 
@@ -102,3 +102,63 @@ def test_every_way_of_importing_what_stands_below_is_seen(source: str) -> None:
 def test_layers_import_neither_the_root_nor_links_by_their_top_names(source: str) -> None:
     assert len(forbidden("cli", source)) == 1
     assert forbidden("cli", "import numpy\nfrom scipy import stats") == []
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(("cadalign", *(part for part in parts if part != "__init__")))
+
+
+def imported_by(source: str, names: set[str]) -> set[str]:
+    """The package's modules that code imports, also in functions and for type checking."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & names
+            found.update(inner or {node.module})
+    return found & names
+
+
+def circles(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Sets of modules of which each imports each other, directly or not."""
+    order: list[str] = []
+    seen: set[str] = set()
+
+    def follow(start: str, edges: dict[str, set[str]], into: list[str]) -> None:
+        seen.add(start)
+        for other in edges[start] - seen:
+            if other not in seen:
+                follow(other, edges, into)
+        into.append(start)
+
+    for name in graph:
+        if name not in seen:
+            follow(name, graph, order)
+    importers: dict[str, set[str]] = {name: set() for name in graph}
+    for name, others in graph.items():
+        for other in others:
+            importers[other].add(name)
+    seen.clear()
+    groups = []
+    for name in reversed(order):
+        if name not in seen:
+            group: list[str] = []
+            follow(name, importers, group)
+            groups.append(set(group))
+    return [group for group in groups if len(group) > 1]
+
+
+def test_circles_are_found_whole() -> None:
+    graph = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
+    assert sorted(map(sorted, circles(graph))) == [["a", "b", "c"], ["d", "e"]]
+    lazy = "def draw():\n    from cadalign.report import page\n    import cadalign.io"
+    names = {"cadalign.report", "cadalign.report.page", "cadalign.io"}
+    assert imported_by(lazy, names) == {"cadalign.report.page", "cadalign.io"}
+
+
+def test_no_circle_of_imports_is_larger_than_two_modules() -> None:
+    sources = {name_of(path): path.read_text(encoding="utf-8") for path in modules()}
+    graph = {name: imported_by(source, set(sources)) for name, source in sources.items()}
+    assert [sorted(circle) for circle in circles(graph) if len(circle) > 2] == []

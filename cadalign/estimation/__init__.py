@@ -1,1 +1,65 @@
-"""Estimate alignments: from keypoints or all evidence to results with their uncertainty."""
+"""Pose, stretch and shape of an object from all that is known about it, and their uncertainty.
+
+Options, models and views go in, a `Result` comes out. `cadalign.fit` and `cadalign.align` stand in
+the modules of their names.
+"""
+
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.estimation.align import align_batch
+    from cadalign.estimation.exporting import object_of
+    from cadalign.estimation.fit import fit_batch
+    from cadalign.estimation.focal import FocalPrior
+    from cadalign.estimation.model import Model, Size
+    from cadalign.estimation.observed import model_of, size_of, views_from, views_of
+    from cadalign.estimation.options import FitOptions, RansacOptions
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
+    from cadalign.estimation.results import Results, to_dataframe
+    from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+    from cadalign.estimation.uncertainty.summary import (
+        Contribution,
+        EvidenceSummary,
+        MaskResiduals,
+        Misfit,
+    )
+    from cadalign.estimation.uncertainty.weakness import Uncertainty
+    from cadalign.estimation.view import View
+
+__all__ = [
+    "Advice",
+    "Alternative",
+    "Contribution",
+    "EvidenceSummary",
+    "FitOptions",
+    "FitStats",
+    "FocalPrior",
+    "MaskResiduals",
+    "Misfit",
+    "Model",
+    "RansacOptions",
+    "Result",
+    "Results",
+    "Size",
+    "Uncertainty",
+    "View",
+    "ViewResult",
+    "align_batch",
+    "fit_batch",
+    "model_of",
+    "object_of",
+    "rank_evidence",
+    "size_of",
+    "to_dataframe",
+    "views_from",
+    "views_of",
+]
+
+__getattr__ = lazy_names(__name__)
+
+
+def __dir__() -> list[str]:
+    return __all__

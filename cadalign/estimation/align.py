@@ -12,8 +12,8 @@ import numpy as np
 
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.assemble import assemble
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
@@ -22,7 +22,7 @@ from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import Problem, find_minima
+from cadalign.estimation.search import JointProblem, find_minima
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (
@@ -88,6 +88,8 @@ def align(
         If an argument is invalid, or a view names a keypoint that the model lacks.
     DegenerateError
         If the keypoints are too few, or no estimate has them all in front of the cameras.
+    NoConsensusError
+        With ``ransac``: if no estimate has more support by keypoints than chance gives.
 
     Examples
     --------
@@ -132,7 +134,7 @@ def align(
                 focal_prior=focal_prior,
             )
         return with_views_left_out(found_by_used, prior, given, left_out)
-    problem = Problem(prior, given, size, options, lenses)
+    problem = JointProblem(prior, given, size, options, lenses)
     lacks_sigma = any(view.sigma is None and len(view.keypoint_ids) for view in given)
     if lacks_sigma:
         problem, minima, iterations, hypotheses = find_minima_and_noise(problem, inits, ransac)
@@ -154,7 +156,7 @@ def align(
     if lacks_sigma:
         minima = widened_by_noise(problem, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = assemble(model, prior, given, minima, stats)
+    result = result_of_minima(model, prior, given, minima, stats)
     if lacks_sigma:
         result = replace(result, sigma=problem.noise)
     return result if masks is None else masks.noted_in(result)

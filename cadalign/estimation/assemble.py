@@ -1,213 +1,251 @@
-"""From minima of the joint estimate to its result."""
+"""The one place that makes results: of keypoints in one view, and of all evidence."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import DegenerateError
-from cadalign.estimation.estimates import (
-    Estimate,
-    curvature_of_rotations,
-    is_exact,
-    is_other,
-    moments_of_estimates,
-    one_of_equals,
-    pose_and_border,
-    pose_and_lengths,
-    stretch_of,
-    widened,
-    with_box,
-)
-from cadalign.estimation.model import Model
-from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.search import Minimum
-from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import stretched_axes
-from cadalign.estimation.uncertainty.evidence import Basis, summaries_of
-from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.warnings import another_pose, warnings_of
-from cadalign.estimation.view import View
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult, quickly
+from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
+from cadalign.estimation.symmetry import SAME_SQUARES, carried, held_axes, is_same
+from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
+from cadalign.estimation.uncertainty.weakness import another_pose
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import nearest_rotation
-from cadalign.shapes.inflation import inflation_with
-from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.covariance import joint_covariance
-from cadalign.solvers.joint.evidence import points_of
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
+
+if TYPE_CHECKING:  # what a fit of keypoints alone has no use for
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.prior import ShapePrior
+    from cadalign.estimation.view import View
+    from cadalign.shapes.model import ShapeModel
+    from cadalign.solvers.marginal.moments import Moments
 
 
-def assemble(
+def result_of_solution(
+    problems: Problems, solutions: Solutions, options: FitOptions, seconds: float
+) -> Result:
+    """The result of the only problem, which has a solution."""
+    minima, iterations, hypotheses, _ = solutions.info[0].tolist()
+    fitted = fitted_fields(problems, solutions, options)
+    effort = {"iterations": iterations, "hypotheses": hypotheses, "seconds": seconds}
+    return result_of_keypoints(
+        problems.points_2d,
+        fitted,
+        method=options.method,
+        stats=quickly(FitStats, effort),
+        cost=None if fitted["fisher_covariance"] is None else solutions.costs.item(0),
+        alternatives=_alternatives(problems, solutions, minima, options) if minima > 1 else (),
+    )
+
+
+def result_of_keypoints(
+    points_2d: FloatArray,
+    fitted: dict[str, Any],
+    *,
+    method: str,
+    stats: FitStats,
+    cost: float | None = None,
+    alternatives: tuple[Alternative, ...] = (),
+) -> Result:
+    """The result of keypoints in one view, from the fields of their `FittedKeypoints`."""
+    points, options = fitted["points_3d"], fitted["options"]
+    ids = _rows(len(points))
+    statistics = quickly(KeypointStatistics, fitted)
+    of_view = {
+        "camera": fitted["camera"],
+        "alignment": fitted["alignment"],
+        "ids": ids,
+        "points_2d": points_2d.copy(),  # the caller may go on to change theirs
+        "residuals": fitted["residuals"],
+        "inliers": fitted["inliers"],
+        "statistics": statistics,
+    }
+    of_result = {
+        "views": (quickly(ViewResult, of_view),),
+        "ids": ids,
+        "points_3d": points,
+        "method": method,
+        "statistics": statistics,
+        "known_axis": options.known_axis,
+        "stretched_axes": options.stretched_axes,
+        "focal": options.focal,
+        "focal_prior": options.focal_prior,
+        "sigma": fitted.get("sigma"),
+        "cost": cost,
+        "alternatives": alternatives,
+        "stats": stats,
+        "options": options,
+    }
+    return quickly(Result, of_result)
+
+
+def with_keypoints(
+    result: Result,
+    problems: Problems,
+    options: FitOptions,
+    residuals: FloatArray,
+    inliers: BoolArray,
+    stats: FitStats,
+) -> Result:
+    """A result of some of the only problem's keypoints as that of all, with their inliers."""
+    points = problems.points_3d.copy()
+    fitted = {
+        "points_3d": points,
+        "residuals": residuals,
+        "inliers": inliers,
+        "alignment": result.alignment,
+        "camera": result.camera,
+        "options": options,
+        "sigma": result.sigma,
+        "fisher_covariance": result.fisher_covariance,
+    }
+    return result_of_keypoints(
+        problems.points_2d,
+        fitted,
+        method=f"ransac-{result.method}",
+        stats=stats,
+        cost=result.cost,
+        alternatives=tuple(replace(each, points_3d=points) for each in result.alternatives),
+    )
+
+
+def _alternatives(
+    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
+) -> tuple[Alternative, ...]:
+    """The other minima that are likely enough."""
+    costs = solutions.costs[0, :minima]
+    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
+        # Costs are in units of sigma^2; below 1 they are those of exact fits.
+        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
+    else:
+        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
+    points = problems.points_3d.copy()
+    return tuple(
+        Alternative(
+            Alignment.from_packed(solutions.poses[0, k]),
+            float(ratios[k]),
+            camera_of(problems, solutions, k),
+            points,
+        )
+        for k in range(1, minima)
+        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
+    )
+
+
+def canonical_result(result: Result, symmetry: Symmetry) -> Result:
+    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
+    group = group_of(symmetry)
+    held = held_axes(result.stretched_axes)
+    best = group.canonical(result.alignment, held=held)
+    statistics = cast("KeypointStatistics", result.statistics)
+    covariance = statistics.fisher_covariance
+    if covariance is not None:
+        covariance = carried(covariance, result.alignment, best, held)
+    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
+    statistics = replace(
+        statistics,
+        alignment=best.alignment,
+        points_3d=best.relabelled(statistics.points_3d),
+        fisher_covariance=covariance,
+        symmetry=symmetry,
+    )
+    return replace(
+        result,
+        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
+        points_3d=best.relabelled(result.points_3d),
+        statistics=statistics,
+        alternatives=tuple(
+            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
+            for equal, each in canonical
+            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+        ),
+        symmetry=symmetry,
+    )
+
+
+def result_of_evidence(
     model: Model | ShapeModel,
     prior: ShapePrior,
     views: Sequence[View],
-    minima: Sequence[Minimum],
-    stats: FitStats,
+    estimates: Sequence[Alternative],
+    moments: Moments,
+    *,
+    poses: Sequence[Alignment],
+    cameras: Sequence[Camera],
+    inliers: Sequence[BoolArray],
+    covariances: Sequence[FloatArray],
+    lengths: FloatArray,
+    statements: dict[str, Any],
+    **fields: Any,
 ) -> Result:
-    """The result of minima, the likeliest first.
+    """The result of all evidence about an object.
 
-    Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely minima are, each with the shape's deviations widened by the inflation.
-
-    Raises
-    ------
-    DegenerateError
-        If the evidence determines none of them.
+    Parameters
+    ----------
+    estimates : sequence of Alternative
+        The likely estimates, the best first.
+    moments : Moments
+        Second moments of them about the best, in the first view's camera.
+    poses, cameras, inliers, covariances
+        Of every view, by the best estimate.
+    lengths : (3,) float
+        Of the object's box.
+    statements, **fields
+        More of `Stated` and of `Result`.
     """
-    minima = [each for each in minima if np.isfinite(each.score)]
-    if not minima:
-        what = "the evidence does not determine pose and shape"
-        raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
-    likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
-    inflation = prior.inflation
-    if all(view.mask is None for view in views):  # a contour tells as much as many keypoints
-        given = len(minima[0].evidence.sightings.point)
-        inflation = inflation_with(given, inflation, prior.few_keypoints)
-    likely = [
-        _estimate(_widened(each, inflation), likelihood, prior)
-        for each, likelihood in zip(minima, likelihoods, strict=True)
-        if likelihood >= LEAST_LIKELIHOOD
+    best = estimates[0]
+    others = [
+        each for each, far in zip(estimates, moments.distances, strict=True) if far > SAME_SQUARES
     ]
-    minimum = minima[0]
-    symmetry = model.symmetry if isinstance(model, Model) else None
-    x, y, z = (minimum.evidence.scales.free == 0).tolist()
-    held = x, y, z
-    likely = one_of_equals(likely, symmetry, held)
-    best = likely[0]
-    moments = moments_of_estimates(likely)
-    covariances = [moments.covariance]
-    covariances += [
-        moments_of_estimates(likely, view).covariance for view in range(1, len(best.poses))
-    ]
-    if symmetry is None and not is_exact(minimum.evidence):
-        for covariance in covariances:
-            covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    alternatives = tuple(
-        Alternative(
-            each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
-        )
-        for k, each in enumerate(likely)
-        if is_other(moments, k)
+    another = another_pose(
+        best.alignment,
+        [each.alignment for each in others],
+        [each.relative_likelihood for each in others],
     )
     statistics = Stated(
         covariances[0],
-        best.covariance,
-        moments.of_points[:-2],
-        moments.of_seen[:-2],
-        warnings=(
-            *warnings_of(
-                minimum.evidence, minimum.state, minimum.cost, best.poses, moments.covariance
-            ),
-            *another_pose(best.poses[0], alternatives),
-        ),
-        evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
+        points_covariance=moments.of_points[:-2],
+        points_cam_covariance=moments.of_seen[:-2],
         degrees_of_freedom=prior.degrees_of_freedom,
-        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
+        **{**statements, "warnings": (*statements["warnings"], *another)},
     )
-    of_views: list[ViewResult] = []
-    inliers_of = _inliers(prior, views, minimum)
-    kept = zip(views, best.cameras, best.poses, covariances, inliers_of, strict=True)
-    for view, camera, pose, covariance, inliers in kept:
+    of_views = []
+    kept = zip(views, cameras, poses, covariances, inliers, strict=True)
+    for number, (view, camera, pose, covariance, marked) in enumerate(kept):
         rows = prior.rows_of(view.keypoint_ids, "ids")
         observed = cast(FloatArray, view.points_2d)
-        residuals = camera.project(pose.apply(best.points[rows])) - observed
-        stated = Stated(covariance) if of_views else statistics
+        residuals = camera.project(pose.apply(best.points_3d[rows])) - observed
+        stated = Stated(covariance) if number else statistics
         of_views.append(
-            ViewResult(camera, pose, view.keypoint_ids, observed, residuals, inliers, stated)
+            ViewResult(camera, pose, view.keypoint_ids, observed, residuals, marked, stated)
         )
-    known_axis = getattr(model, "known_axis", None)
+    mean = prior.lengths
+    has_length = mean > 0
     return Result(
         views=tuple(of_views),
         ids=prior.ids,
-        points_3d=best.points[:-2],
+        points_3d=best.points_3d,
         method="align",
         statistics=statistics,
-        known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
-        stretched_axes=stretched_axes(held),
-        cost=minimum.cost,
-        alternatives=alternatives,
-        stats=stats,
-        symmetry=symmetry,
+        alternatives=tuple(others),
         model=model,
-        component=minimum.component,
-        rig_from_model=_in_rig(views, minimum, best),
-        own_bounds=best.points[-2:],
-        focal="estimate" if minimum.lenses.count else "known",
-        focal_prior=minimum.lenses.prior,
-        own_stretch=stretch_of(best.lengths, prior.lengths),
+        own_bounds=best.own_bounds,
+        own_stretch=np.where(has_length, lengths / np.where(has_length, mean, 1.0), 1.0),
+        **fields,
     )
 
 
-def _widened(minimum: Minimum, factor: float) -> Minimum:
-    """The same points under a prior of wider deviations."""
-    evidence, state = widened(minimum.evidence, minimum.state, factor)
-    return minimum._replace(evidence=evidence, state=state)
-
-
-def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
-    keypoints = len(prior.ids)
-    if prior.box_margins is not None:
-        evidence, state = with_box(minimum.evidence, minimum.state, keypoints, prior.box_margins)
-        minimum = minimum._replace(evidence=evidence, state=state)
-    scale = np.exp(minimum.state.log_scales)
-    rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
-    stretched = points_of(minimum.evidence.shape, minimum.state)[rows]
-    sighted = np.unique(minimum.evidence.sightings.point)
-    seen = stretched[sighted[sighted < keypoints]]
-    if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
-        stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
-        stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
-    found = joint_covariance(minimum.evidence, minimum.state)
-    return Estimate(
-        stretched / scale,
-        scale,
-        _poses(minimum, scale),
-        stretched[-1] - stretched[-2],
-        tuple(
-            pose_and_lengths(
-                minimum.evidence, minimum.state, pose_and_border(found, int(pose)), view
-            )
-            for view, pose in enumerate(minimum.evidence.rig.pose)
-        ),
-        found.points[rows],
-        found.seen[rows],
-        likelihood,
-        tuple(minimum.lenses.cameras_at(minimum.state.log_focals)),
-    )
-
-
-def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
-    """The alignment in the frame that the views share."""
-    if views[0].cam_from_rig is None:
-        return None
-    camera = minimum.evidence.rig.cam_from_rig[0]
-    rotation, shift = camera[:9].reshape(3, 3), camera[9:]
-    pose = best.poses[0]
-    turned = nearest_rotation(rotation.T @ pose.rotation)
-    return Alignment(turned, rotation.T @ (pose.translation - shift), best.scale)
-
-
-def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
-    """The inliers of every view, in its own order of keypoints."""
-    names = np.concatenate([prior.rows_of(view.keypoint_ids, "ids") for view in views])
-    kept = np.empty(len(names), dtype=bool)
-    kept[np.argsort(names, kind="stable")] = minimum.inliers
-    ends = np.cumsum([len(view.keypoint_ids) for view in views])
-    return tuple(np.split(kept, ends[:-1]))
-
-
-def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
-    """Alignments in every view's camera."""
-    rig = minimum.evidence.rig
-    poses = []
-    for camera, p in zip(rig.cam_from_rig, rig.pose, strict=True):
-        pose = minimum.state.poses[p]
-        rotation = camera[:9].reshape(3, 3)
-        turned = rotation @ pose[:9].reshape(3, 3)
-        shift = rotation @ pose[9:] + camera[9:]
-        poses.append(Alignment(turned, shift, scale, is_valid=True))
-    return tuple(poses)
+@lru_cache(maxsize=64)
+def _rows(count: int) -> tuple[int, ...]:
+    """Rows of so many keypoints, which are their ids."""
+    return tuple(range(count))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -13,13 +13,11 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import pixel_information
-from cadalign.estimation.result import Result
+from cadalign.estimation.options import FitOptions, pixel_information
+from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.uncertainty.misfit import Misfit
 from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -35,6 +33,7 @@ from cadalign.io.documents import (
 
 VERSION = 2
 Matrix = list[list[Finite]]
+Kind = TypeVar("Kind", bound=ResultData)
 _BEHIND = (math.inf, math.inf)
 _UNKNOWN = (math.nan, math.nan)
 
@@ -145,7 +144,7 @@ class _Result(ForeignDocument):
                 raise InputError(what, where=name)
 
 
-def write_result(result: Result) -> dict[str, Any]:
+def write_result(result: ResultData) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
     std, misfit, statistics = result.std, result.misfit, result.statistics
     return {
@@ -219,7 +218,7 @@ def _plain_options(options: FitOptions) -> dict[str, Any]:
     return {**asdict(replace(options, sigma=None)), "sigma": plain}
 
 
-def read_result(data: Mapping[str, Any]) -> Result:
+def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
     """Read the parsed form of a result; see `cadalign.Result.from_dict`.
 
     Raises
@@ -232,14 +231,14 @@ def read_result(data: Mapping[str, Any]) -> Result:
             if isinstance(data, Mapping) and "version" not in data:
                 from cadalign.estimation.older_document import completed, upgraded
 
-                return completed(_result(convert(upgraded(data, VERSION), _Result)))
-            return _result(convert(data, _Result))
+                return completed(_result(convert(upgraded(data, VERSION), _Result), kind))
+            return _result(convert(data, _Result), kind)
     except CadalignError as error:
         place = f"result: {error.where}" if error.where else "result"
         raise InputError(error.what, where=place, fix=error.fix) from None
 
 
-def _result(read: _Result) -> Result:
+def _result(read: _Result, kind: type[Kind]) -> Kind:
     unknowns = 10 if read.focal == "estimate" else 9
     views = []
     for row, view in enumerate(read.views):
@@ -257,7 +256,7 @@ def _result(read: _Result) -> Result:
     )
     views[0] = replace(views[0], statistics=statistics)
     count = len(views[0].residuals)
-    return Result(
+    return kind(
         views=tuple(views),
         ids=tuple(read.ids),
         points_3d=np.array(read.points_3d).reshape(-1, 3),

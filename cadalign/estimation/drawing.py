@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.meshing import known_mesh
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.plots import plot_box, plot_keypoints, plot_mesh, plot_photo
@@ -21,14 +20,14 @@ from cadalign.notebook.html import card, draw_picture
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from cadalign.estimation.result import Result
+    from cadalign.estimation.result_data import ResultData
     from cadalign.estimation.uncertainty.weakness import Uncertainty
 
 Photo = npt.ArrayLike | str | os.PathLike[str]
 
 
 def plot_result(
-    result: Result,
+    result: ResultData,
     image: Photo | None = None,
     mesh: Mesh | None = None,
     *,
@@ -41,7 +40,7 @@ def plot_result(
         raise InputError(what, where="view", fix="views count from 0")
     seen = result.views[view]
     axes = plot_photo(seen.camera, _pixels(image), axes=axes)
-    known = known_mesh(result, mesh)
+    known = result.known_mesh(mesh)
     if known is not None:
         plot_mesh(axes, seen.camera, seen.alignment, known)
     bounds = result.bounds if known is None or result.own_bounds is not None else known.bounds
@@ -51,7 +50,7 @@ def plot_result(
     return axes
 
 
-def result_html(result: Result) -> str:
+def result_html(result: ResultData) -> str:
     """HTML of a result for notebooks."""
     views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
     count = f"{int(result.inliers.sum())} of {len(result.inliers)}{views}"

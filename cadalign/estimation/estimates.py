@@ -1,146 +1,20 @@
-"""Likely estimates in the terms of the result: stretch, box, covariance of what is asked for.
+"""Covariances and boxes of estimates in the terms of the result.
 
-All of them together are a mixture of Gaussians; of those that are equal under the model's symmetry
-one stands for all. A face of the box that an outermost keypoint determines moves with it: its row
-of the shape becomes that of the keypoint, shifted by the margin.
+A face of the box that an outermost keypoint determines moves with it: its row of the shape becomes
+that of the keypoint, shifted by the margin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.symmetry import SAME_SQUARES, carried, is_same, without_free_turns
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal, group_of
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.equations import force_of
-from cadalign.solvers.marginal.moments import Likely, Moments, moments_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
 from cadalign.solvers.search import Minima
-
-Held = tuple[bool, bool, bool]
-_ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
-
-
-class Estimate(NamedTuple):
-    """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
-
-    Poses and covariances (9, 9) are those in every view.
-    """
-
-    points: FloatArray
-    scale: FloatArray
-    poses: tuple[Alignment, ...]
-    lengths: FloatArray
-    covariances: tuple[FloatArray, ...]
-    of_points: FloatArray
-    of_seen: FloatArray
-    likelihood: float
-    cameras: tuple[Camera, ...]
-
-    @property
-    def covariance(self) -> FloatArray:
-        """In the first view."""
-        return self.covariances[0]
-
-
-def stretch_of(lengths: FloatArray, of_mean: FloatArray) -> FloatArray:
-    """Lengths (3,) over those of the mean; 1 where it has none."""
-    has_length = of_mean > 0
-    return np.where(has_length, lengths / np.where(has_length, of_mean, 1.0), 1.0)
-
-
-def moments_of_estimates(estimates: Sequence[Estimate], view: int = 0) -> Moments:
-    """Second moments of estimates about the first, in a view's camera; of points in the first."""
-    poses = [
-        np.concatenate([each.poses[view].rotation.ravel(), each.poses[view].translation])
-        for each in estimates
-    ]
-    return moments_of(
-        Likely(
-            np.array(poses),
-            np.array([each.points * each.scale for each in estimates]),
-            np.array([_lengths_and_focal(each, view) for each in estimates]),
-            np.array([each.covariances[view] for each in estimates]),
-            np.array([each.of_points for each in estimates]),
-            np.array([each.of_seen for each in estimates]),
-            np.array([each.likelihood for each in estimates]),
-        )
-    )
-
-
-def _lengths_and_focal(estimate: Estimate, view: int) -> FloatArray:
-    """Lengths (3,) of the box and, where its covariance has it, the focal length of a view."""
-    focal = [estimate.cameras[view].fx]
-    return np.append(estimate.lengths, focal[: len(estimate.covariances[view]) - 9])
-
-
-def is_other(moments: Moments, k: int) -> bool:
-    """True if an estimate is not the first one within its deviations."""
-    return bool(moments.distances[k] > SAME_SQUARES)
-
-
-def one_of_equals(
-    likely: Sequence[Estimate], symmetry: Symmetry | None, held: Held
-) -> list[Estimate]:
-    """Estimates in their canonical form, without those that are equal to the first.
-
-    ``held`` are the axes whose scale is.
-    """
-    if symmetry is None or group_of(symmetry).is_trivial:
-        return list(likely)
-    group = group_of(symmetry)
-    found = [canonical(each, symmetry, held) for each in likely]
-    best = found[0]
-    return [best] + [
-        each
-        for each in found[1:]
-        if not is_same(group, best.poses[0], each.poses[0], best.covariance)
-    ]
-
-
-def canonical(estimate: Estimate, symmetry: Symmetry, held: Held) -> Estimate:
-    """The canonical one of all equal estimates, without deviations that mean nothing."""
-    best = group_of(symmetry).canonical(estimate.poses[0], held=held)
-    turn = best.motion[:3, :3]
-    poses = (best.alignment, *(_turned(pose, best) for pose in estimate.poses[1:]))
-    covariances = []
-    for given, pose, covariance in zip(estimate.poses, poses, estimate.covariances, strict=True):
-        equal = replace(best, alignment=pose)
-        covariances.append(without_free_turns(carried(covariance, given, equal), equal))
-    points = best.relabelled(estimate.points)
-    points[-2:] = _turned_box(estimate.points[-2:], best)
-    return estimate._replace(
-        points=points,
-        scale=best.alignment.scale,
-        poses=poses,
-        lengths=(points[-1] - points[-2]) * best.alignment.scale,
-        covariances=tuple(covariances),
-        of_points=turn.T @ estimate.of_points @ turn,
-    )
-
-
-def _turned(pose: Alignment, best: Equal) -> Alignment:
-    """An alignment in another view after the symmetry's motion."""
-    shift = pose.translation + pose.linear @ best.motion[:3, 3]
-    return Alignment(pose.rotation @ best.motion[:3, :3], shift, best.alignment.scale)
-
-
-def _turned_box(corners: FloatArray, best: Equal) -> FloatArray:
-    """Corners (2, 3) of the object's box; a box that leaves the axes stays as the symmetric is."""
-    entries = np.abs(best.motion[:3, :3])
-    if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
-        return corners
-    return np.sort(best.relabelled(corners), axis=0)
 
 
 def pose_and_border(found: JointCovariance, pose: int) -> FloatArray:
@@ -187,20 +61,6 @@ def _explained_by_corners(evidence: Evidence, own: float) -> FloatArray:
     explained = np.zeros(3)
     explained[evidence.lengths.axis] = np.minimum(own * evidence.lengths.weight**2, 1.0)
     return explained
-
-
-def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
-    """The same points under a prior of wider deviations."""
-    if factor == 1:
-        return evidence, state
-    shape = evidence.shape
-    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
-    return evidence._replace(shape=wide), state._replace(coefficients=state.coefficients / factor)
-
-
-def is_exact(evidence: Evidence) -> bool:
-    """True if the shape is known but for its scales."""
-    return not (len(evidence.shape.modes) or evidence.shape.spread.any())
 
 
 def curvature_of_rotations(covariance: FloatArray) -> FloatArray:

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.meshing import known_mesh
+from cadalign.estimation.result_data import ResultData
+from cadalign.estimation.result_parts import ViewResult
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import ByteImage
-
-if TYPE_CHECKING:
-    from cadalign.estimation.result import Result
-    from cadalign.estimation.result_parts import ViewResult
 
 Photo = Path | str | ByteImage | None
 
 
 def object_of(
-    result: Result,
+    result: ResultData,
     *,
     mesh: Mesh | None = None,
     image: Photo = None,
@@ -59,7 +55,7 @@ def object_of(
         tuple(_exported(view, photo) for view, photo in zip(result.views, photos, strict=True)),
         result.points_3d,
         result.ids,
-        known_mesh(result, mesh),
+        result.known_mesh(mesh),
         result.rig_from_model,
         world_from_cam,
         name,

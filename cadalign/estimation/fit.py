@@ -15,13 +15,13 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.assemble import canonical_result, result_of_solution, with_keypoints
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.keypoint_result import result_of_solution, with_keypoints
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result
-from cadalign.estimation.solve import solve
-from cadalign.estimation.symmetry import canonical_result, checked_symmetry
+from cadalign.estimation.solve import solve, solve_one
+from cadalign.estimation.symmetry import checked_symmetry
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
@@ -372,7 +372,5 @@ _checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
 
 def _fit_all(problems: Problems, options: FitOptions, start: float) -> Result:
     """Fit the only problem to all its keypoints."""
-    solutions = solve(problems, options)
-    if solutions.errors:
-        raise solutions.errors[0]
+    solutions = solve_one(problems, options)
     return result_of_solution(problems, solutions, options, time.perf_counter() - start)

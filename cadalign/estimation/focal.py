@@ -113,6 +113,20 @@ def focal_bounds(camera: Camera) -> tuple[float, float]:
     return SHORTEST * side, LONGEST * side
 
 
+def log_focal_range(
+    camera: Camera, prior: FocalPrior | None, unit: float = 1.0
+) -> tuple[float, float, float, float]:
+    """Bounds of a log focal length, which a prior may widen, and its mean and weight.
+
+    Focal lengths are in ``unit`` [px].
+    """
+    low, high = (math.log(bound / unit) for bound in focal_bounds(camera))
+    if prior is None:
+        return low, high, 0.0, 0.0
+    mean = math.log(prior.focal / unit)
+    return min(low, mean), max(high, mean), mean, prior.relative_sigma**-2
+
+
 def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
     """Focal lengths from which the search starts [px]; with a prior those near it, and it."""
     grid = np.array(_GRID) * max(camera.width, camera.height)

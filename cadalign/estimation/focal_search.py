@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.focal import FocalPrior, focal_bounds, focal_grid
+from cadalign.estimation.focal import FocalPrior, focal_bounds, focal_grid, log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, focal_slopes, rays_of, whitening_of
 from cadalign.geometry.camera import Camera
@@ -85,7 +85,7 @@ class _Task:
     @property
     def prior(self) -> LogFocalPrior:
         """Bounds and prior of the log focal length."""
-        prior = log_focal_prior(self.camera, self.options)
+        prior = LogFocalPrior(*log_focal_range(self.camera, self.options.focal_prior))
         return prior._replace(weight=prior.weight * self.noise**2)
 
 
@@ -314,17 +314,3 @@ def focal_view(
     camera = camera.with_focal(focal)
     rays = rays_of(points_2d, camera)
     return rays, whitening_of(sigma, rays, camera)
-
-
-def log_focal_prior(camera: Camera, options: FitOptions) -> LogFocalPrior:
-    """Bounds of the log focal length, which a prior may widen, and that prior."""
-    low, high = focal_bounds(camera)
-    prior = options.focal_prior
-    if prior is None:
-        return LogFocalPrior(math.log(low), math.log(high), 0.0, 0.0)
-    return LogFocalPrior(
-        math.log(min(low, prior.focal)),
-        math.log(max(high, prior.focal)),
-        math.log(prior.focal),
-        prior.relative_sigma**-2,
-    )

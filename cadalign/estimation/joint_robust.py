@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
+from cadalign.estimation.uncertainty.evidence import kept_rows, seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
-from cadalign.solvers.joint.evidence import Evidence, Sightings, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
@@ -65,7 +66,7 @@ def robust_starts(
     )
 
 
-def find_consensus(
+def robust_minima(
     evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool
 ) -> tuple[list[Consensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
@@ -98,7 +99,7 @@ def _settle(
 ) -> Consensus | None:
     """Refine on the inliers until these don't change."""
     best: Consensus | None = None
-    inliers = _lengths(evidence, state) < threshold
+    inliers = whitened_lengths(evidence, state) < threshold
     for _ in range(rounds):
         if inliers.sum() < _LEAST_INLIERS:
             break
@@ -112,22 +113,18 @@ def _settle(
         score = float(minima.scores[0]) + float(left_out.sum())
         if best is None or score < best.score:
             best = Consensus(inliers, some, state, float(minima.costs[0]), score)
-        again = _lengths(evidence, state) < threshold
+        again = whitened_lengths(evidence, state) < threshold
         if (again == inliers).all():
             break
         inliers = again
     return best
 
 
-def _lengths(evidence: Evidence, state: State) -> FloatArray:
+def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     """Whitened lengths (N,) of all residuals in the image; infinite behind a camera."""
-    points, sightings, rig = points_of(evidence.shape, state), evidence.sightings, evidence.rig
-    poses = state.poses[rig.pose[sightings.image]]
-    cameras = rig.cam_from_rig[sightings.image]
-    seen = points[sightings.point]
-    for motion in (poses, cameras):
-        rotation = motion[:, :9].reshape(-1, 3, 3)
-        seen = (rotation @ seen[:, :, None])[:, :, 0] + motion[:, 9:]
+    sightings = evidence.sightings
+    points = points_of(evidence.shape, state)[sightings.point]
+    seen = seen_in_cameras(evidence, state, points, sightings.image)
     group = evidence.focals.group[sightings.image]
     log_ratio = np.append(state.log_focals, 0.0)[group][:, None]  # 0 where it is known
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
@@ -145,9 +142,7 @@ def with_loss(evidence: Evidence, loss: int) -> Evidence:
 
 def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
     """The evidence of some sightings."""
-    columns: list[Any] = [np.ascontiguousarray(each[kept]) for each in evidence.sightings]
-    some = Sightings(*columns)
-    return evidence._replace(sightings=some)
+    return evidence._replace(sightings=kept_rows(evidence.sightings, kept))
 
 
 def _hypotheses(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.focal import FocalPrior, focal_bounds, focal_grid
+from cadalign.estimation.focal import FocalPrior, focal_grid, log_focal_range
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.evidence import Focals
@@ -67,23 +67,9 @@ class Lenses:
     def focals(self) -> Focals:
         """Bounds and priors in the form of the kernels."""
         firsts = [self.cameras[self.groups.index(group)] for group in range(self.count)]
-        bounds = [focal_bounds(camera) for camera in firsts]
-        given = np.full(self.count, 0.0)
-        weight = 0.0
-        if self.prior is not None:
-            given = np.log([self.prior.focal / camera.fx for camera in firsts])
-            weight = self.prior.relative_sigma**-2
-        low = [math.log(low / camera.fx) for (low, _), camera in zip(bounds, firsts, strict=True)]
-        high = [
-            math.log(high / camera.fx) for (_, high), camera in zip(bounds, firsts, strict=True)
-        ]
-        return Focals(
-            np.array(self.groups, dtype=np.int64),
-            np.minimum(np.array(low, dtype=float), given),
-            np.maximum(np.array(high, dtype=float), given),
-            given,
-            np.full(self.count, weight),
-        )
+        ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in firsts]
+        columns = np.ascontiguousarray(np.array(ranges).reshape(-1, 4).T)
+        return Focals(np.array(self.groups, dtype=np.int64), *columns)
 
     def at(self, log_focals: FloatArray) -> Lenses:
         """The lenses, their references moved to exp(log_focals) (F,) times their focals."""

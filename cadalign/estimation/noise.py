@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.arrays import BoolArray
+from cadalign.estimation.degeneracy import no_redundancy_error
 from cadalign.estimation.options import RansacOptions
-from cadalign.estimation.search import Inits, Minimum, Problem, find_minima
-from cadalign.estimation.solve import no_redundancy_error
+from cadalign.estimation.search import Inits, JointProblem, Minimum, find_minima
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.solvers.joint.search import refine_joint, score_state
@@ -25,8 +25,8 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def find_minima_and_noise(
-    problem: Problem, inits: Inits, ransac: RansacOptions | None
-) -> tuple[Problem, list[Minimum], int, int]:
+    problem: JointProblem, inits: Inits, ransac: RansacOptions | None
+) -> tuple[JointProblem, list[Minimum], int, int]:
     """Minima with the likeliest standard deviation of the keypoints that have none.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the estimate
@@ -63,7 +63,7 @@ def find_minima_and_noise(
     return problem, minima, int(effort[0]), int(effort[1])
 
 
-def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> list[Minimum]:
+def widened_by_noise(problem: JointProblem, minima: Sequence[Minimum]) -> list[Minimum]:
     """The minima with less information, as the noise itself is uncertain."""
     unknown = _without_sigma(problem.views, minima[0])
     unknowns = 6 * len(minima[0].state.poses) + int(minima[0].evidence.scales.free.sum())
@@ -72,7 +72,7 @@ def widened_by_noise(problem: Problem, minima: Sequence[Minimum]) -> list[Minimu
     return [_scaled(each, _without_sigma(problem.views, each), factor) for each in minima]
 
 
-def _likeliest(problem: Problem, minimum: Minimum) -> float:
+def _likeliest(problem: JointProblem, minimum: Minimum) -> float:
     """The noise [px] with the best score of one minimum."""
     unknown = _without_sigma(problem.views, minimum)
     count = int(unknown.sum())

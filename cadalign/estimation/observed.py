@@ -175,7 +175,7 @@ def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) ->
     )
 
 
-class Photo(Protocol):
+class PosedPhoto(Protocol):
     """A photo of a reconstruction, such as `cadalign.datasets.Correspondences`."""
 
     @property
@@ -190,15 +190,15 @@ class Photo(Protocol):
 class Reconstruction(Protocol):
     """Photos by their names, such as `cadalign.datasets.Colmap`."""
 
-    def __getitem__(self, name: str, /) -> Photo:
+    def __getitem__(self, name: str, /) -> PosedPhoto:
         """One photo."""
 
 
-Keypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
+ObservedKeypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
 
 
 def views_from(
-    images: Reconstruction, keypoints: Mapping[str, Keypoints], **options: Any
+    images: Reconstruction, keypoints: Mapping[str, ObservedKeypoints], **options: Any
 ) -> list[View]:
     """Views with the cameras and the known poses of a reconstruction's photos.
 

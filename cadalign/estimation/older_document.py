@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from cadalign.estimation.result import Result
+from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
+Kind = TypeVar("Kind", bound=ResultData)
 _AXES = ("x", "y", "z")
 
 
@@ -72,7 +73,7 @@ def _with(entries: Any, **fields: Any) -> Any:
     return [fields | dict(each) if isinstance(each, Mapping) else each for each in entries]
 
 
-def completed(result: Result) -> Result:
+def completed(result: Kind) -> Kind:
     """A result that was read from an upgraded form, with what follows from its other fields."""
     if result.method == "align":
         diagonal = np.zeros(9) if result.covariance is None else result.covariance.diagonal()

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_positive, is_number, is_whole
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
 from cadalign.estimation.focal import FocalPrior
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
@@ -239,3 +240,33 @@ def _check_known(name: str, value: object, known: Collection[str]) -> None:
     if not isinstance(value, str) or value not in known:
         fix = f"known are {', '.join(known)}"
         raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
+
+
+SIGMA_HELP = (
+    "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
+)
+
+
+def pixel_information(sigma: Any, count: int) -> FloatArray:
+    """Inverse covariances (n, 2, 2) of the pixels of n keypoints; checks sigma."""
+    dimensions = np.ndim(sigma)
+    if dimensions < 2:
+        shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
+        deviations = as_floats(sigma, name="sigma", shape=shape)
+        if not (deviations > 0).all():
+            raise InputError("has values that are not positive", where="sigma", fix=SIGMA_HELP)
+        weights = np.broadcast_to(1.0 / deviations**2, (count,))
+        return np.asarray(weights[:, None, None] * np.eye(2))
+    covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))
+    definite = (np.linalg.eigvalsh(covariances)[:, 0] > 0) & (
+        np.abs(covariances[:, 0, 1] - covariances[:, 1, 0])
+        <= 1e-9 * np.abs(covariances).max(axis=(1, 2))
+    )
+    if not definite.all():
+        raise InputError(
+            f"the covariance of keypoint {np.flatnonzero(~definite)[0]} is not symmetric and "
+            "positive definite",
+            where="sigma",
+            fix=SIGMA_HELP,
+        )
+    return np.asarray(np.linalg.inv(covariances))

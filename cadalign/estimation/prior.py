@@ -14,7 +14,7 @@ from cadalign.estimation.model import Model
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.evidence import ScalePriors, Shape
+from cadalign.solvers.joint.evidence import Evidence, ScalePriors, Shape, State
 
 _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
@@ -142,3 +142,17 @@ def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
 def has_scale_prior(scales: ScalePriors) -> bool:
     """True where a prior ties the scales together more than any plausible proportions do."""
     return bool((scales.precision > 2 / _PROPORTION_SIGMA**2).any())
+
+
+def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
+    """The same points under a prior of wider deviations."""
+    if factor == 1:
+        return evidence, state
+    shape = evidence.shape
+    wide = shape._replace(modes=factor * shape.modes, spread=factor * shape.spread)
+    return evidence._replace(shape=wide), state._replace(coefficients=state.coefficients / factor)
+
+
+def is_exact(evidence: Evidence) -> bool:
+    """True if the shape is known but for its scales."""
+    return not (len(evidence.shape.modes) or evidence.shape.spread.any())

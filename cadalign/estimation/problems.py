@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, is_number
+from cadalign.arrays import FloatArray, IntArray, as_points, is_number
 from cadalign.errors import CadalignError, InputError, quote
-from cadalign.estimation.options import Sigma
+from cadalign.estimation.options import SIGMA_HELP, Sigma, pixel_information
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import all_finite, pinhole_rays
 
@@ -223,7 +223,9 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
         sigma = 1.0
     if isinstance(sigma, int | float) and not camera.distortion:
         if not (is_number(sigma) and sigma > 0):
-            raise InputError(f"{quote(sigma)} is not a standard deviation", where="sigma", fix=_FIX)
+            raise InputError(
+                f"{quote(sigma)} is not a standard deviation", where="sigma", fix=SIGMA_HELP
+            )
         return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
     information = pixel_information(sigma, len(rays))
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
@@ -250,34 +252,6 @@ def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
         else:
             for count in set(counts.tolist()):
                 pixel_information(sigma, count)
-
-
-_FIX = "give a positive number, one per keypoint, or a 2 x 2 covariance per keypoint, in pixels"
-
-
-def pixel_information(sigma: Any, count: int) -> FloatArray:
-    """Inverse covariances (n, 2, 2) of the pixels of n keypoints; checks sigma."""
-    dimensions = np.ndim(sigma)
-    if dimensions < 2:
-        shape: tuple[int | None, ...] = () if dimensions == 0 else (count,)
-        deviations = as_floats(sigma, name="sigma", shape=shape)
-        if not (deviations > 0).all():
-            raise InputError("has values that are not positive", where="sigma", fix=_FIX)
-        weights = np.broadcast_to(1.0 / deviations**2, (count,))
-        return np.asarray(weights[:, None, None] * np.eye(2))
-    covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))
-    definite = (np.linalg.eigvalsh(covariances)[:, 0] > 0) & (
-        np.abs(covariances[:, 0, 1] - covariances[:, 1, 0])
-        <= 1e-9 * np.abs(covariances).max(axis=(1, 2))
-    )
-    if not definite.all():
-        raise InputError(
-            f"the covariance of keypoint {np.flatnonzero(~definite)[0]} is not symmetric and "
-            "positive definite",
-            where="sigma",
-            fix=_FIX,
-        )
-    return np.asarray(np.linalg.inv(covariances))
 
 
 class Solutions(NamedTuple):

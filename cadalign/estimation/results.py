@@ -14,7 +14,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, full_covariances
 from cadalign.estimation.result import Result
-from cadalign.estimation.symmetry import canonical_result, carried, held_axes
+from cadalign.estimation.symmetry import carried, held_axes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
@@ -273,7 +273,7 @@ class SolvedTable:
 
     def single(self, b: int) -> Result:
         """The result of one problem, as `cadalign.fit` gives it."""
-        from cadalign.estimation.keypoint_result import result_of_solution
+        from cadalign.estimation.assemble import canonical_result, result_of_solution
 
         all_of_them, rows = self.solutions, self.problems.rows(b)
         of_problem: dict[str, Any] = {

@@ -7,27 +7,25 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats
-from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.estimation.focal_search import focal_views, log_focal_prior
-from cadalign.estimation.keypoint_result import result_of_keypoints
+from cadalign.arrays import FloatArray
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.assemble import result_of_keypoints
+from cadalign.estimation.consensus import Support, area_of, check_support, order_of_confidence
+from cadalign.estimation.degeneracy import are_in_one_plane
+from cadalign.estimation.focal import log_focal_range
+from cadalign.estimation.focal_search import focal_views
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
 from cadalign.estimation.problems import Problems, rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
-from cadalign.solvers.evidence import Keypoints, ScalePrior, Views
-from cadalign.solvers.minimal import MAX_SOLUTIONS
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
-_CHANCE = 0.1  # expected number of models with as much support by chance
-_FLAT = 1e-6  # thickness over extent of what counts as a plane
-_LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
 
 
 def find_consensus(
@@ -58,7 +56,7 @@ def find_consensus(
             where="minimal",
             fix="leave it at 'ap4p'",
         )
-    by_confidence = _by_confidence(confidences, count)
+    by_confidence = order_of_confidence(confidences, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
     ranked = np.arange(count) if by_confidence is None else np.argsort(order)[by_confidence]
     views = _views(problems.points_2d[order], camera, options)
@@ -75,7 +73,7 @@ def find_consensus(
         ),
         views,
         np.log(views.focals),
-        log_focal_prior(camera, options),
+        LogFocalPrior(*log_focal_range(camera, options.focal_prior)),
         ranked,
         Settings(
             threshold=float(ransac.max_reproj_error),
@@ -93,7 +91,7 @@ def find_consensus(
         pose,
         inliers,
     )
-    if not hypotheses and _are_in_one_plane(points):
+    if not hypotheses and are_in_one_plane(points):
         raise DegenerateError(
             "all keypoints lie in one plane, where the samples of ransac determine nothing",
             where="points_3d",
@@ -104,33 +102,31 @@ def find_consensus(
     alignment = Alignment.from_packed(options.in_model_axes(pose))
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
-    support = int(kept.sum())
     residuals = residuals_of(problems, alignment, camera)
-    errors = np.linalg.norm(residuals[kept], axis=1)
-    extent = np.ptp(problems.points_2d, axis=0) + 2 * ransac.max_reproj_error
-    area = min(float(np.prod(extent)), float(camera.width) * float(camera.height))
-    size += options.focal == "estimate"  # which half a keypoint determines
-    if not np.isfinite(score) or _expected_by_chance(errors, count, size, area) > _CHANCE:
-        raise NoConsensusError(
-            f"no alignment is supported: the best has {support} of {count} keypoints within "
-            f"{ransac.max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)",
-            where="points_2d",
-            fix="check the correspondences and the camera, or raise max_reproj_error or "
-            "max_iterations",
-            score=float(score),
-            inliers=support,
-        )
-    stats = FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score))
-    return result_of_keypoints(
-        problems,
-        options,
-        alignment=alignment,
-        camera=camera,
-        residuals=residuals,
-        inliers=kept,
-        method=f"ransac-{ransac.minimal}",
-        stats=stats,
+    check_support(
+        [
+            Support(
+                np.linalg.norm(residuals[kept], axis=1),
+                count,
+                area_of(problems.points_2d, camera, ransac.max_reproj_error),
+            )
+        ],
+        size + (options.focal == "estimate"),  # which half a keypoint determines
+        max_reproj_error=ransac.max_reproj_error,
+        score=float(score),
+        where="points_2d",
     )
+    stats = FitStats(int(iterations), int(hypotheses), 0.0, float(kept.mean()), float(score))
+    fitted = {
+        "points_3d": problems.points_3d.copy(),
+        "residuals": residuals,
+        "inliers": kept,
+        "alignment": alignment,
+        "camera": camera,
+        "options": options,
+    }
+    method = f"ransac-{ransac.minimal}"
+    return result_of_keypoints(problems.points_2d, fitted, method=method, stats=stats)
 
 
 def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
@@ -142,58 +138,7 @@ def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
     return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
 
 
-def _are_in_one_plane(points: FloatArray) -> bool:
-    """True for points that do not all coincide and lie in a plane or on a line."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[0] > 0 and spread[2] <= _FLAT * spread[0])
-
-
-def _by_confidence(confidences: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
-    """The order of falling confidence; None where there are none, or all are alike."""
-    if confidences is None:
-        return None
-    values = as_floats(confidences, name="confidences", shape=(count,))
-    if (values < 0).any():
-        raise InputError(
-            f"keypoint {int(np.argmax(values < 0))} has the confidence {values.min():g}",
-            where="confidences",
-            fix="give numbers that are not negative",
-        )
-    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None
-
-
-def _expected_by_chance(errors: FloatArray, count: int, size: int, area: float) -> float:
-    """The expected number of models as well supported among keypoints scattered at random.
-
-    Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
-    estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
-    ``size`` keypoints, all choices of k keypoints and of a sample among them are counted, and the
-    chance that the others lie within the largest of the k errors; the least such number over k
-    (over the smallest dozen and all of them, which is where it lies). ``errors`` (k,) are those of
-    the supporting keypoints [px], and outliers are scattered over ``area`` [px^2].
-    """
-    if len(errors) <= size:
-        return math.inf
-    radii = np.maximum(np.sort(errors), _LEAST_ERROR)
-    logarithms = [
-        math.log(MAX_SOLUTIONS * (count - size))
-        + _log_choose(count, k)
-        + _log_choose(k, size)
-        + (k - size) * min(0.0, math.log(math.pi * radii[k - 1] ** 2 / area))
-        for k in {*range(size + 1, min(size + 12, len(errors) + 1)), len(errors)}
-    ]
-    return math.exp(min(700.0, *logarithms))
-
-
-def _log_choose(n: int, k: int) -> float:
-    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-
-
 def residuals_of(problems: Problems, alignment: Alignment, camera: Camera) -> FloatArray:
     """Projected minus observed keypoints (n, 2) of the only problem; infinite behind the camera."""
-    in_camera = alignment.apply(problems.points_3d)
-    ahead = in_camera[:, 2] > 0
-    residuals = np.full((len(in_camera), 2), np.inf)
-    projected = camera.pixels_from_normalized(perspective(in_camera[ahead]))
-    residuals[ahead] = projected - problems.points_2d[ahead]
-    return residuals
+    projected = camera.project_where_ahead(alignment.apply(problems.points_3d))
+    return projected - problems.points_2d

@@ -8,10 +8,12 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.consensus import Support, area_of, check_support
 from cadalign.estimation.joint_robust import (
     Consensus,
-    find_consensus,
+    robust_minima,
     robust_starts,
+    whitened_lengths,
     with_sightings,
 )
 from cadalign.estimation.lenses import ROUNDS, Lenses
@@ -28,13 +30,14 @@ from cadalign.solvers.joint.search import refine_joint, score_state, search_join
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
 _ITERATIONS = 100
+_MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
 
 
 Inits = Sequence[Alignment | None]
 """Given starts: one for each view of unknown motion, or one in the frame that the views share."""
 
 
-class Problem(NamedTuple):
+class JointProblem(NamedTuple):
     """Views of an object with a prior shape, in the terms of the user."""
 
     prior: ShapePrior
@@ -74,9 +77,15 @@ class Minimum(NamedTuple):
 
 
 def find_minima(
-    problem: Problem, init: Inits, ransac: RansacOptions | None
+    problem: JointProblem, init: Inits, ransac: RansacOptions | None
 ) -> tuple[list[Minimum], int, int]:
-    """Minima, the likeliest first, and the numbers of iterations and of starts."""
+    """Minima, the likeliest first, and the numbers of iterations and of starts.
+
+    Raises
+    ------
+    NoConsensusError
+        With ``ransac``: if the likeliest has no more support by keypoints than chance gives.
+    """
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
@@ -89,20 +98,24 @@ def find_minima(
             found, used = _search(evidence, starts)
         else:
             threshold = _thresholds(evidence, problem.lenses, ransac.max_reproj_error)
-            found, used = find_consensus(evidence, starts, threshold, settles=ransac.refine)
+            found, used = robust_minima(evidence, starts, threshold, settles=ransac.refine)
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
             Minimum(number, *each._replace(score=each.score + prior_score), problem.lenses)
             for each in found
         )
+    if ransac is not None and minima:
+        _check_support(problem, min(minima, key=lambda each: each.score), ransac.max_reproj_error)
     if problem.lenses.have_distortion:
         minima = [_relinearised(problem, each) for each in minima]
     minima.sort(key=lambda minimum: minimum.score)
     return minima, iterations, hypotheses
 
 
-def _starts(problem: Problem, shape: Shape, init: Inits, ransac: RansacOptions | None) -> Starts:
+def _starts(
+    problem: JointProblem, shape: Shape, init: Inits, ransac: RansacOptions | None
+) -> Starts:
     """Starts at every focal length of the grid, or at those that are known."""
     lenses = problem.lenses
     found = []
@@ -135,7 +148,7 @@ def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
     return found, iterations
 
 
-def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
+def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
     score = minimum.score - score_state(minimum.evidence, minimum.state)
     for _ in range(ROUNDS):
@@ -151,6 +164,36 @@ def _relinearised(problem: Problem, minimum: Minimum) -> Minimum:
             break
         minimum = minimum._replace(evidence=evidence, state=state, cost=cost, lenses=lenses)
     return minimum._replace(score=score_state(minimum.evidence, minimum.state) + score)
+
+
+def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float) -> None:
+    """Refuse a minimum that chance gives as well; few keypoints leave that to other evidence."""
+    views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
+    limits = _thresholds(best.evidence, best.lenses, 1.0)
+    errors = whitened_lengths(best.evidence, best.state) / limits
+    areas = np.array(
+        [
+            area_of(cast(FloatArray, view.points_2d), view.camera, max_reproj_error)
+            if len(view.keypoint_ids)
+            else 1.0
+            for view in views
+        ]
+    )
+    free = int(best.evidence.scales.free.sum())
+    size = 3 + min(free, _MOST_FREE) // 2 + (problem.lenses.count > 0)
+    supports = []
+    for pose in range(int(rig.pose.max()) + 1):
+        seen = np.flatnonzero(rig.pose == pose)
+        area = float(areas[seen].max())
+        own = np.isin(sightings.image, seen)
+        relative = errors[own] * np.sqrt(area / areas[sightings.image[own]])
+        count = sum(len(views[view].keypoint_ids) for view in seen.tolist())
+        if count > size:
+            supports.append(Support(relative, count, area))
+    if supports:
+        left_out = len(best.inliers) - len(errors)
+        score = float((errors**2).sum() + left_out * max_reproj_error**2)
+        check_support(supports, size, max_reproj_error=max_reproj_error, score=score, where="views")
 
 
 def _thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> FloatArray:

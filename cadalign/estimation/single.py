@@ -14,20 +14,19 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.estimates import curvature_of_rotations, is_other, stretch_of, with_boxes
+from cadalign.estimation.assemble import canonical_result, result_of_evidence
+from cadalign.estimation.estimates import curvature_of_rotations, with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
-from cadalign.estimation.prior import prior_of, rows_among
+from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
+from cadalign.estimation.result_parts import Alternative, FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import canonical_result
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.warnings import another_pose, misfits, weaknesses
+from cadalign.estimation.uncertainty.weakness import misfits, uncertainty_of, weaknesses
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
@@ -44,11 +43,20 @@ _LEAST_POINTS = 3
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and an exact model is given."""
-    if not isinstance(model, Model) or model.shape_sigma is not None or len(views) != 1:
+    return isinstance(model, Model) and model.shape_sigma is None and _has_keypoints_alone(views)
+
+
+def is_single(model: object, views: Sequence[View]) -> bool:
+    """True where nothing but the keypoints of one view and a learned shape is given."""
+    if not isinstance(model, ShapeModel) or not _has_keypoints_alone(views):
         return False
+    return views[0].sigma is not None and len(views[0].keypoint_ids) >= _LEAST_POINTS
+
+
+def _has_keypoints_alone(views: Sequence[View]) -> bool:
     view = views[0]
     others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
-    return all(each is None for each in others)
+    return len(views) == 1 and all(each is None for each in others)
 
 
 def align_plain(
@@ -56,24 +64,18 @@ def align_plain(
 ) -> Result:
     """The result of `fit`, with all keypoints of the model."""
     prior = prior_of(model)
-    points = cast(FloatArray, model.points_3d)
+    points, bounds = cast(FloatArray, model.points_3d), cast(FloatArray, model.bounds)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
+    shape = ("stretch", "scale_prior_sigma", "known_axis")
+    chosen = vars(options) | {name: getattr(model, name) for name in shape}
     found = fit(
         points[rows],
         cast(FloatArray, view.points_2d),
         view.camera,
-        sigma=view.sigma,
-        loss=options.loss,
-        loss_scale=options.loss_scale,
-        focal=options.focal,
-        focal_prior=options.focal_prior,
-        stretch=model.stretch,
-        scale_prior_sigma=model.scale_prior_sigma,
-        known_axis=model.known_axis,
+        **{**chosen, "sigma": view.sigma},
         ransac=ransac,
         confidences=view.confidences if ransac is not None else None,
     )
-    bounds = cast(FloatArray, model.bounds)
     found = replace(
         found,
         views=(replace(found.views[0], ids=view.keypoint_ids),),
@@ -86,17 +88,6 @@ def align_plain(
         own_bounds=bounds,
     )
     return found if model.symmetry is None else canonical_result(found, model.symmetry)
-
-
-def is_single(model: object, views: Sequence[View]) -> bool:
-    """True where nothing but the keypoints of one view and a learned shape is given."""
-    if not isinstance(model, ShapeModel) or len(views) != 1:
-        return False
-    view = views[0]
-    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
-    if view.sigma is None:
-        return False
-    return len(view.keypoint_ids) >= _LEAST_POINTS and all(each is None for each in others)
 
 
 def align_single(
@@ -112,7 +103,8 @@ def align_single(
         If no pose has all keypoints in front of the camera.
     """
     start = time.perf_counter()
-    rows = rows_among(model.ids, view.keypoint_ids, "views[0].ids")
+    prior = prior_of(model)
+    rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
     means, covariances, weights = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = _seen(view, rows, options)
@@ -136,67 +128,41 @@ def align_single(
     if covariances.any():
         turns = moments.covariance[:3, :3]
         turns += curvature_of_rotations(turns)
-    points, alignment = likely.points[0], _alignment(likely.poses[0])
-    in_camera = alignment.apply(points[rows])
-    of_mean = weights @ (means[:, -1] - means[:, -2])
-    alternatives = tuple(
-        Alternative(
-            _alignment(likely.poses[k]),
-            float(likelihoods[k]),
-            view.camera,
-            likely.points[k, :-2],
-            likely.points[k, -2:],
-        )
-        for k in range(1, len(likelihoods))
-        if is_other(moments, k)
-    )
-    warnings = weaknesses(alignment, moments.covariance)
+    alignment = _alignment(likely.poses[0])
+    in_camera = alignment.apply(likely.points[0][rows])
+    warnings = weaknesses(alignment, uncertainty_of(moments.covariance))
     if seen.loss == LINEAR:
         warnings += misfits(float(minima.costs[0]), 2 * len(rows) - POSE_UNKNOWNS)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component = int(minima.label[0])
-    statistics = Stated(
-        moments.covariance,
-        likely.covariances[0],
-        moments.of_points[:-2],
-        moments.of_seen[:-2],
-        warnings=(*warnings, *another_pose(alignment, alternatives)),
-        evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
-        degrees_of_freedom=model.degrees_of_freedom,
-        basis=SingleBasis(
-            model,
-            view,
-            options,
-            component,
-            minima.states[0, :POSE].copy(),
-            force_of(minima.states[0]),
-        ),
-    )
-    observed = cast(FloatArray, view.points_2d)
-    seen_in_view = ViewResult(
-        view.camera,
-        alignment,
-        view.keypoint_ids,
-        observed,
-        view.camera.project(in_camera) - observed,
-        np.ones(len(rows), dtype=bool),
-        statistics,
-    )
-    return Result(
-        views=(seen_in_view,),
-        ids=model.ids,
-        points_3d=points[:-2],
-        method="align",
-        statistics=statistics,
+    pose, force = minima.states[0, :POSE].copy(), force_of(minima.states[0])
+    return result_of_evidence(
+        model,
+        prior,
+        [view],
+        [
+            Alternative(_alignment(pose), float(likelihood), view.camera, points[:-2], points[-2:])
+            for pose, likelihood, points in zip(
+                likely.poses, likelihoods, likely.points, strict=True
+            )
+        ],
+        moments,
+        poses=[alignment],
+        cameras=[view.camera],
+        inliers=[np.ones(len(rows), dtype=bool)],
+        covariances=[moments.covariance],
+        lengths=likely.lengths[0],
+        statements={
+            "fisher_covariance": likely.covariances[0],
+            "warnings": warnings,
+            "evidence": (summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
+            "basis": SingleBasis(model, view, options, component, pose, force),
+        },
         known_axis=None,
         stretched_axes="",
         cost=float(minima.costs[0]),
-        alternatives=alternatives,
         stats=stats,
-        model=model,
         component=component,
-        own_bounds=points[-2:],
-        own_stretch=stretch_of(likely.lengths[0], of_mean),
     )
 
 

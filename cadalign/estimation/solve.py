@@ -5,18 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import CadalignError
+from cadalign.estimation.degeneracy import no_redundancy_error, solver_error
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
-from cadalign.estimation.problems import Problems, Solutions, check_sigmas, rays_of, whitening_of
-from cadalign.estimation.result_parts import Alternative
+from cadalign.estimation.problems import (
+    Problems,
+    Solutions,
+    check_sigmas,
+    full_covariance,
+    rays_of,
+    whitening_of,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, POSE_SIZE, TOO_FEW
-from cadalign.solvers.linear import aepnp_batch, aepnp_error, describe_plane, out_of_range_error
+from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
+from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.projection import pinhole_rays, reproject_batch
 
@@ -28,12 +36,12 @@ _LEAST_SIGMA = 1e-6
 _HIGHEST_QUANTILE = 0.95  # of the residuals' lengths that a robust sigma is taken from
 _EXACT_COST = 1e-6
 _TINY = 1e-100
+_NUMBER = int | float
 # Minima, iterations, hypotheses, undetermined unknown of a method that makes one guess.
 _ONE_MINIMUM = read_only(np.array([[1, 0, 1, -1]]))
 _NO_COST = read_only(np.array([[np.inf]]))
 
 Errors = dict[int, CadalignError]
-_FLAT = 1e-6  # extent across a line over that along it
 LEAST_LIKELIHOOD = 1e-3
 """Relative likelihood above which another minimum is reported as an alternative."""
 
@@ -310,64 +318,18 @@ def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
     return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)
 
 
-def solver_error(
-    status: int, undetermined: int, points_3d: FloatArray, options: FitOptions
-) -> DegenerateError:
-    """Convert a solver's status to an exception; ``undetermined`` is an unknown's number, or -1."""
-    if status == TOO_FEW:
-        method = f"the method {options.method!r}"
-        fix = f"give at least {options.min_points}"
-        if options.method == "optimal":
-            method = f"{options.unknowns} unknowns"
-            fix += ", fewer unknowns by stretch=, or a prior"
-        what = f"{len(points_3d)} keypoints are too few for {method}"
-        return DegenerateError(what, where="points_3d", fix=fix)
-    if status == OUT_OF_RANGE:
-        return out_of_range_error()
-    if status == NOT_FOUND:
-        return DegenerateError(
-            "no alignment with all keypoints in front of the camera was found",
-            where="points_2d",
-            fix="check that points_3d and points_2d correspond, row by row, and the camera",
-        )
-    if undetermined < 0:
-        return aepnp_error(points_3d)
-    reason = describe_plane(points_3d)
-    if undetermined < 3:
-        missing = "the rotation"
-    elif undetermined < 6:
-        missing = f"the translation along the camera's {'xyz'[undetermined - 3]}"
-    else:
-        missing = f"the scale s_{'xyz'[options.axis_order[undetermined - 5]]}"
-    if reason is None and 2 * len(points_3d) <= options.unknowns:
-        return DegenerateError(
-            f"no alignment reprojects the {len(points_3d)} keypoints exactly, and the nearest one "
-            f"leaves {missing} open",
-            where="points_3d",
-            fix="give more keypoints, or a scale_prior_sigma",
-        )
-    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
-    if undetermined < 3 and _are_on_a_line(points_3d):
-        fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
-    return DegenerateError(
-        f"{missing} is not determined: {reason or 'seen from there, the keypoints leave it open'}",
-        where="points_3d",
-        fix=fix,
-    )
+def solve_one(problems: Problems, options: FitOptions) -> Solutions:
+    """Solve the only problem.
 
-
-def _are_on_a_line(points: FloatArray) -> bool:
-    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(sizes[1] <= _FLAT * sizes[0])
-
-
-def no_redundancy_error(count: int) -> DegenerateError:
-    """The error for a noise that is to be estimated from keypoints that always fit."""
-    return DegenerateError(
-        f"{count} keypoints fit exactly, so their noise cannot be estimated",
-        where="sigma",
-        fix="give sigma, or more keypoints",
-    )
+    Raises
+    ------
+    CadalignError
+        If it has no solution.
+    """
+    solutions = solve(problems, options)
+    if solutions.errors:
+        raise solutions.errors[0]
+    return solutions
 
 
 def camera_of(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
@@ -376,24 +338,24 @@ def camera_of(problems: Problems, solutions: Solutions, minimum: int) -> Camera:
     return camera if solutions.focals is None else camera.with_focal(solutions.focals[0, minimum])
 
 
-def alternatives_of(
-    problems: Problems, solutions: Solutions, minima: int, options: FitOptions
-) -> tuple[Alternative, ...]:
-    """The other minima that are likely enough."""
-    costs = solutions.costs[0, :minima]
-    if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
-        # Costs are in units of sigma^2; below 1 they are those of exact fits.
-        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
-    else:
-        ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
-    points = problems.points_3d.copy()
-    return tuple(
-        Alternative(
-            Alignment.from_packed(solutions.poses[0, k]),
-            float(ratios[k]),
-            camera_of(problems, solutions, k),
-            points,
-        )
-        for k in range(1, minima)
-        if ratios[k] >= LEAST_LIKELIHOOD and np.isfinite(solutions.poses[0, k]).all()
-    )
+def fitted_fields(problems: Problems, solutions: Solutions, options: FitOptions) -> dict[str, Any]:
+    """The fields of `FittedKeypoints` of the only problem, which has a solution."""
+    sigma = covariance = None
+    if solutions.sigmas is not None:
+        sigma = float(solutions.sigmas[0])
+    elif options.method == "optimal" and isinstance(options.sigma, _NUMBER):
+        sigma = float(options.sigma)
+    if solutions.covariances is not None:
+        covariance = full_covariance(solutions.covariances[0], options.known_axis)
+    inliers = np.empty(len(problems.points_3d), dtype=bool)
+    inliers.fill(True)
+    return {
+        "points_3d": problems.points_3d.copy(),  # the caller may go on to change theirs
+        "residuals": solutions.residuals,
+        "inliers": inliers,
+        "alignment": Alignment.from_packed(solutions.poses[0, 0]),
+        "camera": camera_of(problems, solutions, 0),
+        "options": options,
+        "sigma": sigma,
+        "fisher_covariance": covariance,
+    }

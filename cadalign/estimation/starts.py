@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.metric_starts import metric_starts
-from cadalign.estimation.uncertainty.contradictions import count_equations
+from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
@@ -163,7 +163,10 @@ def _sized(
 
 
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
-    """Median of measured over predicted lengths, where every view has a pose of its own."""
+    """Median of measured over predicted lengths, where every view has a pose of its own.
+
+    NaN where nothing is measured.
+    """
     sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
     lengths, heights = evidence.lengths, evidence.heights
 
@@ -186,7 +189,8 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
         lengths.value / extents,
         heights.value / below,
     ]
-    return float(np.median(np.concatenate(ratios)))
+    told = np.concatenate(ratios)
+    return float(np.median(told)) if len(told) else float("nan")
 
 
 def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:

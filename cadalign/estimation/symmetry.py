@@ -10,9 +10,6 @@ deviations are stated without that step, such that points on the axis keep their
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, cast
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
@@ -20,11 +17,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
-
-if TYPE_CHECKING:
-    from cadalign.estimation.result import Result
-    from cadalign.estimation.uncertainty.stated import KeypointStatistics
-    from cadalign.geometry.symmetry_group import Equal, SymmetryGroup
+from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
 
 SAME_SQUARES = 9.0
 """Squared distance of rotations, in the best one's deviations, of equal estimates."""
@@ -45,8 +38,6 @@ def checked_symmetry(symmetry: object) -> Symmetry | None:
     if not isinstance(symmetry, Symmetry):
         what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
         raise InputError(what, where="symmetry", fix="see cadalign.Symmetry.from_dict")
-    from cadalign.geometry.symmetry_group import group_of  # only here: most models have none
-
     group_of(symmetry)
     return symmetry
 
@@ -111,8 +102,6 @@ def equal_text(
     """A clause about the alignments that are equal to one; empty without a symmetry."""
     if symmetry is None or symmetry.is_trivial:
         return ""
-    from cadalign.geometry.symmetry_group import group_of
-
     group = group_of(symmetry)
     found = group.canonical(alignment, held=held)
     if len(found.free) > 1:
@@ -124,39 +113,6 @@ def equal_text(
     if count == 1:
         return "the stretch leaves no other alignment equal under the model's symmetry"
     return f"{count} alignments are equal under the model's symmetry"
-
-
-def canonical_result(result: Result, symmetry: Symmetry) -> Result:
-    """A result of keypoints in one view as its canonical one, with alternatives that are others."""
-    from cadalign.geometry.symmetry_group import group_of
-
-    group = group_of(symmetry)
-    held = held_axes(result.stretched_axes)
-    best = group.canonical(result.alignment, held=held)
-    statistics = cast("KeypointStatistics", result.statistics)
-    covariance = statistics.fisher_covariance
-    if covariance is not None:
-        covariance = carried(covariance, result.alignment, best, held)
-    canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
-    statistics = replace(
-        statistics,
-        alignment=best.alignment,
-        points_3d=best.relabelled(statistics.points_3d),
-        fisher_covariance=covariance,
-        symmetry=symmetry,
-    )
-    return replace(
-        result,
-        views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
-        points_3d=best.relabelled(result.points_3d),
-        statistics=statistics,
-        alternatives=tuple(
-            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
-            for equal, each in canonical
-            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
-        ),
-        symmetry=symmetry,
-    )
 
 
 def carried(

@@ -12,6 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
+from cadalign.estimation.degeneracy import are_on_a_line
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
@@ -129,8 +130,7 @@ def _renumbered(text: str, used: Sequence[int]) -> str:
 def _is_on_a_line(points: FloatArray) -> bool:
     if len(points) < _LEAST_POINTS:
         return True
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extents[1] <= _ON_A_LINE * extents[0])
+    return are_on_a_line(points, _ON_A_LINE)
 
 
 def _camera_of(view: View, estimated: Mapping[Camera, Camera]) -> Camera:

@@ -4,8 +4,9 @@
 (n, 3) and ``rays`` (n, 2), the normalised image coordinates that `cadalign.Camera.normalize` gives.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.solvers.linear import aepnp
@@ -15,10 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["aepnp", "aepnp_paper", "ap4p", "epnp"]
 
-_LAZY = {"aepnp": "linear", "aepnp_paper": "paper", "ap4p": "minimal", "epnp": "opencv"}
+__getattr__ = lazy_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"cadalign.solvers.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __dir__() -> list[str]:
+    return __all__

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align, align_batch, fit
-from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.shapes.box_margins import BoxMargins
@@ -275,6 +275,15 @@ class TestOutliers:
         view = View(CAMERA, pixels, ids=order.tolist())
         result = align(model, view, ransac=RansacOptions())
         assert np.flatnonzero(~result.inliers).tolist() == [3]
+
+    def test_keypoints_scattered_at_random_have_no_consensus(self) -> None:
+        model, rng = spreads(0.01, count=16), np.random.default_rng(1)
+        for views in (1, 2):
+            scattered = [View(CAMERA, rng.uniform(0, 480, (16, 2))) for _ in range(views)]
+            with pytest.raises(NoConsensusError, match="no alignment is supported") as refusal:
+                align(model, scattered, ransac=RansacOptions())
+            assert 0 < refusal.value.inliers < 16 * views
+            assert np.isfinite(refusal.value.score)
 
 
 def test_a_batch_is_its_single_results_and_keeps_errors() -> None:

@@ -97,8 +97,8 @@ class MaskFit(NamedTuple):
 class _Candidate(NamedTuple):
     """A start, a surface, and where the rounds led.
 
-    ``evidence`` and ``state`` are those of the start, with displacements as modes where the surface
-    follows them; ``prior_score`` is that of the component.
+    ``evidence`` and ``state`` are those of the start, with displacements as modes: the surface
+    follows them. ``prior_score`` is that of the component.
     """
 
     start: Minimum
@@ -150,7 +150,6 @@ def fit_masks(
         _settled,
         likely[:most],
         keypoints,
-        follows_displacements=isinstance(model, Model),
         is_wide=is_open,
     )
     best: list[_Candidate] = []
@@ -209,7 +208,6 @@ def _settled(
     contours: list[ViewContour],
     surfaces: list[Surface],
     *,
-    follows_displacements: bool,
     is_wide: bool,
 ) -> list[_Candidate]:
     """Every start with the surface that fits best.
@@ -220,9 +218,7 @@ def _settled(
     for start in starts:
         own = score_state(start.evidence, start.state)
         extra = start.score - own if np.isfinite(start.score - own) else 0.0
-        evidence, state = start.evidence, start.state
-        if follows_displacements:
-            evidence, state = with_displacement_modes(evidence, state)
+        evidence, state = with_displacement_modes(start.evidence, start.state)
         tried = []
         for surface in surfaces:
             settled = settle(evidence, keypoints, state, contours, surface, is_wide=is_wide)

@@ -16,15 +16,13 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
-    is_exact,
     pose_and_border,
     pose_and_lengths,
-    widened,
     with_box,
 )
 from cadalign.estimation.model import Model, Size
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.prior import ShapePrior, is_exact, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

@@ -1,4 +1,6 @@
-"""Pieces of evidence that contradict the others, found by leaving each out.
+"""Warnings about a joint estimate, above all about evidence that contradicts the rest.
+
+Pieces that contradict the others are found by leaving each out.
 
 Without a piece the cost at the optimum falls by the square of what the others predict of it wrong,
 whitened by the covariance of the prediction and of the piece together: a chi-square of as many
@@ -7,15 +9,16 @@ degrees as the piece has redundant equations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.prior import has_scale_prior
+from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
+    count_equations,
     depth_factor,
     kept_rows,
     keypoints_in,
@@ -24,10 +27,12 @@ from cadalign.estimation.uncertainty.evidence import (
     without,
 )
 from cadalign.estimation.uncertainty.summary import name_of
+from cadalign.estimation.uncertainty.weakness import misfits, uncertainty_of, weaknesses
+from cadalign.geometry.alignment import Alignment
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, packed
 from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import refine_joint
+from cadalign.solvers.joint.search import refine_joint, search_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together
@@ -38,8 +43,6 @@ _WRONG_UNIT = 100.0  # factor between measured and expected depths
 _PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
 _MOST_TESTED = 40  # pieces
 _AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
-
-Search = Callable[[Evidence], tuple[State, float] | None]
 
 
 class _Trial(NamedTuple):
@@ -57,17 +60,10 @@ class _Determined(NamedTuple):
     rank: int
 
 
-def contradictions(
-    evidence: Evidence, state: State, cost: float, search: Search
-) -> tuple[str, ...]:
+def contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
     """Warnings that name the pieces which contradict the rest.
 
-    Parameters
-    ----------
-    evidence, state, cost
-        The estimate.
-    search
-        Finds the best estimate of other evidence.
+    ``state`` is the estimate, ``cost`` its cost.
     """
     every = pieces_of(evidence)
     pieces = [each for each in every if not _determines_its_pose(evidence, each)]
@@ -82,7 +78,7 @@ def contradictions(
     if not _is_suspicious(evidence, state, cost, pieces, level):
         return ()
     whole = _determined(evidence, state)
-    found = [_searched(evidence, state, cost, whole, piece, search) for piece in pieces]
+    found = [_searched(evidence, state, cost, whole, piece) for piece in pieces]
     suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
     if not suspects:
         return ()
@@ -168,7 +164,7 @@ def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
     if trial.piece.kind != "depth" or trial.piece.view is None:
         return ""
     factor = depth_factor(evidence, trial.state, trial.piece.view)
-    if 1 / _WRONG_UNIT < factor < _WRONG_UNIT:
+    if _is_plausible(factor):
         return ""
     return (
         f": the depths are {factor:.3g} times what is expected, are they in another unit "
@@ -182,12 +178,11 @@ def _searched(
     cost: float,
     whole: _Determined,
     piece: Piece,
-    search: Search,
 ) -> _Trial | None:
     """The trial of a piece by a search, since the estimate may lie far from that without it."""
     rest, start = without(evidence, state, piece)
     lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
-    found = search(rest)
+    found = _best_of(rest)
     if found is not None and found[1] < lower:
         refitted, lower = found
     return _trial(piece, whole, rest, refitted, cost, lower)
@@ -230,15 +225,62 @@ def _rank(hessian: FloatArray) -> int:
     return int((values > _LEAST_INFORMATION * len(values)).sum())
 
 
-def count_equations(evidence: Evidence) -> int:
-    """Number of equations, those of priors included; what is exact adds none."""
-    sightings = evidence.sightings
-    count = 2 * int((sightings.whitening[:, 2] > 0).sum())
-    count += int((sightings.whitening[sightings.whitening[:, 2] == 0].any(axis=1)).sum())
-    count += int((sightings.depths[:, 1] > 0).sum())
-    count += 2 * len(evidence.directions.image) + len(evidence.lengths.weight)
-    count += len(evidence.heights.weight) + len(evidence.planes.weight)
-    count += len(evidence.shape.modes)
-    if has_scale_prior(evidence.scales):
-        count += int(np.linalg.matrix_rank(evidence.scales.precision))
-    return count
+def warnings_of(
+    evidence: Evidence,
+    state: State,
+    cost: float,
+    pose: Alignment,
+    covariance: FloatArray,
+) -> tuple[str, ...]:
+    """Warnings about rotation, lengths and distance, and about residuals beyond their sigma."""
+    warnings = [*weaknesses(pose, uncertainty_of(covariance))]
+    contradicting = contradictions(evidence, state, cost)
+    warnings.extend(_wrong_units(evidence, state, contradicting))
+    warnings.extend(contradicting)
+    if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
+        redundancy = count_equations(evidence) - len(evidence.shape.modes)
+        redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
+        warnings.extend(misfits(cost, redundancy))
+    return tuple(warnings)
+
+
+def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str]) -> Iterator[str]:
+    """Warnings about depths in another unit than the model and the rest of the evidence.
+
+    The estimate may follow the depths, which then makes the object too large, or leave them out.
+    """
+    size = float(np.exp(state.log_scales.mean()))
+    is_told = not _is_plausible(size) and (contradicting or _is_sized_by_depth_alone(evidence))
+    ask = "are the depths in another unit (millimetres for metres)?"
+    for piece in pieces_of(evidence):
+        name = name_of(*piece)
+        if piece.kind != "depth" or any(name in text for text in contradicting):
+            continue
+        factor = depth_factor(evidence, state, cast(int, piece.view))
+        if not _is_plausible(factor):
+            yield f"{name}: the depths are {factor:.2g} times what is expected: {ask}"
+        elif is_told:
+            yield f"{name}: the object is {size:.2g} times as large as the model: {ask}"
+
+
+def _is_plausible(factor: float) -> bool:
+    return 1 / _WRONG_UNIT < factor < _WRONG_UNIT
+
+
+def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
+    has_depth = len(evidence.planes.point) or (evidence.sightings.depths[:, 1] > 0).any()
+    others = len(evidence.lengths.value) + len(evidence.heights.value)
+    is_rig = (np.bincount(evidence.rig.pose) > 1).any()
+    return bool(has_depth and not others and not is_rig)
+
+
+def _best_of(evidence: Evidence) -> tuple[State, float] | None:
+    """The best estimate of the evidence, and its cost."""
+    starts = starts_of(evidence)
+    if not len(starts.poses):
+        return None
+    minima, _ = search_joint(evidence, *starts)
+    if not minima.states:
+        return None
+    best = int(np.argmin(minima.costs))
+    return minima.states[best], float(minima.costs[best])

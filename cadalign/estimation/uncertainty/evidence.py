@@ -14,6 +14,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.estimation.pack import SingleBasis
+from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
 from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.geometry.camera import Camera
@@ -127,6 +128,20 @@ def _unlinked(evidence: Evidence, state: State, view: int) -> tuple[Evidence, St
     pose[view] = len(state.poses)
     rig = Rig(evidence.rig.cam_from_rig, pose)
     return evidence._replace(rig=rig), state._replace(poses=np.vstack([state.poses, own]))
+
+
+def count_equations(evidence: Evidence) -> int:
+    """Number of equations, those of priors included; what is exact adds none."""
+    sightings = evidence.sightings
+    count = 2 * int((sightings.whitening[:, 2] > 0).sum())
+    count += int((sightings.whitening[sightings.whitening[:, 2] == 0].any(axis=1)).sum())
+    count += int((sightings.depths[:, 1] > 0).sum())
+    count += 2 * len(evidence.directions.image) + len(evidence.lengths.weight)
+    count += len(evidence.heights.weight) + len(evidence.planes.weight)
+    count += len(evidence.shape.modes)
+    if has_scale_prior(evidence.scales):
+        count += int(np.linalg.matrix_rank(evidence.scales.precision))
+    return count
 
 
 def summaries_of(
@@ -324,9 +339,11 @@ def _deviations(evidence: Evidence, state: State) -> Uncertainty:
     distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))
     x, y, z = (_or_infinite(each, _UNKNOWN_SCALE * distance) for each in deviations[3:6])
-    sx, sy, sz, *focal = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:])
-    rotation = _or_infinite(rotation, _UNKNOWN_ROTATION_DEG)
-    return Uncertainty(rotation, (x, y, z), (sx, sy, sz), focal=focal[0] if focal else 0.0)
+    sx, sy, sz = (_or_infinite(each, _UNKNOWN_SCALE) for each in deviations[6:9])
+    focal = _or_infinite(float(deviations[9:].sum()), _UNKNOWN_SCALE)  # none where it is known
+    return Uncertainty(
+        _or_infinite(rotation, _UNKNOWN_ROTATION_DEG), (x, y, z), (sx, sy, sz), focal
+    )
 
 
 def _or_infinite(deviation: float, limit: float) -> float:

@@ -6,9 +6,9 @@ An outlier is far from where the other keypoints predict it, by the covariance o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +16,11 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result import Result
+from cadalign.estimation.problems import pack_one
+from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
-from cadalign.estimation.uncertainty.posterior import Likelihood
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
+from cadalign.estimation.uncertainty.likelihood import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.summary import Misfit
 from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -29,76 +30,30 @@ from cadalign.solvers.projection import ray_derivatives
 _FALSE_ALARMS = 0.004
 _FALSE_STRETCH_ALARMS = 0.002
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
-_MOST_NAMED = 5
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _UNKNOWNS = 10  # of a result's covariance, focal length included
 Rows = npt.NDArray[np.intp]
-FitRows = Callable[[Rows, bool], Result]
+
+
+class PoseFit(Protocol):
+    """A fit of keypoints, such as `cadalign.Result`."""
+
+    @property
+    def alignment(self) -> Alignment: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def fisher_covariance(self) -> FloatArray | None: ...
+
+
+FitRows = Callable[[Rows, bool], PoseFit]
 """Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
 True."""
 
 _FALSE_OUTLIER_ALARMS = 0.01
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """Residuals that are larger than the standard deviations of the keypoints explain.
-
-    Parameters
-    ----------
-    chi_square : float
-        Sum of the losses on the whitened residuals: of their squares, with the linear loss.
-    redundancy : int
-        What is expected of it: the equations minus the unknowns.
-    free_scale : tuple of 3 float, optional
-        The scales without the constraints on them (stretch=, scale_prior_sigma), where it is these
-        that contradict the keypoints.
-    outliers : mapping of int to float
-        The keypoints without which the others fit, and their distances from where the others put
-        them [px]; empty where no few keypoints are to blame.
-    """
-
-    chi_square: float
-    redundancy: int
-    free_scale: tuple[float, float, float] | None = None
-    outliers: Mapping[int, float] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON."""
-        outliers = [{"row": row, "distance_px": px} for row, px in self.outliers.items()]
-        return {
-            "chi_square": self.chi_square,
-            "redundancy": self.redundancy,
-            "free_scale": None if self.free_scale is None else list(self.free_scale),
-            "outliers": outliers,
-        }
-
-    def __str__(self) -> str:
-        if self.free_scale is not None:
-            scale = ", ".join(f"{value:.3g}" for value in self.free_scale)
-            return (
-                f"the keypoints contradict the constraint on the stretch: without it they fit "
-                f"better, with the scale ({scale})"
-            )
-        ratio = math.sqrt(self.chi_square / self.redundancy)
-        text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
-        if not self.outliers:
-            return text + (
-                "the keypoints do not fit the model together (wrong pairs, model, stretch or "
-                "camera), or sigma is too small; sigma=None suits a model that is only similar"
-            )
-        worst = sorted(self.outliers, key=lambda row: -self.outliers[row])[:_MOST_NAMED]
-        named = ", ".join(f"{row} ({self.outliers[row]:.3g} px)" for row in worst)
-        if len(worst) < len(self.outliers):
-            named += f" and {len(self.outliers) - len(worst)} more"
-        one = len(self.outliers) == 1
-        return text + (
-            f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
-            "(counted from 0, with the distance from where those put it)"
-        )
-
-
-def find_misfit(result: KeypointStatistics) -> Misfit | None:
+def find_misfit(result: FittedKeypoints) -> Misfit | None:
     """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
 
     The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
@@ -120,7 +75,7 @@ def find_misfit(result: KeypointStatistics) -> Misfit | None:
     return Misfit(tested.chi_square, tested.redundancy, outliers=_outliers(tested))
 
 
-def unverified_stretch(result: KeypointStatistics) -> str | None:
+def unverified_stretch(result: FittedKeypoints) -> str | None:
     """Warn about scales held at 1 where the keypoints would not contradict another value.
 
     None where nothing is held, sigma is estimated, or the free scales are not determined at all,
@@ -158,7 +113,7 @@ class _Tested:
     chi_square: float
 
     @classmethod
-    def of(cls, result: KeypointStatistics) -> _Tested:
+    def of(cls, result: FittedKeypoints) -> _Tested:
         rows = np.flatnonzero(result.inliers)
         points_3d, residuals = result.points_3d[rows], result.residuals[rows]
         projected = result.camera.project(result.alignment.apply(points_3d))
@@ -188,12 +143,13 @@ class _Tested:
         redundancy = self.redundancy
         return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
 
-    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> Result:
+    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FittedKeypoints:
         """Fit some of the keypoints anew, with changed options."""
-        from cadalign.estimation.fit import fit
-
-        chosen = {**vars(self.options), "sigma": self.covariances[rows], **changes}
-        return fit(self.points_3d[rows], self.points_2d[rows], self.camera, **chosen)
+        options = replace(self.options, sigma=self.covariances[rows], **changes)
+        problems = pack_one(self.points_3d[rows], self.points_2d[rows], self.camera)
+        with np.errstate(all="ignore"):
+            solutions = solve_one(problems, options)
+        return FittedKeypoints(**fitted_fields(problems, solutions, options))
 
 
 def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
@@ -203,7 +159,7 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
         return None
     try:
         free = tested.fit(stretch=None, scale_prior_sigma=None)
-        decrease = tested.chi_square - _retested(free).chi_square
+        decrease = tested.chi_square - _Tested.of(free).chi_square
     except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
         return None
     if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
@@ -212,16 +168,10 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _retested(result: Result) -> _Tested:
-    """The test of another fit."""
-    assert isinstance(result.statistics, KeypointStatistics)
-    return _Tested.of(result.statistics)
-
-
 def _outliers(tested: _Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
-    def fit_rows(rows: Rows, robust: bool) -> Result:
+    def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
         loss = "cauchy" if robust else "linear"
         return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
 
@@ -236,7 +186,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
     rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
-    if not _retested(rest).passes:
+    if not _Tested.of(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}
 
@@ -356,13 +306,10 @@ class _Search:
         squares = _squares(residuals, expected) / 2
         return squares / self.level.variance(total, redundancy), redundancy
 
-    def residuals(self, result: Result) -> FloatArray:
+    def residuals(self, result: PoseFit) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
         in_camera = result.alignment.apply(self.points_3d)
-        ahead = in_camera[:, 2] > 0
-        residuals = np.full((len(in_camera), 2), np.inf)
-        residuals[ahead] = result.camera.project(in_camera[ahead]) - self.points_2d[ahead]
-        return residuals
+        return result.camera.project_where_ahead(in_camera) - self.points_2d
 
 
 def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -11,21 +11,18 @@ centroid, and the logarithms of scales and focal length. The draws are the same 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import distinct_rows, pixel_information
+from cadalign.estimation.problems import distinct_rows
 from cadalign.estimation.uncertainty.distributions import chi_square_quantile, f_quantile
+from cadalign.estimation.uncertainty.likelihood import FittedKeypoints, Likelihood
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
-
-if TYPE_CHECKING:
-    from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
@@ -45,7 +42,7 @@ _SEED = 0
 _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 
 
-def posterior_covariance(result: KeypointStatistics) -> FloatArray:
+def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None
     options = result.options
@@ -82,7 +79,7 @@ class _Chart:
     in_camera: FloatArray  # the center
 
     @classmethod
-    def of(cls, result: KeypointStatistics) -> _Chart:
+    def of(cls, result: FittedKeypoints) -> _Chart:
         points = result.points_3d[result.inliers]
         center = points.mean(axis=0)
         (in_camera,) = result.alignment.apply(center[None])
@@ -155,7 +152,7 @@ def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptio
 
 @np.errstate(all="ignore")  # draws that overflow have no weight
 def _sample(
-    result: KeypointStatistics, first: FloatArray, likelihood: Likelihood, widening: float
+    result: FittedKeypoints, first: FloatArray, likelihood: Likelihood, widening: float
 ) -> FloatArray | None:
     """A covariance (m, m) by draws from the posterior, or None where the proposals miss it.
 
@@ -256,69 +253,3 @@ def _log_haar_density(vectors: FloatArray) -> FloatArray:
     with np.errstate(divide="ignore"):
         density = np.sinc(angles / (2 * np.pi)) ** 2
         return np.where(angles < np.pi, np.log(density), -np.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class Likelihood:
-    """Negative log likelihoods, times two, of residuals in pixels.
-
-    Parameters
-    ----------
-    information : (2, 2) or (n, 2, 2) float
-        Inverse covariance of the keypoints [1 / px^2].
-    options : FitOptions
-        Loss and priors.
-    """
-
-    information: FloatArray
-    options: FitOptions
-
-    @classmethod
-    def of(cls, result: KeypointStatistics) -> Likelihood:
-        """The likelihood of the inliers that the result maximises, at its estimated sigma."""
-        options = result.options
-        sigma: Any = result.sigma if options.sigma is None else options.sigma
-        if np.ndim(sigma) == 0:
-            return cls(np.eye(2) / float(sigma) ** 2, options)
-        information = pixel_information(sigma, len(result.inliers))
-        return cls(information[result.inliers], options)
-
-    def squares(self, residuals: FloatArray) -> FloatArray:
-        """Squared whitened lengths (..., n) of residuals (..., n, 2) [px]."""
-        u, v = residuals[..., 0], residuals[..., 1]
-        (a, b), (_, c) = self.information.T
-        squares = u * u * a + v * v * c
-        if b.any():
-            squares += 2 * b * u * v
-        return np.asarray(squares)
-
-    def losses(self, residuals: FloatArray) -> FloatArray:
-        """The loss (n,) on each of the residuals (n, 2) [px], at most its whitened square."""
-        return bent(self.squares(residuals), self.options.loss, self.options.loss_scale)
-
-    def weights(self, residuals: FloatArray) -> FloatArray:
-        """Weights (n,) of the squares that stand for the loss near residuals (n, 2) [px]."""
-        squares, bend = self.squares(residuals), self.options.loss_scale
-        if self.options.loss == "huber":
-            return np.asarray(bend / np.maximum(np.sqrt(squares), bend))
-        if self.options.loss == "cauchy":
-            return np.asarray(1 / (1 + squares / bend**2))
-        return np.ones(len(squares))
-
-    def penalties(self, log_scales: FloatArray, log_focals: FloatArray) -> FloatArray:
-        """Squared deviations (k,) from the priors, of the log scales (k, 3) and focals (k,)."""
-        total = self.options.prior_weight * (log_scales**2).sum(axis=1)
-        prior = self.options.focal_prior
-        if prior is not None:
-            total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2
-        return np.asarray(total)
-
-
-def bent(squares: FloatArray, loss: str, bend: float) -> FloatArray:
-    """The loss, linear, huber or cauchy, on squared whitened lengths of any shape."""
-    if loss == "huber":
-        linear = 2 * bend * np.sqrt(squares) - bend**2
-        return np.asarray(np.where(squares <= bend**2, squares, linear))
-    if loss == "cauchy":
-        return np.asarray(bend**2 * np.log1p(squares / bend**2))
-    return squares

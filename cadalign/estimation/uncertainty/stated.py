@@ -8,23 +8,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
-from cadalign.estimation.options import FitOptions
+from cadalign.estimation.options import pixel_information
 from cadalign.estimation.symmetry import held_axes, without_free_turns
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
-from cadalign.estimation.uncertainty.weakness import uncertainty_of, warnings_of
+from cadalign.estimation.uncertainty.likelihood import FittedKeypoints
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
+from cadalign.estimation.uncertainty.weakness import uncertainty_of, weaknesses_of_keypoints
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.evidence import AnyBasis
-    from cadalign.estimation.uncertainty.misfit import Misfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,28 +47,8 @@ class Stated:
 
 
 @dataclass(frozen=True, eq=False)
-class KeypointStatistics:
-    """Statements about an exact or stretched model's keypoints in one view.
-
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        The keypoints that the view shows, on the model.
-    residuals, inliers, alignment, camera, sigma, symmetry
-        As of `cadalign.Result`.
-    options : FitOptions
-    fisher_covariance : (9, 9) or (10, 10) float, optional
-    """
-
-    points_3d: FloatArray
-    residuals: FloatArray
-    inliers: BoolArray
-    alignment: Alignment
-    camera: Camera
-    options: FitOptions
-    sigma: float | None = None
-    fisher_covariance: FloatArray | None = None
-    symmetry: Symmetry | None = None
+class KeypointStatistics(FittedKeypoints):
+    """Statements about an exact or stretched model's keypoints in one view."""
 
     points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
 
@@ -84,8 +63,6 @@ class KeypointStatistics:
         if self.symmetry is None:
             return covariance
         held = held_axes(self.options.stretched_axes)
-        from cadalign.geometry.symmetry_group import group_of
-
         best = group_of(self.symmetry).canonical(self.alignment, held=held)
         return without_free_turns(covariance, best)
 
@@ -105,7 +82,7 @@ class KeypointStatistics:
             return ()
         kept, options = self.points_3d[self.inliers], self.options
         is_estimated = options.focal == "estimate"
-        return self._contradictions() + warnings_of(
+        return self._contradictions() + weaknesses_of_keypoints(
             kept,
             self.alignment,
             uncertainty_of(self.covariance),
@@ -125,11 +102,9 @@ class KeypointStatistics:
     @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:
         """Agreement of the keypoints that the estimate rests on."""
-        from cadalign.estimation.problems import pixel_information  # takes the compiler along
-
         residuals = self.residuals[self.inliers]
         squares = (residuals * residuals).sum()
-        sigma: Any = self.sigma if self.options.sigma is None else self.options.sigma
+        sigma = self.chosen_sigma
         if np.ndim(sigma) == 0:
             whitened = squares / (1.0 if sigma is None else float(sigma)) ** 2
         else:

@@ -1,8 +1,11 @@
-"""What a result tells about each piece of evidence: summary, contribution, residuals of masks."""
+"""Statements of a result about its evidence: summary, contribution, misfit, residuals of masks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +22,7 @@ _FIELDS = {
     "camera height": "camera_height",
     "rig": "cam_from_rig",
 }
+_MOST_NAMED = 5  # outliers, in a sentence
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,64 @@ def name_of(kind: str, view: int | None) -> str:
     ('size', 'views[0].depth')
     """
     return kind if view is None else f"views[{view}].{_FIELDS[kind]}"
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Residuals that are larger than the standard deviations of the keypoints explain.
+
+    Parameters
+    ----------
+    chi_square : float
+        Sum of the losses on the whitened residuals: of their squares, with the linear loss.
+    redundancy : int
+        What is expected of it: the equations minus the unknowns.
+    free_scale : tuple of 3 float, optional
+        The scales without the constraints on them (stretch=, scale_prior_sigma), where it is these
+        that contradict the keypoints.
+    outliers : mapping of int to float
+        The keypoints without which the others fit, and their distances from where the others put
+        them [px]; empty where no few keypoints are to blame.
+    """
+
+    chi_square: float
+    redundancy: int
+    free_scale: tuple[float, float, float] | None = None
+    outliers: Mapping[int, float] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, for JSON."""
+        outliers = [{"row": row, "distance_px": px} for row, px in self.outliers.items()]
+        return {
+            "chi_square": self.chi_square,
+            "redundancy": self.redundancy,
+            "free_scale": None if self.free_scale is None else list(self.free_scale),
+            "outliers": outliers,
+        }
+
+    def __str__(self) -> str:
+        if self.free_scale is not None:
+            scale = ", ".join(f"{value:.3g}" for value in self.free_scale)
+            return (
+                f"the keypoints contradict the constraint on the stretch: without it they fit "
+                f"better, with the scale ({scale})"
+            )
+        ratio = math.sqrt(self.chi_square / self.redundancy)
+        text = f"the residuals are {ratio:.2g} times as large as sigma explains: "
+        if not self.outliers:
+            return text + (
+                "the keypoints do not fit the model together (wrong pairs, model, stretch or "
+                "camera), or sigma is too small; sigma=None suits a model that is only similar"
+            )
+        worst = sorted(self.outliers, key=lambda row: -self.outliers[row])[:_MOST_NAMED]
+        named = ", ".join(f"{row} ({self.outliers[row]:.3g} px)" for row in worst)
+        if len(worst) < len(self.outliers):
+            named += f" and {len(self.outliers) - len(worst)} more"
+        one = len(self.outliers) == 1
+        return text + (
+            f"keypoint{'' if one else 's'} {named} {'does' if one else 'do'} not fit the others "
+            "(counted from 0, with the distance from where those put it)"
+        )
 
 
 @dataclass(frozen=True, eq=False)

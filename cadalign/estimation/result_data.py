@@ -1,0 +1,359 @@
+"""Values of a result: alignment, residuals of every view, uncertainty, alternatives, mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import InputError
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result_parts import (
+    NO_STATS,
+    Alternative,
+    FitStats,
+    ViewResult,
+    extent,
+    rms_of,
+)
+from cadalign.estimation.symmetry import equal_text, held_axes
+from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
+from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
+
+if TYPE_CHECKING:
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.uncertainty.summary import (
+        EvidenceSummary,
+        MaskResiduals,
+        Misfit,
+    )
+    from cadalign.geometry.mesh import Mesh
+    from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import NearestShape
+
+
+@dataclass(frozen=True, eq=False)
+class ResultData:
+    """Pose, stretch and shape of an object, with their uncertainty: the values of a result.
+
+    Parameters
+    ----------
+    views : tuple of ViewResult
+        Camera, pose, residuals and inliers of every view.
+    ids : tuple of int or str
+        Ids or names of the m keypoints; of `cadalign.fit`, their rows.
+    points_3d : (m, 3) float
+        All keypoints of the model as they are on the object, also those that no view shows, in the
+        model's frame and before its stretch: of an exact model, as given; with a symmetry, turned
+        by the one that leads to this alignment.
+    method : str
+        The method that found it: that of `cadalign.fit`, "align" where all evidence was estimated
+        together.
+    statistics : Statistics
+        What is stated of the uncertainty.
+    known_axis : {"x", "y", "z"}, optional
+        The model's axis whose scale was taken as 1; None where all of them are estimated, or none.
+    stretched_axes : str
+        The axes whose scale was estimated.
+    focal : {"known", "estimate"}
+        The cameras' focal length was taken as right, or estimated.
+    focal_prior : FocalPrior, optional
+        Prior on the estimated focal length.
+    sigma : float, optional
+        Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
+        its own.
+    cost : float, optional
+        -2 log likelihood of the evidence, with its priors, but for constants: the sum of whitened
+        squares, or of losses. None for methods that are not statistical.
+    alternatives : tuple of Alternative
+        Other estimates that explain the evidence as well: with 4 points all other exact solutions,
+        otherwise minima whose likelihood is at least 1/1000 of the best one's.
+    stats : FitStats
+    options : FitOptions, optional
+        Those of `cadalign.fit`.
+    symmetry : Symmetry, optional
+        The model's, as given: of all equal alignments this is the canonical one.
+    model : Model or ShapeModel, optional
+        The model of `cadalign.align`; None for a result that was read from a file.
+    component : int
+        Number of the mixture's component that the object belongs to.
+    rig_from_model : Alignment, optional
+        The alignment in the frame that views with ``cam_from_rig`` share; None without them.
+    mask_residuals : tuple of MaskResiduals or None
+        Agreement of the contour of every view's mask with the estimate; empty without masks.
+    own_bounds, own_stretch, own_equal : optional
+        ``bounds``, ``stretch`` and ``equal_under_symmetry`` where they do not follow.
+    """
+
+    views: tuple[ViewResult, ...]
+    ids: tuple[Hashable, ...]
+    points_3d: FloatArray
+    method: str
+    statistics: Statistics = field(repr=False)
+    known_axis: str | None = "x"
+    stretched_axes: str = "yz"
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
+    sigma: float | None = None
+    cost: float | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    stats: FitStats = NO_STATS
+    options: FitOptions | None = None
+    symmetry: Symmetry | None = None
+    model: Model | ShapeModel | None = None
+    component: int = 0
+    rig_from_model: Alignment | None = None
+    mask_residuals: tuple[MaskResiduals | None, ...] = ()
+    own_bounds: FloatArray | None = None
+    own_stretch: FloatArray | None = None
+    own_equal: str | None = None
+
+    @property
+    def alignment(self) -> Alignment:
+        """Pose in the first view's camera, and scale.
+
+        ``alignment.apply(points_3d)`` are the object's keypoints in that camera's frame.
+        """
+        return self.views[0].alignment
+
+    @property
+    def camera(self) -> Camera:
+        """The first view's camera; with the estimated focal length, where that was unknown."""
+        return self.views[0].camera
+
+    @property
+    def poses(self) -> tuple[Alignment, ...]:
+        """The alignment in every view's camera."""
+        return tuple(view.alignment for view in self.views)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera of every view."""
+        return tuple(view.camera for view in self.views)
+
+    @property
+    def observed(self) -> tuple[FloatArray, ...]:
+        """Observed keypoints (n_v, 2) of every view [px]."""
+        return tuple(view.points_2d for view in self.views)
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Projected minus observed keypoints (n, 2) of all views, one after the other [px].
+
+        Infinite for keypoints that were rejected and lie behind the camera.
+        """
+        if len(self.views) == 1:
+            return self.views[0].residuals
+        return np.concatenate([view.residuals for view in self.views])
+
+    @property
+    def inliers(self) -> BoolArray:
+        """Marks the keypoints (n,) of all views that the estimate rests on."""
+        if len(self.views) == 1:
+            return self.views[0].inliers
+        return np.concatenate([view.inliers for view in self.views])
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of the inliers' residuals [px]."""
+        return rms_of(self.residuals, self.inliers)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance (9, 9) or (10, 10) of the errors, calibrated.
+
+        Of the rotation vector in the first camera's frame [rad], the translation [model units], the
+        logarithms of the object's lengths along x, y, z and, where it was estimated, of the focal
+        length; zero for what is held. None for methods that are not statistical.
+
+        Of the keypoints of an exact model in one view it is the second moments of the posterior
+        about the alignment, from some thousand draws (always the same), scaled such that the 95 %
+        ellipsoid holds what the likelihood ratio does not reject at 5 %. Where sigma was estimated,
+        it is widened for the few degrees of freedom of that estimate. It does not reach to the
+        ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance`` but for that widening.
+
+        Of other evidence it is the inverse information of all evidence and priors, calibrated for
+        learned shapes, and where other estimates are likely too, it holds their distance.
+
+        With a symmetry, rotations about its axes count nothing.
+        """
+        return self.statistics.covariance
+
+    @property
+    def fisher_covariance(self) -> FloatArray | None:
+        """Inverse of the Fisher information at the optimum, in the form of ``covariance``.
+
+        The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
+        not statistical, and where a file does not tell it.
+        """
+        return self.statistics.fisher_covariance
+
+    @property
+    def std(self) -> Uncertainty | None:
+        """Standard deviations from ``covariance``; None for methods that have none."""
+        return None if self.covariance is None else uncertainty_of(self.covariance)
+
+    @property
+    def degrees_of_freedom(self) -> float | None:
+        """Of the t distribution of the errors, whose covariance the stated ones are.
+
+        None if they are Gaussian. `radius` depends on it.
+        """
+        return self.statistics.degrees_of_freedom
+
+    @cached_property
+    def _of_points(self) -> tuple[FloatArray, FloatArray] | None:
+        if self.covariance is None:
+            return None
+        return points_covariances(self.points_3d, self.alignment, self.covariance)
+
+    @property
+    def points_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the model's frame, with its stretch."""
+        stated = self.statistics.points_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[0]
+
+    @property
+    def points_cam_covariance(self) -> FloatArray | None:
+        """Covariance (m, 3, 3) of each keypoint in the first camera's frame."""
+        stated = self.statistics.points_cam_covariance
+        return stated if stated is not None or self._of_points is None else self._of_points[1]
+
+    @property
+    def misfit(self) -> Misfit | None:
+        """Result of a chi-square test of residuals that the given sigma does not explain.
+
+        None if they pass (of right data, 99.5 % or more do), for an estimated sigma, and for
+        methods that are not statistical. Of several pieces of evidence, ``warnings`` tell it.
+        """
+        return self.statistics.misfit
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about what the evidence leaves undetermined, and what contradicts the rest."""
+        return self.statistics.warnings
+
+    @property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of every piece of evidence with the estimate."""
+        return self.statistics.evidence
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Least and greatest coordinates (2, 3) of the object in the model's frame.
+
+        Those of the keypoints where the model has no others.
+        """
+        return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
+
+    @property
+    def box(self) -> Box:
+        """The object's box in the first camera's frame."""
+        return Box.from_model(self.bounds, self.alignment)
+
+    @property
+    def stretch(self) -> FloatArray:
+        """Lengths (3,) of the object over the model's or, for a learned shape, the mean's."""
+        return self.alignment.scale if self.own_stretch is None else self.own_stretch
+
+    @property
+    def equal_under_symmetry(self) -> str:
+        """Clause about the alignments that are equal under the model's symmetry; empty without."""
+        if self.own_equal is not None:
+            return self.own_equal
+        return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
+
+    @property
+    def probability(self) -> float:
+        """Probability of the estimate itself rather than of one of its alternatives."""
+        return 1 / (1 + sum(other.relative_likelihood for other in self.alternatives))
+
+    def radius(self, probability: float, *, dimension: int = 1) -> float:
+        """Radius, in stated deviations, of the region that holds the truth with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        dimension : int
+            Number of coordinates that the region has: 1 for an interval, 3 for a rotation or a
+            keypoint, whose regions are ellipsoids.
+
+        Raises
+        ------
+        InputError
+            If the probability is not between 0 and 1, or the dimension is not positive.
+        """
+        from cadalign.shapes.tails import radius_of
+
+        if not 0 < probability < 1:
+            raise InputError(f"{probability!r} is not between 0 and 1", where="probability")
+        if dimension < 1:
+            raise InputError(f"{dimension!r} is not a positive number", where="dimension")
+        return radius_of(probability, dimension, self.degrees_of_freedom)
+
+    def mesh(self, mesh: Mesh | None = None) -> Mesh:
+        """A model's mesh, warped so that its keypoints are the object's.
+
+        Parameters
+        ----------
+        mesh : Mesh, optional
+            By default that of the `Model`. For a learned shape, that of `nearest`. Where the model
+            is not known, it is taken for the object's own.
+
+        Returns
+        -------
+        Mesh
+            In the model's frame, before the stretch; ``alignment`` places it.
+
+        Raises
+        ------
+        InputError
+            If there is no mesh to warp.
+        """
+        from cadalign.shapes.model import ShapeModel
+        from cadalign.shapes.warp import warp_mesh
+
+        model = self.model
+        if isinstance(model, ShapeModel):
+            if mesh is None:
+                fix = "give that of the training model `nearest`, read from its mesh_path"
+                raise InputError("a learned shape has no mesh of its own", where="mesh", fix=fix)
+            source = self.nearest.points_3d
+            known = np.isfinite(source).all(axis=1)
+            return warp_mesh(mesh, source[known], self.points_3d[known], bounds=self.bounds)
+        given = mesh if mesh is not None or model is None else model.mesh
+        if given is None:
+            raise InputError("the model has no mesh", where="mesh", fix="give one")
+        if model is None or model.shape_sigma is None:
+            return given
+        return warp_mesh(given, model.points_3d, self.points_3d, bounds=self.bounds)
+
+    def known_mesh(self, mesh: Mesh | None) -> Mesh | None:
+        """As `mesh`; None where there is no mesh to warp."""
+        known = mesh if mesh is not None else getattr(self.model, "mesh", None)
+        return None if known is None else self.mesh(known)
+
+    @property
+    def nearest(self) -> NearestShape:
+        """The training model of a learned shape whose keypoints are nearest to the object's.
+
+        Raises
+        ------
+        InputError
+            If the model is not learned, or its training models are not known.
+        """
+        from cadalign.shapes.model import ShapeModel
+
+        if not isinstance(self.model, ShapeModel):
+            raise InputError("only a learned shape has training models", where="model")
+        return self.model.nearest(self.points_3d)

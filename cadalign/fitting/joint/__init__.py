@@ -1,1 +1,0 @@
-"""Former name of parts of `cadalign.estimation`."""

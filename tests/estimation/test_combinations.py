@@ -1,0 +1,154 @@
+"""Every combination of model, evidence, focal length, noise and outliers aligns, or is refused.
+
+All pairs of them are in the quick part; the long one has every model with every piece of evidence,
+focal length and way with outliers.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from support.combinations import (
+    EVIDENCE,
+    FOCALS,
+    MODELS,
+    NOISES,
+    OUTLIERS,
+    Cell,
+    Request,
+    covering,
+    has_covariance,
+    has_stated_focal,
+    model_of,
+    problem_of,
+    refusal_of,
+    requests,
+    written,
+)
+from support.refusals import refusal_text
+
+from cadalign import Alignment, Camera, View, align
+from cadalign.estimation.result import Result
+from cadalign.metrics import rotation_error
+
+PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "combinations.md"
+SIGMAS = 5.0
+LARGEST_ROTATION_DEG = 12.0
+LARGEST_LOG_FOCAL = 0.4
+
+
+def rarer() -> list[Cell]:
+    """Every model with all evidence and focal lengths; noise and outliers take turns."""
+    turns = list(product(NOISES, OUTLIERS))
+    frequent = product(MODELS, EVIDENCE, FOCALS)
+    return [Cell(*each, *turns[5 * k % len(turns)]) for k, each in enumerate(frequent)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cells")
+
+
+@pytest.mark.parametrize("cell", covering(2), ids=str)
+def test_all_pairs(cell: Cell, folder: Path) -> None:
+    check(cell, folder)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("cell", rarer(), ids=str)
+def test_rarer_combinations(cell: Cell, folder: Path) -> None:
+    check(cell, folder)
+
+
+def check(cell: Cell, folder: Path) -> None:
+    """The cell aligns within its own deviations, and its result can be used; or it is refused."""
+    problem = problem_of(cell, folder)
+    message = refusal_of(cell)
+    if message is not None:
+        assert refusal_text(problem.align) == message
+        return
+    result = problem.align()
+    left_out = {2} if cell.evidence == "weak view" else set()
+    for number, (view, truth) in enumerate(zip(result.views, problem.truths, strict=True)):
+        error = rotation_error(est=view.alignment, gt=truth, symmetry=problem.symmetry)
+        if number in left_out:
+            assert view.covariance is None
+            continue
+        assert error < LARGEST_ROTATION_DEG
+        assert (view.covariance is not None) == has_covariance(cell)
+        if view.covariance is not None:
+            assert_covers(cell, view.covariance, error, view.alignment, truth)
+            log_focal = np.log(view.camera.fx / 500.0)
+            assert abs(log_focal) < LARGEST_LOG_FOCAL
+            if cell.focal != "known" and has_stated_focal(cell):
+                assert abs(log_focal) < SIGMAS * np.sqrt(view.covariance[9, 9]) + 1e-3
+    if cell.outliers == "linear":
+        assert not any("contradict" in text for text in result.warnings)
+    assert_usable(result, folder)
+
+
+def assert_covers(
+    cell: Cell, covariance: np.ndarray, error: float, found: Alignment, truth: Alignment
+) -> None:
+    """The covariance has its shape, is one, and explains the errors of rotation and translation."""
+    size = 9 if cell.focal == "known" else 10
+    assert covariance.shape == (size, size)
+    assert np.isfinite(covariance).all()
+    assert np.linalg.eigvalsh(covariance)[0] > -1e-9
+    if not has_stated_focal(cell):
+        return
+    variances = covariance.diagonal()
+    assert error < SIGMAS * np.degrees(np.sqrt(variances[:3].sum())) + 0.05
+    shift = np.linalg.norm(found.translation - truth.translation)
+    assert shift < SIGMAS * np.sqrt(variances[3:6].sum()) + 0.002
+
+
+def assert_usable(result: Result, folder: Path) -> None:
+    """The result is told, stored, drawn, exported, and its evidence weighed."""
+    text = result.to_json()
+    again = Result.from_json(text)
+    assert again.to_json() == text
+    assert str(again) == str(result)
+    assert repr(result).startswith("Result(")
+    contributions = result.contributions()
+    assert {each.name for each in result.evidence} <= {each.name for each in contributions} | {
+        f"views[{number}].points_2d" for number in range(len(result.views))
+    }
+    for view in range(len(result.views)):
+        result.plot(view=view, axes=Figure().add_subplot())
+    if getattr(result.model, "mesh", None) is not None:
+        assert result.export(folder / "object.glb").stat().st_size > 0
+
+
+@pytest.mark.parametrize("request_", requests(), ids=lambda each: each.asked)
+def test_what_is_impossible_is_refused_with_its_reason(request_: Request) -> None:
+    assert refusal_text(request_.act) == request_.message
+
+
+@pytest.mark.parametrize("model", ["held", "similar", "learned", "mixture"])
+def test_the_focal_length_of_a_far_flat_object_is_uncertain(model: str) -> None:
+    problem = problem_of(Cell(model, "keypoints", "known", "number", "linear"), Path())
+    rows = [0, 1, 2, 3, 8, 9, 10]
+    camera = Camera(480, 360, 8000.0, 8000.0, 239.5, 179.5)
+    far = Alignment(problem.truths[0].rotation, [0.0, 0.0, 60.0], np.ones(3))
+    points = np.array(model_of("held", None).points_3d)[rows]  # type: ignore[union-attr]
+    pixels = camera.project(far.apply(points)) + np.random.default_rng(0).normal(size=(7, 2))
+    view = View(Camera.without_focal(480, 360), pixels, ids=rows)
+    result = align(model_of(model, None), view, focal="estimate")
+    assert result.std is not None
+    assert result.std.focal > 0.5
+    assert any("the focal length is known only to" in text for text in result.warnings)
+
+
+def test_the_page_tells_the_cells() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    how = (
+        "write it anew: PYTHONPATH=tests:. python -c 'from pathlib import Path; "
+        "from support.combinations import written; "
+        'page = Path("docs/how_to/combinations.md"); page.write_text(written(page.read_text()))\''
+    )
+    assert written(page) == page, how

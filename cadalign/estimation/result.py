@@ -115,7 +115,7 @@ class Result(ResultData):
         Examples
         --------
         >>> from matplotlib.figure import Figure
-        >>> from cadalign import fit
+        >>> from cadalign import Camera, fit
         >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
         >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
         >>> result = fit(corners, camera.project(corners + [0.1, 0.2, 5.0]), camera)

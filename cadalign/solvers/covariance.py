@@ -8,6 +8,7 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, evaluate_alignment, room_for, with_points
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, UNOBSERVABLE
+from cadalign.solvers.evidence import LogFocalPrior
 from cadalign.solvers.focal import FocalObjective, evaluate_focal
 from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
 from cadalign.solvers.unknowns import uncenter
@@ -34,7 +35,7 @@ def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: Float
 
     The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
     number of an unknown that the points do not determine; the focal length is never one, its
-    deviation is then as large as rounding errors let it be known.
+    deviation is then as large as rounding errors let it be known. Bounds don't count.
     """
     points = system.objective.keypoints.points
     center, unit = center_and_unit(points)
@@ -42,7 +43,8 @@ def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: Float
     state = np.zeros(POSE_SIZE + 1)
     state[:POSE_SIZE] = _centered(pose, center, unit)
     equations = room_for(UNKNOWNS + 1)
-    evaluate_focal(FocalObjective(local, system.slopes, system.prior), state, equations)
+    unbounded = LogFocalPrior(-np.inf, np.inf, system.prior.center, system.prior.weight)
+    evaluate_focal(FocalObjective(local, system.slopes, unbounded), state, equations)
     hessian, distance = equations.new_hessian, state[11]
     least = UNOBSERVABLE * hessian[5, 5] * distance * distance
     undetermined = _invert(hessian, system.objective.free, least, covariance)

@@ -197,8 +197,8 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
         problem.camera,
         focal=focal,
     )
-    assert again.covariance is not None
-    return again.covariance
+    assert again.fisher_covariance is not None
+    return again.fisher_covariance
 
 
 @pytest.mark.long
@@ -208,7 +208,7 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
 def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
     problem = problem_of(seed, points=9, noise_px=0.5)
     result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
-    assert result.covariance is not None
+    assert result.fisher_covariance is not None
     # The prediction is of first order: a focal length that is open by more than its own size, at
     # the end of its range, is beyond it.
     assume(result.std is not None and result.std.focal < 1)
@@ -217,10 +217,12 @@ def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> No
     candidates = candidates[result.alignment.apply(candidates)[:, 2] > 0.5]
     brute = np.array([refitted(problem, result, point, focal).diagonal() for point in candidates])
     predicted = updated_variances(
-        candidates, result.camera, result.alignment, result.covariance, 1.0
+        candidates, result.camera, result.alignment, result.fisher_covariance, 1.0
     )
     np.testing.assert_allclose(predicted, brute, rtol=2e-3)
-    next_best = find_next_best(candidates, result.camera, result.alignment, result.covariance, 1.0)
+    next_best = find_next_best(
+        candidates, result.camera, result.alignment, result.fisher_covariance, 1.0
+    )
     assert next_best is not None
     column = brute[:, next_best.unknown]
     assert column[next_best.row] <= column.min() * (1 + 5e-3)

@@ -111,7 +111,7 @@ def test_detection_goes_all_the_way_from_file_to_picture(
     kept = re.search(r"ransac-optimal: (\d+) of 36 keypoints, rms [34]\.", printed)
     assert kept is not None
     assert int(kept[1]) >= 25
-    assert re.search(r"  scale        \(1, 0\.[89]", printed)
+    assert re.search(r"  stretch      \(1, 0\.[89]", printed)
     out = tmp_path / "found.observation_fit"
     written = Result.from_json((out / "fit.json").read_text())
     direct = fit(

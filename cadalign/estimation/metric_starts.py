@@ -71,7 +71,7 @@ def _rows_of(evidence: Evidence) -> _Rows:
         np.stack([zeros, zeros, ones], axis=1),
         planes.normal,
     ]
-    right = [zeros, zeros, sightings.depths[:, 0], planes.offset]
+    right = [zeros, zeros, sightings.depths[:, 0], planes.depth]
     weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1], planes.weight]
     point = np.concatenate([np.tile(sightings.point, 3), planes.point])
     image = np.concatenate([np.tile(sightings.image, 3), planes.image])

@@ -245,13 +245,15 @@ def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View
         sigmas.append(relative * depth[known])
     if not points:
         none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
-        return Planes(none, none, np.empty((0, 3)), no_value, no_value, none, no_value)
+        directions = np.empty((0, 3)), np.empty((0, 2))
+        return Planes(none, none, *directions, no_value, no_value, none, no_value)
     point = np.concatenate(points)
     count = len(point)
     return Planes(
         point,
         np.concatenate(images),
         np.tile([0.0, 0.0, 1.0], (count, 1)),
+        np.zeros((count, 2)),
         np.concatenate(depths),
         1.0 / np.hypot(np.concatenate(sigmas), shape.spread[point]),
         np.full(count, CAUCHY),

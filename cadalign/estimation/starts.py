@@ -185,7 +185,7 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
     below = -(seen(heights.point, heights.image) * ups).sum(axis=1)
     ratios = [
         sightings.depths[has_depth, 0] / depths,
-        planes.offset / distances,
+        planes.depth / distances,
         lengths.value / extents,
         heights.value / below,
     ]

@@ -74,7 +74,8 @@ def evidence_of(
     planes = Planes(
         np.array([2, 6]),
         np.array([0, 1]),
-        rng.normal(size=(2, 3)),
+        rng.normal(size=(2, 3)) + [0.0, 0.0, 3.0],
+        0.4 * rng.normal(size=(2, 2)),
         np.array([4.0, 5.0]),
         np.array([30.0, 20.0]),
         np.full(2, loss),

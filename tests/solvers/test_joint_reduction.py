@@ -76,7 +76,9 @@ def evidence(rank: int) -> Evidence:
         Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
         Lengths(np.empty((0, 2), dtype=np.int64), NONE, NO_VALUE, NO_VALUE),
         Heights(NONE, NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
-        Planes(NONE, NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE, NONE, NO_VALUE),
+        Planes(
+            *(NONE, NONE, np.empty((0, 3)), np.empty((0, 2))), *(NO_VALUE, NO_VALUE, NONE, NO_VALUE)
+        ),
         ScalePriors(np.zeros(3), np.zeros((3, 3))),
     )
 

@@ -346,15 +346,6 @@ def has_covariance(cell: Cell) -> bool:
     return not (is_plain and cell.outliers == "unrefined")
 
 
-def has_stated_focal(cell: Cell) -> bool:
-    """False where the stated deviation of the focal length is known to be too small.
-
-    The depths of a surface count at the pixels' rays of the last round: they lack the derivative by
-    the focal length, which turns the rays.
-    """
-    return cell.focal == "known" or cell.evidence not in ("surface", "everything")
-
-
 def _seen(rows: Sequence[int] = SHOWN, *, is_known: bool = True, **fields: Any) -> View:
     truth = Alignment(LOOK, TRANSLATION, np.ones(3))
     camera = CAMERA if is_known else Camera.without_focal(480, 360)
@@ -512,6 +503,4 @@ def _mark(model: str, evidence: str) -> str:
         notes += " (1)"
     if not all(has_covariance(each) for each in cells):
         notes += " (2)"
-    if not all(has_stated_focal(each) for each in cells):
-        notes += " (3)"
     return f"yes{notes}"

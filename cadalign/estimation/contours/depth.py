@@ -63,7 +63,8 @@ class _Rows(NamedTuple):
     modes: FloatArray
     image: int
     normal: FloatArray
-    offset: FloatArray
+    ray: FloatArray
+    depth: FloatArray
     weight: FloatArray
 
 
@@ -127,7 +128,8 @@ def _settled(
             _rows(
                 posed,
                 poses[each.image],
-                _at_focal(each, bare, state),
+                each,
+                ratio=_focal_ratio(each, bare, state),
                 is_exact=surface.is_exact,
             )
             for each in samples
@@ -147,13 +149,10 @@ def _settled(
     return result
 
 
-def _at_focal(samples: _Samples, evidence: Evidence, state: State) -> _Samples:
-    """The samples with the rays that they have at the focal length of a state."""
+def _focal_ratio(samples: _Samples, evidence: Evidence, state: State) -> float:
+    """Focal length of the samples' view at a state over that of their rays."""
     group = int(evidence.focals.group[samples.image])
-    if group < 0:
-        return samples
-    ratio = float(np.exp(state.log_focals[group]))
-    return samples._replace(rays=samples.rays / [ratio, ratio, 1.0])
+    return 1.0 if group < 0 else float(np.exp(state.log_focals[group]))
 
 
 def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:
@@ -162,18 +161,20 @@ def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evide
     return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
-def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples, *, is_exact: bool) -> _Rows:
+def _rows(
+    surface: PosedSurface, pose: Alignment, samples: _Samples, *, ratio: float, is_exact: bool
+) -> _Rows:
     """Points where the rays of samples meet the surface, and planes at their measured depths."""
     origin, model_from_ray = model_rays(pose)
-    directions = samples.rays @ model_from_ray.T
+    rays = samples.rays / [ratio, ratio, 1.0]
+    directions = rays @ model_from_ray.T
     face, depth = surface.caster.first_hits(origin, directions)
     hit = np.flatnonzero(face >= 0)
     normals = (surface.caster.normals(face[hit]) / pose.scale) @ pose.rotation.T
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    rays = samples.rays[hit]
-    along = (normals * rays).sum(axis=1)
-    steep = np.abs(along) > _GRAZING * np.linalg.norm(rays, axis=1)
-    hit, normals, along = hit[steep], normals[steep], along[steep]
+    along = (normals * rays[hit]).sum(axis=1)
+    steep = np.abs(along) > _GRAZING * np.linalg.norm(rays[hit], axis=1)
+    hit, normals = hit[steep], normals[steep]
     points = origin + depth[hit, None] * directions[hit]
     mean, modes = surface.rows(points, face[hit])
     measured = samples.depths[hit]
@@ -184,7 +185,8 @@ def _rows(surface: PosedSurface, pose: Alignment, samples: _Samples, *, is_exact
         mean,
         modes,
         samples.image,
-        normals / along[:, None],
+        normals,
+        samples.rays[hit, :2],
         measured,
         1.0 / (sigma * measured),
     )
@@ -217,7 +219,8 @@ def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evi
             np.concatenate([planes.point, keypoints + np.arange(total)]),
             np.concatenate([planes.image, *images]),
             np.concatenate([planes.normal, *(each.normal for each in rows)]),
-            np.concatenate([planes.offset, *(each.offset for each in rows)]),
+            np.concatenate([planes.ray, *(each.ray for each in rows)]),
+            np.concatenate([planes.depth, *(each.depth for each in rows)]),
             np.concatenate([planes.weight, *(each.weight for each in rows)]),
             np.concatenate([planes.loss, np.full(total, CAUCHY)]),
             np.concatenate([planes.loss_scale, np.full(total, _LOSS_SCALE)]),

@@ -236,11 +236,15 @@ def _depths(
 def plane_distances(
     evidence: Evidence, state: State
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Expected and measured distances along planes' normals, inverse deviations, and views."""
+    """Expected and measured depths at which rays meet planes, inverse deviations, and views."""
     planes = evidence.planes
     points = points_of(evidence.shape, state)[planes.point]
     seen = seen_in_cameras(evidence, state, points, planes.image)
-    return (seen * planes.normal).sum(axis=1), planes.offset, planes.weight, planes.image
+    group = evidence.focals.group[planes.image]
+    ratios = np.exp(np.append(state.log_focals, 0.0))[group]  # of views whose group is -1: 1
+    rays = np.column_stack([planes.ray / ratios[:, None], np.ones(len(ratios))])
+    met = (seen * planes.normal).sum(axis=1) / (rays * planes.normal).sum(axis=1)
+    return met, planes.depth, planes.weight, planes.image
 
 
 def _of_up(evidence: Evidence, state: State, view: int) -> list[EvidenceSummary]:

@@ -155,7 +155,8 @@ def _add_heights(evidence: Evidence, state: State, arrow: Arrow) -> float:
 def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add points that lie in planes known in a camera.
 
-    The residual is ``normal . X - offset`` of the point X in the camera's frame.
+    The residual is ``normal . X / normal . ray - depth`` of the point X in the camera's frame, the
+    depth at which the ray meets the plane through it.
     """
     planes, rig = evidence.planes, evidence.rig
     row = np.empty(6 + arrow.border.shape[0])
@@ -166,14 +167,20 @@ def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
         camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
         for a in range(3):
             stretched[a] = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
-        value = -planes.offset[j]
+        group = evidence.focals.group[v]
+        tilt = planes.normal[j, 0] * planes.ray[j, 0] + planes.normal[j, 1] * planes.ray[j, 1]
+        if group >= 0:
+            tilt *= np.exp(-state.log_focals[group])
+        along = planes.normal[j, 2] + tilt
+        met = 0.0
         for r in range(3):
             normal[r] = rotated[r] = 0.0
             for c in range(3):
-                normal[r] += planes.normal[j, c] * camera[3 * c + r]
+                normal[r] += planes.normal[j, c] / along * camera[3 * c + r]
                 rotated[r] += pose[3 * r + c] * stretched[c]
-            value += planes.normal[j, r] * camera[9 + r] + normal[r] * (rotated[r] + pose[9 + r])
-        value *= planes.weight[j]
+            met += planes.normal[j, r] / along * camera[9 + r]
+            met += normal[r] * (rotated[r] + pose[9 + r])
+        value = (met - planes.depth[j]) * planes.weight[j]
         part, root = loss_and_root(planes.loss[j], planes.loss_scale[j], value * value)
         cost += part
         weight = root * planes.weight[j]
@@ -181,6 +188,8 @@ def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
             normal[r] *= weight
         row[:] = 0.0
         _write_turn(rotated, normal, row)
+        if group >= 0:
+            row[6 + group] = weight * met * tilt / along
         for a in range(3):
             row[3 + a] = normal[a]
             slope = normal[0] * pose[a] + normal[1] * pose[3 + a] + normal[2] * pose[6 + a]

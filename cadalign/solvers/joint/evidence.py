@@ -107,16 +107,18 @@ class Heights(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """Planes ``normal . X = offset`` (N, 3), (N,) in a camera that points lie in.
+    """Planes in a camera that points X lie in: each meets a pixel's ray at a measured depth.
 
-    ``point``, ``image``, ``loss`` and ``loss_scale`` are as in `Sightings`; ``weight`` (N,) is the
-    inverse deviation of ``normal . X``.
+    They lie across ``normal`` (N, 3) and meet the rays (u / r, v / r, 1) at ``depth`` (N,), with
+    ``ray`` (N, 2) for (u, v) and the view's relative focal length r. ``point``, ``image``, ``loss``
+    and ``loss_scale`` are as in `Sightings`; ``weight`` (N,) is the inverse deviation of depths.
     """
 
     point: IntArray
     image: IntArray
     normal: FloatArray
-    offset: FloatArray
+    ray: FloatArray
+    depth: FloatArray
     weight: FloatArray
     loss: IntArray
     loss_scale: FloatArray

@@ -47,8 +47,8 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     assert live.shown is not None
     alignment, camera = live.shown.alignment, case.instance.camera
     # The pairs' deviations as the page shows them, calibrated for few pairs.
-    ratio = live.shown.posterior_covariance.diagonal() / live.shown.covariance.diagonal()
-    sigma = live.sigma * np.sqrt(ratio.mean())
+    stated, raw = live.shown.covariance.diagonal(), live.shown.fisher_covariance.diagonal()
+    sigma = live.sigma * np.sqrt((stated[raw > 0] / raw[raw > 0]).mean())
     wanted = rank_evidence(
         Model(
             points_3d=np.vstack([session.registry.xyz(keypoints), suggestion.point.xyz]),
@@ -94,7 +94,8 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
         )
         points_2d = large.project(live.cautious.alignment.apply(points_3d))
         marked = Marked(points_3d, points_2d, np.full(6, float(times)))
-        result = replace(live.cautious, camera=large)
+        (view,) = live.cautious.views
+        result = replace(live.cautious, views=(replace(view, camera=large),))
         found.append(rank(session.model, marked, result, suggestion))
     assert [each.kind for each in found[0]] == [each.kind for each in found[1]]
     worst = [[each.worst for each in one] for one in found]

@@ -15,16 +15,15 @@ import numpy as np
 import tyro
 from common import LIMIT_DRAWS, SeededBenchmark, new_table, write_results
 from rich.console import Console
-from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, Result, ShapeModel, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
+from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.geometry.metrics import rotation_error
-from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.seeding import instance_rng
 
 KNOWN = Camera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
@@ -126,20 +125,11 @@ def posterior_bound(seen: Sighting, basis: FloatArray, *, noise_px: float) -> Fl
     deviations that the modes leave are noise of the keypoints.
     """
     modes = len(basis)
-
-    def places(errors: FloatArray, points_3d: FloatArray) -> FloatArray:
-        points = points_3d + np.tensordot(errors[7:], basis, 1)
-        turned = points @ seen.gt.rotation.T @ rotation_from_vector(errors[:3]).T
-        in_camera = turned + seen.gt.translation + errors[3:6]
-        return np.exp(errors[6]) * KNOWN.fx * in_camera[:, :2] / in_camera[:, 2:]
-
-    unmoved = np.zeros(7 + modes)
-    jacobian = approx_fprime(unmoved, lambda x: places(x, seen.points_3d).ravel())
-    by_place = approx_fprime(
-        np.zeros(3), lambda x: places(unmoved, seen.points_3d + x).ravel()
-    ).reshape(-1, 2, 3)
+    jacobian = projection_jacobian(seen.points_3d, KNOWN, seen.gt)
+    by_place = jacobian[:, :, 3:6] @ seen.gt.rotation
+    by_mode = np.einsum("nia,kna->nik", by_place, basis)
+    rows = np.concatenate([jacobian[:, :, :6], jacobian[:, :, 9:], by_mode], axis=2)
     noise = noise_px**2 * np.eye(2) + RESIDUAL**2 * by_place @ by_place.transpose(0, 2, 1)
-    rows = jacobian.reshape(-1, 2, 7 + modes)
     information = np.einsum("nik,nil->kl", rows, np.linalg.solve(noise, rows))
     information[7:, 7:] += np.eye(modes)
     return np.linalg.inv(information)

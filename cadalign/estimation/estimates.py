@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
@@ -61,6 +62,19 @@ def _explained_by_corners(evidence: Evidence, own: float) -> FloatArray:
     explained = np.zeros(3)
     explained[evidence.lengths.axis] = np.minimum(own * evidence.lengths.weight**2, 1.0)
     return explained
+
+
+def poses_of(evidence: Evidence, state: State) -> list[Alignment]:
+    """Alignments in every view's camera."""
+    rig, scale = evidence.rig, np.exp(state.log_scales)
+    poses = []
+    for camera, p in zip(rig.cam_from_rig, rig.pose, strict=True):
+        rotation, pose = camera[:9].reshape(3, 3), state.poses[p]
+        turned = rotation @ pose[:9].reshape(3, 3)
+        poses.append(
+            Alignment(turned, rotation @ pose[9:] + camera[9:], scale.copy(), is_valid=True)
+        )
+    return poses
 
 
 def curvature_of_rotations(covariance: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from cadalign.estimation.estimates import (
     curvature_of_rotations,
     pose_and_border,
     pose_and_lengths,
+    poses_of,
     with_box,
 )
 from cadalign.estimation.model import Model
@@ -172,7 +173,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> _Estima
     return _Estimate(
         stretched / scale,
         scale,
-        _poses(minimum, scale),
+        tuple(poses_of(minimum.evidence, minimum.state)),
         stretched[-1] - stretched[-2],
         tuple(
             pose_and_lengths(
@@ -205,19 +206,6 @@ def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tupl
     kept[np.argsort(names, kind="stable")] = minimum.inliers
     ends = np.cumsum([len(view.keypoint_ids) for view in views])
     return tuple(np.split(kept, ends[:-1]))
-
-
-def _poses(minimum: Minimum, scale: FloatArray) -> tuple[Alignment, ...]:
-    """Alignments in every view's camera."""
-    rig = minimum.evidence.rig
-    poses = []
-    for camera, p in zip(rig.cam_from_rig, rig.pose, strict=True):
-        pose = minimum.state.poses[p]
-        rotation = camera[:9].reshape(3, 3)
-        turned = rotation @ pose[:9].reshape(3, 3)
-        shift = rotation @ pose[9:] + camera[9:]
-        poses.append(Alignment(turned, shift, scale, is_valid=True))
-    return tuple(poses)
 
 
 def _moments(estimates: Sequence[_Estimate], view: int = 0) -> Moments:

@@ -14,7 +14,7 @@ from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
 from cadalign.estimation.uncertainty.evidence import kept_rows, seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
-from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, points_of
 from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
@@ -125,8 +125,7 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     sightings = evidence.sightings
     points = points_of(evidence.shape, state)[sightings.point]
     seen = seen_in_cameras(evidence, state, points, sightings.image)
-    group = evidence.focals.group[sightings.image]
-    log_ratio = np.append(state.log_focals, 0.0)[group][:, None]  # 0 where it is known
+    log_ratio = log_focals_of(evidence, state)[sightings.image][:, None]
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
     error -= log_ratio * sightings.slopes
     a, b, c = sightings.whitening.T

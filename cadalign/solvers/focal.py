@@ -50,11 +50,10 @@ from cadalign.solvers.system import (
     score_of,
     solve,
 )
-from cadalign.solvers.unknowns import has_collapsed, hold_fixed, move_pose
+from cadalign.solvers.unknowns import has_collapsed, hold_fixed, leaves_bounds, move_pose
 
 _LARGEST_STEP = 0.5
 _SAME_FOCAL = 0.01
-_AT_BOUND = 1e-9
 
 
 class FocalObjective(NamedTuple):
@@ -170,10 +169,7 @@ def _hold_at_bounds(
     prior: LogFocalPrior, log_ratio: float, hessian: FloatArray, gradient: FloatArray
 ) -> None:
     """Hold the focal length where it would leave its bounds."""
-    downhill = -gradient[UNKNOWNS]
-    if (log_ratio <= prior.low + _AT_BOUND and downhill < 0.0) or (
-        log_ratio >= prior.high - _AT_BOUND and downhill > 0.0
-    ):
+    if leaves_bounds(log_ratio, prior.low, prior.high, gradient[UNKNOWNS]):
         gradient[UNKNOWNS] = 0.0
         for m in range(UNKNOWNS):
             hessian[UNKNOWNS, m] = hessian[m, UNKNOWNS] = 0.0

@@ -13,6 +13,7 @@ from cadalign.solvers.sampling import next_subset
 from cadalign.solvers.unknowns import pack_pose
 
 _DRAWS_PER_SUBSET = 4
+_LEAST_DEPTH = 1e-9
 
 
 @kernel
@@ -142,3 +143,32 @@ def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> 
         pack_pose(rotation, right, unstretched, poses[found])
         found += 1
     return found
+
+
+@kernel
+def widen_by_shape(
+    points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
+) -> None:
+    """Widen keypoints by the shape's uncertainty, ``variances`` (n,) of each coordinate.
+
+    It is that seen from the distance at which the mean ``points`` have the size of their image.
+    """
+    extent, size = _square_spread(points), _square_spread(rays)
+    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
+    for i in range(whitening.shape[0]):
+        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
+        information = (whitening[i, 0] ** 2 + whitening[i, 2] ** 2) / 2.0
+        whitening[i] /= np.sqrt(1.0 + variances[i] / depth**2 * information)
+
+
+@kernel
+def _square_spread(rows: FloatArray) -> float:
+    """Sum of the variances of the columns of a matrix."""
+    total = 0.0
+    for a in range(rows.shape[1]):
+        mean = 0.0
+        for n in range(rows.shape[0]):
+            mean += rows[n, a] / rows.shape[0]
+        for n in range(rows.shape[0]):
+            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
+    return total

@@ -17,6 +17,7 @@ from cadalign.solvers.linalg import polish_rotation
 _LARGEST_STRETCH = 1e3
 _LARGEST_LOG_STEP = 2.0
 _ROTATION_ERROR = 1e-10
+_AT_BOUND = 1e-9
 
 
 @kernel
@@ -62,6 +63,14 @@ def move_pose(pose: FloatArray, step: FloatArray, moved: FloatArray) -> None:
     for k in range(2):
         log_step = min(max(step[6 + k], -_LARGEST_LOG_STEP), _LARGEST_LOG_STEP)
         moved[13 + k] = pose[13 + k] * np.exp(log_step)
+
+
+@inlined
+def leaves_bounds(value: float, low: float, high: float, gradient: float) -> bool:
+    """True if an unknown stands at a bound that the descent leads beyond."""
+    return (value <= low + _AT_BOUND and gradient > 0.0) or (
+        value >= high - _AT_BOUND and gradient < 0.0
+    )
 
 
 @inlined

@@ -15,12 +15,12 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.contour import robust_deviation
 from cadalign.estimation.contours.loop import (
-    poses_of,
     state_with_points,
     state_without_points,
     with_points,
 )
 from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
+from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
@@ -31,7 +31,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, Planes, log_focals_of, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border
@@ -123,13 +123,13 @@ def _settled(
     extra = start.score - own if np.isfinite(start.score - own) else 0.0
     for _ in range(_ROUNDS):
         posed = surface.at(start.evidence.shape, state)
-        poses = poses_of(bare, state)
+        poses, ratios = poses_of(bare, state), np.exp(log_focals_of(bare, state))
         rows = [
             _rows(
                 posed,
                 poses[each.image],
                 each,
-                ratio=_focal_ratio(each, bare, state),
+                ratio=float(ratios[each.image]),
                 is_exact=surface.is_exact,
             )
             for each in samples
@@ -147,12 +147,6 @@ def _settled(
             break
         last = cost
     return result
-
-
-def _focal_ratio(samples: _Samples, evidence: Evidence, state: State) -> float:
-    """Focal length of the samples' view at a state over that of their rays."""
-    group = int(evidence.focals.group[samples.image])
-    return 1.0 if group < 0 else float(np.exp(state.log_focals[group]))
 
 
 def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:

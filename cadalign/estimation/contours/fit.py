@@ -24,7 +24,6 @@ from cadalign.estimation.contours.loop import (
     contour_view,
     count_of,
     noise_of,
-    poses_of,
     rim_rows,
     settle,
     state_with_points,
@@ -33,7 +32,7 @@ from cadalign.estimation.contours.loop import (
 )
 from cadalign.estimation.contours.rims import extraction_bias, find_rims
 from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
-from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
+from cadalign.estimation.estimates import pose_and_border, pose_and_lengths, poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, prior_of

@@ -27,12 +27,13 @@ from cadalign.estimation.contours.rims import (
     mask_image,
 )
 from cadalign.estimation.contours.surface import PosedSurface, Surface
+from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State
+from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, log_focals_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
@@ -342,21 +343,10 @@ def rim_rows(
 
 def camera_at(view: ViewContour, evidence: Evidence, state: State) -> Camera:
     """The camera of a view, with the focal length that a state has."""
-    group = int(evidence.focals.group[view.image])
-    if group < 0:
+    if evidence.focals.group[view.image] < 0:
         return view.camera
-    return view.camera.with_focal(view.camera.fx * float(np.exp(state.log_focals[group])))
-
-
-def poses_of(evidence: Evidence, state: State) -> list[Alignment]:
-    """Alignments in every view's camera."""
-    scale = np.exp(state.log_scales)
-    poses = []
-    for camera, p in zip(evidence.rig.cam_from_rig, evidence.rig.pose, strict=True):
-        rotation, pose = camera[:9].reshape(3, 3), state.poses[p]
-        turned = rotation @ pose[:9].reshape(3, 3)
-        poses.append(Alignment(turned, rotation @ pose[9:] + camera[9:], scale))
-    return poses
+    ratio = np.exp(log_focals_of(evidence, state)[view.image])
+    return view.camera.with_focal(view.camera.fx * float(ratio))
 
 
 class RimRows(NamedTuple):

@@ -19,7 +19,15 @@ from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummar
 from cadalign.estimation.uncertainty.weakness import Uncertainty
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, Planes, Rig, Sightings, State, points_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Planes,
+    Rig,
+    Sightings,
+    State,
+    log_focals_of,
+    points_of,
+)
 from cadalign.solvers.joint.reduction import reduced
 
 Rows = TypeVar("Rows", bound=tuple[Any, ...])
@@ -181,8 +189,7 @@ def _of_keypoints(
     if not rows.any():
         return []
     seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
-    group = int(evidence.focals.group[view])
-    log_ratio = float(state.log_focals[group]) if group >= 0 else 0.0
+    log_ratio = log_focals_of(evidence, state)[view]
     ratio = np.exp(log_ratio)
     seen_rays = seen[:, :2] / seen[:, 2:]
     errors = seen_rays - (sightings.rays[rows] + log_ratio * sightings.slopes[rows]) / ratio
@@ -240,8 +247,7 @@ def plane_distances(
     planes = evidence.planes
     points = points_of(evidence.shape, state)[planes.point]
     seen = seen_in_cameras(evidence, state, points, planes.image)
-    group = evidence.focals.group[planes.image]
-    ratios = np.exp(np.append(state.log_focals, 0.0))[group]  # of views whose group is -1: 1
+    ratios = np.exp(log_focals_of(evidence, state))[planes.image]
     rays = np.column_stack([planes.ray / ratios[:, None], np.ones(len(ratios))])
     met = (seen * planes.normal).sum(axis=1) / (rays * planes.normal).sum(axis=1)
     return met, planes.depth, planes.weight, planes.image

@@ -144,9 +144,9 @@ def _add_heights(evidence: Evidence, state: State, arrow: Arrow) -> float:
             _add_shape(evidence, state, i, r, weight * heights.direction[j, r], row)
         value *= weight
         cost += value * value
-        row[0] = weight * (up[1] * q[2] - up[2] * q[1])
-        row[1] = weight * (up[2] * q[0] - up[0] * q[2])
-        row[2] = weight * (up[0] * q[1] - up[1] * q[0])
+        _write_turn(up, q, row)
+        for r in range(3):
+            row[r] *= weight
         add_row(arrow, rig.pose[v], row, value)
     return cost
 

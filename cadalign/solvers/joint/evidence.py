@@ -174,6 +174,11 @@ def packed(state: State) -> FloatArray:
     return np.concatenate([np.ravel(part) for part in state])
 
 
+def log_focals_of(evidence: Evidence, state: State) -> FloatArray:
+    """Log focal length (V,) of every view over that of its rays; 0 where it is known."""
+    return np.append(state.log_focals, 0.0)[evidence.focals.group]  # the last, for -1
+
+
 @kernel
 def points_of(shape: Shape, state: State) -> FloatArray:
     """The points (m, 3) in the model's frame."""

@@ -11,11 +11,11 @@ from cadalign.compile import kernel
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.starts import widen_by_shape
 
 MOST_PER_VIEW = 8
 _LEAST_POINTS = 3
 _UNLIKELY = 60.0  # excess cost of a pose of the mean shape that is still a start
-_LEAST_DEPTH = 1e-9
 
 
 class ViewRays(NamedTuple):
@@ -32,10 +32,7 @@ class ViewRays(NamedTuple):
 
 @kernel
 def rays_in(evidence: Evidence, view: int) -> ViewRays:
-    """One view's keypoints, the shape's uncertainty in their whitening.
-
-    The uncertainty is that seen from the distance at which the mean has the size of its image.
-    """
+    """One view's keypoints, the shape's uncertainty in their whitening."""
     sightings, shape = evidence.sightings, evidence.shape
     rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0.0))
     count = len(rows)
@@ -45,18 +42,15 @@ def rays_in(evidence: Evidence, view: int) -> ViewRays:
         points[n] = shape.mean[sightings.point[rows[n]]]
         rays[n] = sightings.rays[rows[n]]
         whitening[n] = sightings.whitening[rows[n]]
+    variances = np.empty(count)
+    for n in range(count):
+        i = sightings.point[rows[n]]
+        variances[n] = shape.spread[i] ** 2
+        for k in range(shape.modes.shape[0]):
+            for a in range(3):
+                variances[n] += shape.modes[k, i, a] ** 2 / 3.0
     if count > 0:
-        extent, seen = _square_spread(points), _square_spread(rays)
-        depth = max(np.sqrt(extent * 2.0 / 3.0 / max(seen, 1e-30)), _LEAST_DEPTH)
-        for n in range(count):
-            i = sightings.point[rows[n]]
-            variance = shape.spread[i] ** 2
-            for k in range(shape.modes.shape[0]):
-                for a in range(3):
-                    variance += shape.modes[k, i, a] ** 2 / 3.0
-            # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-            information = (whitening[n, 0] ** 2 + whitening[n, 2] ** 2) / 2.0
-            whitening[n] /= np.sqrt(1.0 + variance / depth**2 * information)
+        widen_by_shape(points, rays, variances, whitening)
     return ViewRays(points, rays, whitening, rows)
 
 
@@ -99,17 +93,3 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
             poses[k, 9 + a] = found[0, k, 9 + a]
             logs[k, order[a]] = np.log(found[0, k, 12 + a])
     return poses, logs
-
-
-@kernel
-def _square_spread(rows: FloatArray) -> float:
-    """Sum of the variances of the columns of a matrix."""
-    total = 0.0
-    count = rows.shape[0]
-    for a in range(rows.shape[1]):
-        mean = 0.0
-        for n in range(count):
-            mean += rows[n, a] / count
-        for n in range(count):
-            total += (rows[n, a] - mean) ** 2 / count
-    return total

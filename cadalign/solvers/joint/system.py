@@ -47,11 +47,10 @@ from cadalign.solvers.system import (
     score_of,
     solve,
 )
-from cadalign.solvers.unknowns import move_rigid, orthonormalize
+from cadalign.solvers.unknowns import leaves_bounds, move_rigid, orthonormalize
 
 _LARGEST_LOG_STEP = 1.0
 _SAME_CHORD = 1e-3
-_AT_BOUND = 1e-9
 
 
 class Joint(NamedTuple):
@@ -326,11 +325,8 @@ def _hold_at_bounds(evidence: Evidence, state: State, arrow: Arrow) -> None:
     """Hold focal lengths where they would leave their bounds."""
     focals = evidence.focals
     for f in range(focals.low.shape[0]):
-        downhill = -arrow.gradient[6 * arrow.blocks.shape[0] + f]
-        value = state.log_focals[f]
-        if (value <= focals.low[f] + _AT_BOUND and downhill < 0.0) or (
-            value >= focals.high[f] - _AT_BOUND and downhill > 0.0
-        ):
+        slope = arrow.gradient[6 * arrow.blocks.shape[0] + f]
+        if leaves_bounds(state.log_focals[f], focals.low[f], focals.high[f], slope):
             hold(arrow, f)
 
 

@@ -21,7 +21,7 @@ from cadalign.solvers.marginal.equations import Posed, state_at
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
 from cadalign.solvers.refine import refine
 from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
-from cadalign.solvers.starts import rotation_starts
+from cadalign.solvers.starts import rotation_starts, widen_by_shape
 from cadalign.solvers.system import are_same, cost_at, score_of
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
@@ -36,7 +36,6 @@ _ROTATIONS = 96
 _REFINED = 16
 _ITERATIONS = 4
 _SAME_CHORD = 0.3
-_LEAST_DEPTH = 1e-9
 _UNLIKELY_SHAPE = 60.0  # squared distance of a start from the mean, in deviations
 _FLATNESS = 0.01  # displacement that no image shows, relative to the extent
 
@@ -139,8 +138,7 @@ def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
     """Poses (S, 12) of the mean, the likeliest first.
 
     Of poses at evenly spread rotations the best are improved by a few steps. The shape's
-    uncertainty, seen from the distance at which the mean has the size of its image, widens the
-    keypoints' own.
+    uncertainty widens the keypoints' own.
     """
     center, unit = center_and_unit(target.mean)
     if not unit > 0:
@@ -188,31 +186,13 @@ def is_among(pose: FloatArray, poses: FloatArray, chord: float) -> bool:
 @kernel
 def _widened(target: GaussianTarget, seen: Seen) -> FloatArray:
     """Whitening (n, 3) of the keypoints about the mean's projection."""
-    n = seen.points.shape[0]
-    whitening = np.empty((n, 3))
-    extent, size = _square_spread(target.mean), _square_spread(seen.rays)
-    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
-    for i in range(n):
-        variance = 0.0
+    variances = np.zeros(seen.points.shape[0])
+    for i in range(variances.shape[0]):
         for a in range(3):
-            variance += target.covariance[3 * i + a, 3 * i + a] / 3.0
-        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-        information = (seen.whitening[i, 0] ** 2 + seen.whitening[i, 2] ** 2) / 2.0
-        whitening[i] = seen.whitening[i] / np.sqrt(1.0 + variance / depth**2 * information)
+            variances[i] += target.covariance[3 * i + a, 3 * i + a] / 3.0
+    whitening = seen.whitening.copy()
+    widen_by_shape(target.mean, seen.rays, variances, whitening)
     return whitening
-
-
-@kernel
-def _square_spread(rows: FloatArray) -> float:
-    """Sum of the variances of the columns of a matrix."""
-    total = 0.0
-    for a in range(rows.shape[1]):
-        mean = 0.0
-        for n in range(rows.shape[0]):
-            mean += rows[n, a] / rows.shape[0]
-        for n in range(rows.shape[0]):
-            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
-    return total
 
 
 @kernel

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
-    from cadalign.estimation.model import Model, Size
+    from cadalign.estimation.model import Model
     from cadalign.estimation.observed import views_from
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import AlignResult, FitResult, Result
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cadalign.geometry.camera import Camera
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.symmetry import Symmetry
+    from cadalign.io.evidence import Size
     from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match

@@ -13,13 +13,11 @@ from cadalign.annotate.further import FurtherEvidence
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.observed_image import KnownSize
+from cadalign.io.evidence import LENGTHS, Size
 
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]
 
-LENGTHS = ("width", "height", "length")
-"""Names of the lengths along the model's x, y and z."""
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
@@ -57,22 +55,18 @@ class MarkedLengths:
     sigmas: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, size: KnownSize | None) -> MarkedLengths | None:
+    def of(cls, size: Size | None) -> MarkedLengths | None:
         """Those of an observation."""
         if size is None:
             return None
-        sigma = size.sigma
-        if sigma is None:
-            sigmas: tuple[float, ...] = ()
-        else:
-            sigmas = (sigma,) if isinstance(sigma, float | int) else tuple(sigma)
+        sigmas = () if size.sigma is None else tuple(np.atleast_1d(size.sigma).tolist())
         return cls(size.width, size.height, size.length, sigmas)
 
     @property
-    def size(self) -> KnownSize:
+    def size(self) -> Size:
         """Those of an observation."""
         sigma = list(self.sigmas) if len(self.sigmas) > 1 else next(iter(self.sigmas), None)
-        return KnownSize(width=self.width, height=self.height, length=self.length, sigma=sigma)
+        return Size(width=self.width, height=self.height, length=self.length, sigma=sigma)
 
 
 @dataclass(frozen=True)

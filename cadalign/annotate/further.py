@@ -9,8 +9,9 @@ import numpy as np
 
 from cadalign.errors import DataError
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.evidence import ImageEvidence, Size
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.io.observed_image import ObservedImage
 
 _LABELS = {
     "mask": "mask",
@@ -33,7 +34,7 @@ class FurtherEvidence:
         The file's other images.
     place : int
         The photo's number among all of them.
-    size : KnownSize, optional
+    size : Size, optional
         Known lengths of the object.
     sigma : float, optional
         Stored standard deviation of all keypoints in place of their own [px].
@@ -44,7 +45,7 @@ class FurtherEvidence:
     image: ImageEvidence = field(default_factory=ImageEvidence)
     others: tuple[ObservedImage, ...] = ()
     place: int = 0
-    size: KnownSize | None = None
+    size: Size | None = None
     sigma: float | None = None
     symmetry: Symmetry | None = None
 
@@ -112,7 +113,7 @@ def _place_of(photo: Path, views: tuple[ObservedImage, ...], *, where: Path) -> 
     )
 
 
-def _lengths(size: KnownSize) -> list[str]:
+def _lengths(size: Size) -> list[str]:
     return [name for name in ("width", "height", "length") if getattr(size, name) is not None]
 
 

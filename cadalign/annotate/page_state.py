@@ -13,7 +13,7 @@ from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.advice import Marked, present, rank
 from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
-from cadalign.annotate.evidence import LENGTHS, MarkedLengths, MaskDrawing, find_up
+from cadalign.annotate.evidence import MarkedLengths, MaskDrawing, find_up
 from cadalign.annotate.files import filled
 from cadalign.annotate.masks import draw_mask
 from cadalign.annotate.objects.page import objects_state, with_photo_names
@@ -32,6 +32,7 @@ from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import Point3
+from cadalign.io.evidence import LENGTHS
 
 _FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
 

@@ -18,14 +18,15 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.model import Model, Size
-from cadalign.estimation.observed import model_of, size_of, views_of
+from cadalign.estimation.model import Model
+from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.evidence import Size
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 
@@ -189,7 +190,7 @@ class JointEstimate:
         lens: Mapping[str, Any],
     ) -> JointEstimate:
         """Align views, ``lens`` being the options of `align` for focal lengths."""
-        size, sigma, used = size_of(observation), known.further.sigma, views
+        size, sigma, used = observation.size, known.further.sigma, views
         if sigma is None and known.has_open_sigma(observation):
             sigma = _explaining_sigma(model, views, size, lens)
             used = tuple(replace(view, sigma=sigma) for view in views)

@@ -34,7 +34,9 @@ class _Command(NamedTuple):
 
     def load(self) -> Any:
         """The command's class; its module is imported when the command is called."""
-        return getattr(import_module(f"cadalign.cli.{self.module}"), self.name)
+        command = getattr(import_module(f"cadalign.cli.{self.module}"), self.name)
+        declared = getattr(command, "with_declared_fields", None)
+        return command if declared is None else declared()
 
 
 COMMANDS = {

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 
 from cadalign.cli.options import named_as_flags
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
+from cadalign.io.evidence import ImageEvidence, as_arguments, evidence_fields
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SizeFields, read_size
 
@@ -42,49 +42,45 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceOptions:
-    """Evidence beyond keypoints."""
+    """Evidence beyond keypoints: the declared fields are options, see `with_declared_fields`."""
 
-    mask: Path | None = None
-    """Mask of the object, a grey PNG of the photo's size."""
-    mask_sigma: float | None = None
-    """Standard deviation of the mask's contour [px]; estimated by default."""
-    depth: Path | None = None
-    """Depth image that is registered to the photo, a PNG of 16 bits; 0 where unknown."""
-    depth_scale: float | None = None
-    """Units per count of the depth image; 0.001 by default, millimetres to metres."""
-    depth_sigma: float | None = None
-    """Relative standard deviation of the depths; 0.01 by default."""
-    up: tuple[float, float, float] | None = None
-    """Upward direction in the camera's frame, whose y points down: 0 -1 0 for a level camera."""
-    up_sigma_deg: float | None = None
-    """Standard deviation of this direction [degrees]; 1 by default."""
-    camera_height: float | None = None
-    """Height of the camera above the plane that the object stands on."""
     size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
     """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
     their relative standard deviation, as in --size height 0.91 sigma 0.005."""
 
-    def add_to(self, observation: Observation) -> Observation:
-        """An observation with the evidence of the options, which takes the place of its own."""
-        given: dict[str, Any] = {
-            "mask": _absolute(self.mask),
-            "mask_sigma": self.mask_sigma,
-            "depth": _absolute(self.depth),
-            "depth_scale": self.depth_scale,
-            "depth_sigma": self.depth_sigma,
-            "up": None if self.up is None else np.array(self.up),
-            "up_sigma_deg": self.up_sigma_deg,
-            "camera_height": self.camera_height,
-        }
-        known = {name: value for name, value in given.items() if value is not None}
-        if known:
+    @classmethod
+    def with_declared_fields(cls) -> type[EvidenceOptions]:
+        """The command with an option for every field of `cadalign.io.evidence`."""
+        options = []
+        for each in evidence_fields():
+            if each.option is not None:
+                kind: Any = each.option | None
+                option = Annotated[kind, tyro.conf.arg(help=each.help)]
+                options.append((each.name, option, field(default=None)))
+        command = make_dataclass(cls.__name__, options, bases=(cls,), frozen=True, kw_only=True)
+        command.__doc__, command.__module__ = cls.__doc__, cls.__module__
+        return command
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The fields of evidence that are given, by name."""
+        found = {}
+        for each in evidence_fields():
+            value = getattr(self, each.name, None)
+            if value is not None:
+                found[each.name] = value.resolve() if isinstance(value, Path) else value
+        return found
+
+    def add_to(self, observation: Observation, **others: Any) -> Observation:
+        """An observation with the evidence of the options, which takes the place of its own.
+
+        ``others`` are further fields.
+        """
+        if given := others | self.given:
             with named_as_flags(self):
-                observation = replace(observation, evidence=replace(observation.evidence, **known))
+                evidence = ImageEvidence(**as_arguments(observation.evidence.given | given))
+                observation = replace(observation, evidence=evidence)
         if self.size is None:
             return observation
         size = read_size(convert(self.size, SizeFields, where="--size"))
         return replace(observation, size=size)
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else path.resolve()

@@ -166,7 +166,7 @@ class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
     ) -> tuple[Result, tuple[View, ...]]:
         """Align any model to all evidence; returns the views of it, too."""
         from cadalign.estimation.align import align
-        from cadalign.estimation.observed import size_of, views_of
+        from cadalign.estimation.observed import views_of
 
         self.check_for(observation)
         options = self.options_for(observation, path)
@@ -174,7 +174,7 @@ class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
         stated = self.stated_sigma(observation)
         with in_file(path):
             views = views_of(observation, model, sigma=stated.get("sigma"))
-            size = size_of(observation)
+            size = observation.size
         if "sigma" in stated and stated["sigma"] is None:
             views = tuple(replace(view, sigma=None) for view in views)
         with status, self._located(path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -100,10 +100,8 @@ class Observe(CameraOptions, EvidenceOptions):
                 sigma_from_scores=self.sigma if self.weigh else None,
             )
         make_folder(out.parent)
-        evidence = self
-        if self.mask is None:
-            evidence = replace(self, mask=self._write_mask(observation, found, out))
-        observation = evidence.add_to(observation)
+        drawn = None if "mask" in self.given else self._write_mask(observation, found, out)
+        observation = self.add_to(observation, mask=drawn)
         observation.save(out)
         return observation
 
@@ -127,7 +125,8 @@ class Observe(CameraOptions, EvidenceOptions):
 
     def _camera(self, found: ImageKeypoints, image: Path | None) -> Camera:
         """Read the camera, or make one of the photo's size without focal length."""
-        paths = [path for path in (image, self.mask, self.depth) if path is not None]
+        given = self.given
+        paths = [path for path in (image, given.get("mask"), given.get("depth")) if path]
         sizes = {str(path): photo_size(path) for path in paths}
         if found.size is not None:
             sizes[found.source] = found.size
@@ -154,8 +153,8 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     """Write an observation of each object; returns the exit code, 3 where some are left out."""
     from rich.progress import track
 
-    for name in ("object", "mask", "depth"):
-        if getattr(command, name) is not None:
+    for name, given in {"object": command.object, **command.given}.items():
+        if name in ("object", "mask", "depth") and given is not None:
             raise InputError("is for one photo", where=f"--{name}", fix="leave out --every")
     if command.image is not None and not command.image.is_dir():
         what = f"{command.image} is not a folder of photos"

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.exporting import object_of
     from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
-    from cadalign.estimation.model import Model, Size
-    from cadalign.estimation.observed import model_of, size_of, views_from, views_of
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.observed import model_of, views_from, views_of
     from cadalign.estimation.options import FitOptions, RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from cadalign.estimation.uncertainty.weakness import Uncertainty
     from cadalign.estimation.view import View
+    from cadalign.io.evidence import Size
 
 __all__ = [
     "Advice",
@@ -52,7 +53,6 @@ __all__ = [
     "model_of",
     "object_of",
     "rank_evidence",
-    "size_of",
     "to_dataframe",
     "views_from",
     "views_of",

@@ -15,7 +15,7 @@ from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.lenses import Lenses
-from cadalign.estimation.model import Model, Size
+from cadalign.estimation.model import Model
 from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
@@ -32,6 +32,7 @@ from cadalign.estimation.weak_views import (
     with_views_left_out,
 )
 from cadalign.geometry.alignment import Alignment
+from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 
 T = TypeVar("T")

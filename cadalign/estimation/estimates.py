@@ -59,8 +59,10 @@ def _explained_by_corners(evidence: Evidence, own: float) -> FloatArray:
 
     The weight of a length counts these, of variance ``own``, as part of its noise.
     """
-    explained = np.zeros(3)
-    explained[evidence.lengths.axis] = np.minimum(own * evidence.lengths.weight**2, 1.0)
+    offsets, explained = evidence.offsets, np.zeros(3)
+    of_box = (offsets.ends == [len(evidence.shape.mean) - 2, len(evidence.shape.mean) - 1]).all(1)
+    along = np.abs(offsets.direction[of_box]).argmax(axis=1)
+    explained[along] = np.minimum(own * offsets.weight[of_box] ** 2, 1.0)
     return explained
 
 
@@ -105,11 +107,11 @@ def with_box(
 ) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
-    Such a face varies with its keypoint. The box remains the linear one where measured lengths or
-    heights determine it.
+    Such a face varies with its keypoint. The box remains the linear one where measured distances
+    determine it.
     """
     shape = evidence.shape
-    if len(evidence.lengths.value) or len(evidence.heights.value) or not len(shape.modes):
+    if len(evidence.offsets.value) or not len(shape.modes):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
     rows = np.unique(evidence.sightings.point)

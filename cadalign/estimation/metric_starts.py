@@ -197,19 +197,26 @@ def _scale_basis(evidence: Evidence) -> FloatArray:
 def _other_rows(
     evidence: Evidence, rotation: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Whitened equations of known lengths and of heights, in translation and scales."""
-    lengths, heights, mean = evidence.lengths, evidence.heights, evidence.shape.mean
+    """Whitened equations of known distances, in translation and scales."""
+    offsets, mean = evidence.offsets, evidence.shape.mean
     rows, right = [np.empty((0, 3 + basis.shape[1]))], [np.empty(0)]
-    for (low, high), axis, value, weight in zip(*lengths, strict=True):
-        by_scale = np.eye(3)[axis] * (mean[high, axis] - mean[low, axis])
-        rows.append(weight * np.concatenate([np.zeros(3), by_scale @ basis])[None])
-        right.append(np.array([weight * value]))
-    for point, image, direction, value, weight in zip(*heights, strict=True):
-        camera = evidence.rig.cam_from_rig[image]
-        up = rotation @ direction
-        centre = -camera[:9].reshape(3, 3).T @ camera[9:]
-        rows.append(weight * np.concatenate([up, (direction * mean[point]) @ basis])[None])
-        right.append(np.array([weight * (up @ centre - value)]))
+    for (*ends, image), direction, value, weight in zip(
+        np.column_stack([offsets.ends, offsets.image]).tolist(),
+        offsets.direction,
+        offsets.value,
+        offsets.weight,
+        strict=True,
+    ):
+        row, known = np.zeros(6), value
+        for point, sign in zip(ends, (-1.0, 1.0), strict=True):
+            if point >= 0:
+                row[3:] += sign * direction * mean[point]
+            else:
+                camera, turned = evidence.rig.cam_from_rig[image], rotation @ direction
+                row[:3] -= sign * turned
+                known += sign * turned @ (camera[:9].reshape(3, 3).T @ camera[9:])
+        rows.append(weight * np.concatenate([row[:3], row[3:] @ basis])[None])
+        right.append(np.array([weight * known]))
     return np.concatenate(rows), np.concatenate(right)
 
 

@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import CadalignError, InputError, quote
-from cadalign.estimation.model import Model, Size
+from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import within
+from cadalign.io.evidence import as_arguments
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 from cadalign.shapes.model import ShapeModel
@@ -101,11 +102,6 @@ def views_of(
     return tuple(views)
 
 
-def size_of(observation: Observation) -> Size | None:
-    """The known lengths of an observation's object, if there are any."""
-    return None if observation.size is None else Size(**observation.size.given)
-
-
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
     """The ids, or names, by which a learned shape knows an image's keypoints.
 
@@ -171,7 +167,7 @@ def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) ->
         ids=ids,
         sigma=sigma,
         confidences=image.confidences,
-        **evidence,
+        **as_arguments(evidence),
     )
 
 

@@ -11,20 +11,19 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.evidence_kinds import is_told, known_of
 from cadalign.estimation.lenses import Lenses
-from cadalign.estimation.model import Size
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import ShapePrior, prior_of, rows_among, scale_priors
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
+from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
-    Directions,
     Evidence,
-    Heights,
-    Lengths,
+    Offsets,
     Planes,
     Rig,
     Shape,
@@ -32,7 +31,6 @@ from cadalign.solvers.joint.evidence import (
     State,
 )
 
-_NONE = np.empty(0, dtype=np.int64)
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
@@ -68,40 +66,33 @@ def evidence_of(
         for number, view in enumerate(views)
     ]
     for number, view in enumerate(views):
-        _check_view(prior, view, number)
+        _check_view(view, number)
+    directions, offsets = known_of(prior, [view.given for view in views], size)
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
         _rig(views),
         lenses.focals(),
-        _directions(prior, views),
-        _lengths(prior, size),
-        _heights(prior, views),
+        directions,
+        offsets,
         sampled_planes(prior.components[0], rows, views),
-        scale_priors(prior, is_metric(views, size)),
+        scale_priors(prior, _is_metric(offsets, views)),
     )
 
 
-def is_metric(views: Sequence[View], size: Size | None) -> bool:
-    """True if the object's size is told: by depths, lengths, heights, or known camera poses."""
-    if size is not None or any(view.camera_height is not None for view in views):
-        return True
+def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
+    """True if the object's size is told: by distances, depths, or known camera poses."""
     depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
-    if any(np.isfinite(depth).any() for depth in depths):
+    if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
         return True
     return len(views) > 1 and views[0].cam_from_rig is not None
 
 
-def _check_view(prior: ShapePrior, view: View, number: int) -> None:
-    has_samples = view.depth is not None and view.mask is not None
-    told = (view.mask, view.up, view.camera_height)
-    if not len(view.keypoint_ids) and all(each is None for each in told) and not has_samples:
+def _check_view(view: View, number: int) -> None:
+    is_something = view.mask is not None or is_told(view.given)
+    if not len(view.keypoint_ids) and not is_something:
         fix = "give keypoints, a mask or a direction, or leave the view away"
         raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
-    for name in ("up", "camera_height"):
-        if getattr(view, name) is not None and prior.up is None:
-            fix = f"learn it with an up axis, or leave `{name}` away"
-            raise InputError("the model has no up axis", where=f"views[{number}].{name}", fix=fix)
 
 
 def _sightings(
@@ -162,68 +153,6 @@ def _rig(views: Sequence[View]) -> Rig:
     cameras = [cast(FloatArray, view.cam_from_rig) for view in views]
     rows = [np.concatenate([pose[:3, :3].ravel(), pose[:3, 3]]) for pose in cameras]
     return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64))
-
-
-def _directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
-    numbers = [number for number, view in enumerate(views) if view.up is not None]
-    model = np.tile(np.zeros(3) if prior.up is None else prior.up, (len(numbers), 1))
-    camera = [cast(FloatArray, views[number].up) for number in numbers]
-    whitening = [_whitening_of_up(views[number]) for number in numbers]
-    return Directions(
-        model,
-        np.array(camera).reshape(-1, 3),
-        np.array(numbers, dtype=np.int64),
-        np.array(whitening).reshape(-1, 3, 3),
-    )
-
-
-def _whitening_of_up(view: View) -> FloatArray:
-    """Whitening (3, 3) of the difference of directions [1/rad]; along them as weak as across."""
-    sigma = np.asarray(view.up_sigma_deg, dtype=np.float64)
-    if not sigma.ndim:
-        return np.asarray(np.eye(3) / np.radians(sigma))
-    up = cast(FloatArray, view.up)
-    across = np.eye(3) - np.outer(up, up)
-    covariance = across @ np.radians(np.radians(sigma)) @ across
-    largest = np.linalg.eigvalsh(covariance)[-1]
-    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance + largest * np.outer(up, up))).T)
-
-
-def _lengths(prior: ShapePrior, size: Size | None) -> Lengths:
-    if size is None:
-        return Lengths(np.empty((0, 2), dtype=np.int64), _NONE, np.empty(0), np.empty(0))
-    shape = prior.components[0]
-    axes = np.flatnonzero(np.isfinite(size.lengths))
-    count = len(shape.mean)
-    values, sigmas = size.lengths[axes], size.deviations[axes]
-    for axis in axes:
-        if not prior.lengths[axis] > 0:
-            name = ("width", "height", "length")[axis]
-            what = f"the model has no extent along its {'xyz'[axis]}"
-            raise InputError(what, where=f"size.{name}", fix="leave it away")
-    own = (shape.spread[-2:] ** 2).sum()  # of the two corners, which move by themselves
-    return Lengths(
-        np.tile([count - 2, count - 1], (len(axes), 1)).astype(np.int64),
-        axes.astype(np.int64),
-        values,
-        1.0 / np.sqrt(sigmas**2 + own),
-    )
-
-
-def _heights(prior: ShapePrior, views: Sequence[View]) -> Heights:
-    numbers = [number for number, view in enumerate(views) if view.camera_height is not None]
-    shape, count = prior.components[0], len(prior.components[0].mean)
-    up = np.zeros(3) if prior.up is None else prior.up
-    lowest = count - 2 if up.sum() > 0 else count - 1  # the box's corner in its lowest face
-    values = np.array([views[number].camera_height for number in numbers], dtype=np.float64)
-    relative = np.array([views[number].camera_height_sigma for number in numbers])
-    return Heights(
-        np.full(len(numbers), lowest, dtype=np.int64),
-        np.array(numbers, dtype=np.int64),
-        np.tile(up, (len(numbers), 1)),
-        values,
-        1.0 / np.hypot(values * relative, shape.spread[lowest]),
-    )
 
 
 def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:

@@ -17,13 +17,13 @@ from cadalign.estimation.joint_robust import (
     with_sightings,
 )
 from cadalign.estimation.lenses import ROUNDS, Lenses
-from cadalign.estimation.model import Size
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.starts import Start, Starts, starts_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
+from cadalign.io.evidence import Size
 from cadalign.solvers.joint.evidence import Evidence, Shape, State
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 

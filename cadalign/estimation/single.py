@@ -54,9 +54,7 @@ def is_single(model: object, views: Sequence[View]) -> bool:
 
 
 def _has_keypoints_alone(views: Sequence[View]) -> bool:
-    view = views[0]
-    others = (view.depth, view.up, view.cam_from_rig, view.mask, view.camera_height)
-    return len(views) == 1 and all(each is None for each in others)
+    return len(views) == 1 and not views[0].sources
 
 
 def align_plain(

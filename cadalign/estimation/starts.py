@@ -14,7 +14,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.metric_starts import metric_starts
 from cadalign.estimation.uncertainty.evidence import count_equations
-from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.joint.evidence import Evidence, distances_of
 from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
@@ -138,11 +138,11 @@ def _of_pose(evidence: Evidence, pose: int) -> Evidence:
     """The evidence of the views that share a pose."""
     chosen = evidence.rig.pose == pose
     columns: dict[str, Any] = {
-        name: type(rows)(*(column[chosen[rows.image]] for column in rows))
+        name: type(rows)(*(column[(rows.image < 0) | chosen[rows.image]] for column in rows))
         for name, rows in (
             ("sightings", evidence.sightings),
             ("directions", evidence.directions),
-            ("heights", evidence.heights),
+            ("offsets", evidence.offsets),
             ("planes", evidence.planes),
         )
     }
@@ -152,7 +152,7 @@ def _of_pose(evidence: Evidence, pose: int) -> Evidence:
 def _sized(
     evidence: Evidence, poses: FloatArray, log_scales: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Starts enlarged about each view's camera such that depths, lengths and heights agree."""
+    """Starts enlarged about each view's camera such that depths and distances agree."""
     poses, log_scales = poses.copy(), log_scales.copy()
     for pose, logs in zip(poses, log_scales, strict=True):
         factor = _size_factor(evidence, pose, np.exp(logs))
@@ -168,7 +168,7 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
     NaN where nothing is measured.
     """
     sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
-    lengths, heights = evidence.lengths, evidence.heights
+    offsets = evidence.offsets
 
     def seen(point: IntArray, image: IntArray) -> FloatArray:
         turns = poses[evidence.rig.pose[image]]
@@ -178,16 +178,10 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
     has_depth = sightings.depths[:, 1] > 0
     depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
     distances = (seen(planes.point, planes.image) * planes.normal).sum(axis=1)
-    box = mean[lengths.points[:, 1]] - mean[lengths.points[:, 0]]
-    extents = (box * scale)[np.arange(len(box)), lengths.axis]
-    turns = poses[evidence.rig.pose[heights.image]][:, :9].reshape(-1, 3, 3)
-    ups = np.einsum("nij,nj->ni", turns, heights.direction)
-    below = -(seen(heights.point, heights.image) * ups).sum(axis=1)
     ratios = [
         sightings.depths[has_depth, 0] / depths,
         planes.depth / distances,
-        lengths.value / extents,
-        heights.value / below,
+        offsets.value / distances_of(evidence, poses, mean * scale),
     ]
     told = np.concatenate(ratios)
     return float(np.median(told)) if len(told) else float("nan")

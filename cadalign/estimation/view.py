@@ -24,15 +24,17 @@ from cadalign.errors import InputError, quote
 from cadalign.estimation.model import checked_ids
 from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
+from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import read_grey
 
 _ROTATION_TOLERANCE = 1e-6
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
+_DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class View(DeclaredEvidence):
     """Evidence of one image about an object.
 
     Parameters
@@ -54,7 +56,7 @@ class View:
         the object's size is wanted]; 0 or NaN where unknown. A depth image is sampled robustly at
         the keypoints and, with a mask and a mesh, over the visible surface.
     depth_sigma : float or (n,) float
-        Standard deviation of the depths, relative (0.005 is 0.5 %).
+        Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional
         Units per count of a depth image; by default 0.001 for a file (millimetres to metres), 1 for
         an array of floats.
@@ -78,6 +80,9 @@ class View:
         [0, 1], or an 8-bit grey PNG that is not zero there.
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
+    more : mapping of str to values
+        Evidence of registered kinds; see
+        `cadalign.estimation.evidence_kinds.register_evidence`.
 
     Raises
     ------
@@ -99,18 +104,12 @@ class View:
     ids: Sequence[Hashable] | None = None
     sigma: Sigma | None = 1.0
     confidences: npt.ArrayLike | None = None
-    depth: npt.ArrayLike | str | os.PathLike[str] | None = None
-    depth_sigma: npt.ArrayLike = 0.01
-    up: npt.ArrayLike | None = None
-    up_sigma_deg: npt.ArrayLike = 1.0
-    cam_from_rig: npt.ArrayLike | None = None
-    depth_scale: float | None = None
-    camera_height: float | None = None
-    camera_height_sigma: float = 0.02
-    mask: npt.ArrayLike | str | os.PathLike[str] | None = None
-    mask_sigma: float | None = None
 
     def __post_init__(self) -> None:
+        self._check_more()
+        for name, value in _DEFAULTS.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         _check_camera(self.camera)
         points = np.empty((0, 2)) if np.size(self.points_2d) == 0 else self.points_2d
         points = as_points(points, name="points_2d", dimension=2)
@@ -119,7 +118,7 @@ class View:
         if self.depth is not None:
             depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
             object.__setattr__(self, "depth", read_only(depth))
-        checked_depth_sigma(self.depth_sigma, self.depth, len(points))
+        checked_depth_sigma(cast(float, self.depth_sigma), self.depth, len(points))
         self._check_up()
         if self.camera_height is not None:
             height = as_positive(self.camera_height, name="camera_height")
@@ -133,9 +132,7 @@ class View:
             as_positive(self.mask_sigma, name="mask_sigma")
 
     def __repr__(self) -> str:
-        names = ("mask", "depth", "up", "camera_height", "cam_from_rig")
-        given = [name for name in names if getattr(self, name) is not None]
-        return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *given])})"
+        return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *self.sources])})"
 
     @property
     def keypoint_ids(self) -> tuple[Hashable, ...]:

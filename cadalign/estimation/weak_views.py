@@ -13,6 +13,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.degeneracy import are_on_a_line
+from cadalign.estimation.evidence_kinds import is_told
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
@@ -45,7 +46,7 @@ def views_without_pose(
         number
         for number, view in enumerate(views)
         if inits[number] is None
-        and (len(view.keypoint_ids) or view.mask is not None or view.up is not None)
+        and (len(view.keypoint_ids) or view.mask is not None or is_told(view.given))
         and _is_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 
@@ -145,7 +146,15 @@ def _camera_of(view: View, estimated: Mapping[Camera, Camera]) -> Camera:
 def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -> Alignment:
     """A pose near that of the first view under which a view's keypoints fit."""
     scale = result.alignment.scale
-    alone = replace(view, camera=camera, depth=None, mask=None, mask_sigma=None, camera_height=None)
+    alone = View(
+        camera,
+        view.points_2d,
+        ids=view.ids,
+        sigma=view.sigma,
+        confidences=view.confidences,
+        up=view.up,
+        up_sigma_deg=view.up_sigma_deg,
+    )
     if not len(view.keypoint_ids) and view.up is None:
         return result.alignment
     evidence = evidence_of(prior, [alone], None, loss=LINEAR, loss_scale=1.0)

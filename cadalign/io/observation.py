@@ -80,6 +80,7 @@ import msgspec
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
+from cadalign.io.evidence import Size
 from cadalign.io.files import write_json
 from cadalign.io.observation_file import (
     fill_xyz,
@@ -89,7 +90,7 @@ from cadalign.io.observation_file import (
     read_start,
     write_image_fields,
 )
-from cadalign.io.observed_image import KnownSize, ObservedImage
+from cadalign.io.observed_image import ObservedImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ class Observation(ObservedImage):
         Keyword arguments for `cadalign.fit` where they are not its defaults; see the module.
     others : tuple of ObservedImage
         The other images.
-    size : KnownSize, optional
+    size : Size, optional
         Known lengths of the object.
     shape : Path, optional
         File of the learned shape that takes the model's place.
@@ -121,7 +122,7 @@ class Observation(ObservedImage):
     model: Path | None = None
     fit_options: Mapping[str, Any] = field(default_factory=dict)
     others: tuple[ObservedImage, ...] = field(default=(), kw_only=True)
-    size: KnownSize | None = field(default=None, kw_only=True)
+    size: Size | None = field(default=None, kw_only=True)
     shape: Path | None = field(default=None, kw_only=True)
     symmetry: Symmetry | None = field(default=None, kw_only=True)
     init: Alignment | None = field(default=None, kw_only=True)

@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -20,7 +21,6 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, shift_of
 from cadalign.io.documents import (
     Document,
-    Finite,
     Labelled,
     NotNegative,
     PathText,
@@ -33,10 +33,10 @@ from cadalign.io.documents import (
     within,
     written_path,
 )
-from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.io.evidence import EvidenceField, ImageEvidence, Size, as_arguments, evidence_fields
+from cadalign.io.observed_image import ObservedImage
 
-_Row4 = tuple[Finite, Finite, Finite, Finite]
-_PATHS = ("mask", "depth")
+Declared = TypeVar("Declared", bound=Document)
 
 
 class KeypointFields(Labelled, kw_only=True):
@@ -91,21 +91,11 @@ class StartFields(Document):
 
 
 class _ImageFields(Document, kw_only=True):
-    """Fields of one image, beside its keypoints."""
+    """Fields of one image, beside its keypoints and `cadalign.io.evidence`."""
 
     camera: Any  # in the form of `Camera.from_dict`
     pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
     image: PathText | None = None
-    mask: PathText | None = None
-    mask_sigma: Positive | None = None
-    depth: PathText | None = None
-    depth_scale: Positive | None = None
-    depth_sigma: Positive | None = None
-    up: Point3 | None = None
-    up_sigma_deg: Positive | None = None
-    camera_height: Positive | None = None
-    camera_height_sigma: Positive | None = None
-    cam_from_rig: tuple[_Row4, _Row4, _Row4, _Row4] | None = None
 
 
 class ViewFields(_ImageFields, kw_only=True):
@@ -146,6 +136,21 @@ class SeveralViews(Document, kw_only=True):
     fit: FitFields = msgspec.field(default_factory=FitFields)
 
 
+def with_evidence(fields: type[Declared]) -> type[Declared]:
+    """The declared fields of an image, or of a file of several, with those of its evidence."""
+    return _with_evidence(fields, evidence_fields())
+
+
+@cache
+def _with_evidence(fields: type[Declared], evidence: tuple[EvidenceField, ...]) -> type[Declared]:
+    added: list[tuple[str, Any, Any]] = [(each.name, each.stored | None, None) for each in evidence]
+    if issubclass(fields, SeveralViews):
+        views: Any = _with_evidence(ViewFields, evidence)
+        added = [("views", Annotated[list[views], Meta(min_length=1)], msgspec.NODEFAULT)]
+    extended = msgspec.defstruct(fields.__name__, added, bases=(fields,), kw_only=True)
+    return cast("type[Declared]", extended)
+
+
 def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | OneView, ...]]:
     """Check the parsed form of a file; returns its fields and those of its views.
 
@@ -156,13 +161,13 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
     """
     if not isinstance(data, Mapping) or "views" not in data:
         is_started = isinstance(data, Mapping) and data.get("init") is not None
-        one: OneView = convert(data, StartedView if is_started else OneView)
+        one: OneView = convert(data, with_evidence(StartedView if is_started else OneView))
         sigma = one.fit.sigma
         if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
             what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"
             raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
         return one, (one,)
-    several: SeveralViews = convert(data, SeveralViews)
+    several: SeveralViews = convert(data, with_evidence(SeveralViews))
     if isinstance(several.fit.sigma, list):
         fix = "give one for all, or `sigma` of every keypoint"
         raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
@@ -179,12 +184,11 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
     """
     names = _column(read.keypoints, "name")
     ids = _column(read.keypoints, "semantic_id")
-    evidence = {name: getattr(read, name) for name in ImageEvidence.__dataclass_fields__}
-    for name in _PATHS:
-        if evidence[name] is not None:
-            evidence[name] = path_from(evidence[name], folder)
-    if evidence["cam_from_rig"] is not None:
-        evidence["cam_from_rig"] = np.array(evidence["cam_from_rig"])
+    evidence = {}
+    for each in evidence_fields():
+        value = getattr(read, each.name)
+        is_path = each.stored is PathText and value is not None
+        evidence[each.name] = path_from(value, folder) if is_path else value
     return ObservedImage(
         points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
         points_2d=np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
@@ -196,22 +200,19 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
         confidences=_column(read.keypoints, "confidence"),
         image=None if read.image is None else path_from(read.image, folder),
         depths=_depths(read.keypoints),
-        evidence=ImageEvidence(**evidence),
+        evidence=ImageEvidence(**as_arguments(evidence)),
     )
 
 
-def read_size(read: SizeFields | None) -> KnownSize | None:
+def read_size(read: SizeFields | None) -> Size | None:
     """The known lengths, if there are any.
 
     Raises
     ------
-    DataError
-        If ``size`` has no length, or neither one deviation nor three.
+    InputError
+        If it has no length, or neither one standard deviation nor three.
     """
-    if read is None:
-        return None
-    with within("size"):
-        return KnownSize(**msgspec.structs.asdict(read))
+    return None if read is None else Size(**msgspec.structs.asdict(read))
 
 
 def read_start(read: StartFields | None) -> Alignment | None:

@@ -2,87 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_positive
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
-
-_REFINES = {
-    "mask_sigma": "mask",
-    "depth_scale": "depth",
-    "up_sigma_deg": "up",
-    "camera_height_sigma": "camera_height",
-}
-
-_NUMBERS = (*_REFINES, "depth_sigma", "camera_height")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ImageEvidence:
-    """Evidence of an image beyond keypoints; None for what is not known.
-
-    Parameters
-    ----------
-    mask : Path, optional
-        PNG of the camera's size, nonzero where the object is seen.
-    mask_sigma : float, optional
-        Standard deviation of its contour [px].
-    depth : Path, optional
-        Depth image of the camera's size, a PNG of 16 bits.
-    depth_scale : float, optional
-        Model units of one count of it.
-    depth_sigma : float, optional
-        Relative standard deviation of depths, of the image or of the keypoints.
-    up : (3,) float, optional
-        The model's up axis in the camera's frame.
-    up_sigma_deg : float, optional
-        Its standard deviation [degrees].
-    camera_height : float, optional
-        Height of the camera above the plane the object stands on [model units].
-    camera_height_sigma : float, optional
-        Its relative standard deviation.
-    cam_from_rig : (4, 4) float, optional
-        The camera's known pose in the frame that the views share.
-
-    Raises
-    ------
-    InputError
-        If a number is not positive, a deviation or scale is given without what it is of, or an
-        array has a wrong shape.
-    """
-
-    mask: Path | None = None
-    mask_sigma: float | None = None
-    depth: Path | None = None
-    depth_scale: float | None = None
-    depth_sigma: float | None = None
-    up: FloatArray | None = None
-    up_sigma_deg: float | None = None
-    camera_height: float | None = None
-    camera_height_sigma: float | None = None
-    cam_from_rig: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        for name, of in _REFINES.items():
-            if getattr(self, name) is not None and getattr(self, of) is None:
-                raise InputError(f"given without {of}", where=name, fix=f"give {of}, too")
-        for name in _NUMBERS:
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, as_positive(value, name=name))
-        for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, as_floats(value, name=name, shape=shape))
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The fields that are known."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+from cadalign.io.evidence import ImageEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,38 +85,3 @@ class ObservedImage:
     def has_more(self) -> bool:
         """True where more than keypoints is known."""
         return self.depths is not None or bool(self.evidence.given)
-
-
-@dataclass(frozen=True, kw_only=True)
-class KnownSize:
-    """Known lengths of the object's box along x, y and z; None where unknown.
-
-    Parameters
-    ----------
-    width, height, length : float, optional
-        Along x, y, z [model units].
-    sigma : float or sequence of 3 float, optional
-        Relative standard deviation of all, or of each.
-
-    Raises
-    ------
-    InputError
-        If no length is given, or neither one deviation nor three.
-    """
-
-    width: float | None = None
-    height: float | None = None
-    length: float | None = None
-    sigma: float | Sequence[float] | None = None
-
-    def __post_init__(self) -> None:
-        if self.width is None and self.height is None and self.length is None:
-            raise InputError("no length is given", fix="give width, height or length")
-        if isinstance(self.sigma, Sequence) and len(self.sigma) != 3:
-            what = f"{len(self.sigma)} numbers"
-            raise InputError(what, where="sigma", fix="give one, or one for each of 3 lengths")
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The fields that are known."""
-        return {name: value for name, value in vars(self).items() if value is not None}

@@ -19,9 +19,9 @@ from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ImageEvidence, KnownSize
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
@@ -60,7 +60,7 @@ def observed(case: Case, *pieces: str) -> Observation:
         given |= {"camera_height": float(max(-lowest, 0.1)), "up": up}
     if "size" in pieces:
         lengths = np.ptp(np.asarray(instance.scene.bounds), axis=0) * truth.scale  # type: ignore[union-attr]
-        fields["size"] = KnownSize(width=float(lengths[0]), height=float(lengths[1]), sigma=0.01)
+        fields["size"] = Size(width=float(lengths[0]), height=float(lengths[1]), sigma=0.01)
     first = Observation(
         instance.points_3d,
         instance.points_2d,

@@ -283,7 +283,7 @@ def test_an_assumed_focal_length_of_one_photo_keeps_the_alignment_from_being_sav
 
 def test_photos_beside_a_rig_are_refused(case: Case) -> None:
     instance = case.instance
-    from cadalign.io.observed_image import ImageEvidence
+    from cadalign.io.evidence import ImageEvidence
 
     first = Observation(
         instance.points_3d,

@@ -22,8 +22,9 @@ from cadalign import Alignment, Camera, Model, Result, Size, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.io.observed_image import ObservedImage
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.overlay import EST_COLOR
@@ -57,7 +58,7 @@ def test_gravity_and_size_are_used_as_by_align(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     height = float(np.ptp(POINTS[:, 1]) * TRUTH.scale[1])
-    path = write(tmp_path, observed(up=UP, up_sigma_deg=2.0), size=KnownSize(height=height))
+    path = write(tmp_path, observed(up=UP, up_sigma_deg=2.0), size=Size(height=height))
     assert main(["fit", str(path)]) == 0
     view = View(CAMERA, observed().points_2d, up=UP, up_sigma_deg=2.0)
     expected = align(Model(points_3d=POINTS), view, size=Size(height=height))

@@ -12,8 +12,9 @@ from support.files import replaced, write_json
 
 from cadalign import Alignment, Camera
 from cadalign.errors import DataError, InputError
+from cadalign.io.evidence import ImageEvidence, Size
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ImageEvidence, KnownSize, ObservedImage
+from cadalign.io.observed_image import ObservedImage
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [500.0, 500.0, 320.0, 240.0]}
 KEYPOINTS = [
@@ -227,4 +228,4 @@ def test_arrays_of_evidence_are_checked() -> None:
     with pytest.raises(InputError, match="cam_from_rig: "):
         ImageEvidence(cam_from_rig=np.eye(3))
     with pytest.raises(InputError, match="no length is given"):
-        KnownSize()
+        Size()

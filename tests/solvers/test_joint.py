@@ -14,8 +14,7 @@ from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
     Focals,
-    Heights,
-    Lengths,
+    Offsets,
     Planes,
     Rig,
     ScalePriors,
@@ -64,12 +63,17 @@ def evidence_of(
         np.array([[0, 0.8, 0.6]]),
         np.array([1]),
         30 * np.eye(3)[None] + rng.normal(size=(1, 3, 3)),
+        np.zeros(1, dtype=np.int64),
     )
-    lengths = Lengths(
-        np.array([[0, 1], [2, 3]]), np.array([0, 1]), np.array([1.0, 2.0]), np.array([10.0, 20.0])
-    )
-    heights = Heights(
-        np.array([5]), np.array([1]), np.array([[0.0, 0.6, 0.8]]), np.array([2.0]), np.array([20.0])
+    ends = [[0, 1], [2, 3], [5, -1], [-1, 4]]  # two lengths, a height, and a distance from a camera
+    along = [[1.0, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0.8, 0, 0.6]]
+    offsets = Offsets(
+        np.array(ends),
+        np.array([-1, -1, 1, 0]),
+        np.array(along),
+        np.array([1.0, 2.0, 2.0, -3.0]),
+        np.array([10.0, 20.0, 20.0, 10.0]),
+        np.arange(4),
     )
     planes = Planes(
         np.array([2, 6]),
@@ -91,7 +95,7 @@ def evidence_of(
         np.full(focals, 30.0),
     )
     rig = Rig(cameras, np.array(poses))
-    return Evidence(shape, sightings, rig, lenses, up, lengths, heights, planes, scales)
+    return Evidence(shape, sightings, rig, lenses, up, offsets, planes, scales)
 
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
@@ -212,8 +216,7 @@ def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
 
 def with_sightings_alone(evidence: Evidence) -> Evidence:
     return evidence._replace(
-        lengths=Lengths(*(column[:0] for column in evidence.lengths)),
-        heights=Heights(*(column[:0] for column in evidence.heights)),
+        offsets=Offsets(*(column[:0] for column in evidence.offsets)),
         planes=Planes(*(column[:0] for column in evidence.planes)),
     )
 
@@ -258,8 +261,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     each = spread * np.eye(3 * POINTS).reshape(-1, POINTS, 3)
     evidence = seen_from(evidence, state_of(5, 1))
     evidence = evidence._replace(
-        lengths=Lengths(*(column[:0] for column in evidence.lengths)),
-        heights=Heights(*(column[:0] for column in evidence.heights)),
+        offsets=Offsets(*(column[:0] for column in evidence.offsets)),
         planes=Planes(*(column[:0] for column in evidence.planes)),
     )
     as_modes = evidence._replace(

@@ -27,8 +27,8 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import write_json
-from cadalign.io.observed_image import ImageEvidence
 
 logger = logging.getLogger("cadalign")
 

@@ -380,8 +380,7 @@ def with_points(
     own[:, :keypoints] = shape.modes[:, :keypoints]
     own[:, keypoints + total :] = shape.modes[:, keypoints:]
     all_modes[:, keypoints : keypoints + total] = modes
-    sightings, lengths = evidence.sightings, evidence.lengths
-    heights, planes = evidence.heights, evidence.planes
+    sightings, offsets, planes = evidence.sightings, evidence.offsets, evidence.planes
     return evidence._replace(
         shape=Shape(
             np.concatenate([shape.mean[:keypoints], mean, shape.mean[keypoints:]]),
@@ -389,8 +388,7 @@ def with_points(
             np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]]),
         ),
         sightings=sightings._replace(point=_moved(sightings.point, keypoints, total)),
-        lengths=lengths._replace(points=_moved(lengths.points, keypoints, total)),
-        heights=heights._replace(point=_moved(heights.point, keypoints, total)),
+        offsets=offsets._replace(ends=_moved(offsets.ends, keypoints, total)),
         planes=planes._replace(point=_moved(planes.point, keypoints, total)),
     )
 

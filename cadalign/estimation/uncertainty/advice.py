@@ -20,13 +20,14 @@ from cadalign.estimation.estimates import (
     pose_and_lengths,
     with_box,
 )
-from cadalign.estimation.model import Model, Size
+from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, is_exact, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
+from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
@@ -191,7 +192,7 @@ def _lengths(scene: KnownScene) -> Iterator[Advice]:
 
 def _relative(size: Size | None) -> FloatArray:
     """Relative deviations (3,) of known lengths."""
-    given = LENGTH_SIGMA if size is None else size.sigma
+    given = LENGTH_SIGMA if size is None else size.relative
     return np.broadcast_to(np.asarray(given, dtype=np.float64), (3,))
 
 
@@ -213,7 +214,7 @@ def _keypoints(scene: KnownScene, name: Hashable) -> Iterator[Advice]:
 
 def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
     count = len(view.keypoint_ids)
-    depth = view.depth
+    depth, relative = view.depth, np.asarray(view.depth_sigma, dtype=np.float64)
     sigma = 1.0 if view.sigma is None else view.sigma
     if depth is not None and view.depth_image is None:
         depth = np.append(cast(FloatArray, depth), np.nan)
@@ -224,7 +225,7 @@ def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
         sigma=_with_mean(sigma, count, is_one=np.ndim(sigma) == 0),
         confidences=None,
         depth=depth,
-        depth_sigma=_with_mean(view.depth_sigma, count, is_one=np.ndim(view.depth_sigma) == 0),
+        depth_sigma=_with_mean(relative, count, is_one=relative.ndim == 0),
     )
 
 

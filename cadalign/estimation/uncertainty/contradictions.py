@@ -269,7 +269,7 @@ def _is_plausible(factor: float) -> bool:
 
 def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
     has_depth = len(evidence.planes.point) or (evidence.sightings.depths[:, 1] > 0).any()
-    others = len(evidence.lengths.value) + len(evidence.heights.value)
+    others = len(evidence.offsets.value)
     is_rig = (np.bincount(evidence.rig.pose) > 1).any()
     return bool(has_depth and not others and not is_rig)
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.estimates import pose_and_lengths
+from cadalign.estimation.evidence_kinds import SIZE, kind_names
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
@@ -25,6 +26,7 @@ from cadalign.solvers.joint.evidence import (
     Rig,
     Sightings,
     State,
+    distances_of,
     log_focals_of,
     points_of,
 )
@@ -53,14 +55,20 @@ def pieces_of(evidence: Evidence) -> list[Piece]:
             "keypoints": keypoints_in(evidence, view),
             "mask": contours_in(evidence, view),
             "depth": np.append(depths_in(evidence, view), evidence.planes.image == view),
-            "gravity": evidence.directions.image == view,
-            "camera height": evidence.heights.image == view,
+            **{kind: _known_in(evidence, Piece(kind, view)) for kind in kind_names()},
             "rig": np.array([poses[pose] > 1]),
         }
         pieces.extend(Piece(kind, view) for kind, rows in told.items() if rows.any())
-    if len(evidence.lengths.value):
-        pieces.append(Piece("size", None))
+    if _known_in(evidence, Piece(SIZE, None)).any():
+        pieces.append(Piece(SIZE, None))
     return pieces
+
+
+def _known_in(evidence: Evidence, piece: Piece) -> BoolArray:
+    """Known directions, then distances, that belong to a piece."""
+    number, view = kind_names().index(piece.kind), -1 if piece.view is None else piece.view
+    tables = (evidence.directions, evidence.offsets)
+    return np.concatenate([(each.kind == number) & (each.image == view) for each in tables])
 
 
 def keypoints_in(evidence: Evidence, view: int) -> BoolArray:
@@ -88,9 +96,11 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
     Without the known motion of its camera, a view has a pose of its own.
     """
     view = piece.view
-    if view is None:
-        none = np.zeros(len(evidence.lengths.value), dtype=bool)
-        return evidence._replace(lengths=kept_rows(evidence.lengths, none)), state
+    if view is None or piece.kind in kind_names():
+        kept, count = ~_known_in(evidence, piece), len(evidence.directions.kind)
+        directions = kept_rows(evidence.directions, kept[:count])
+        offsets = kept_rows(evidence.offsets, kept[count:])
+        return evidence._replace(directions=directions, offsets=offsets), state
     if piece.kind == "rig":
         return _unlinked(evidence, state, view)
     if piece.kind == "keypoints":
@@ -98,13 +108,7 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
     if piece.kind == "mask":
         kept = ~contours_in(evidence, view)
         return evidence._replace(sightings=kept_rows(evidence.sightings, kept)), state
-    if piece.kind == "depth":
-        return _without_depth(evidence, view), state
-    if piece.kind == "gravity":
-        rest = kept_rows(evidence.directions, evidence.directions.image != view)
-        return evidence._replace(directions=rest), state
-    rest_of_heights = kept_rows(evidence.heights, evidence.heights.image != view)
-    return evidence._replace(heights=rest_of_heights), state
+    return _without_depth(evidence, view), state
 
 
 def kept_rows(rows: Rows, kept: BoolArray) -> Rows:
@@ -144,8 +148,8 @@ def count_equations(evidence: Evidence) -> int:
     count = 2 * int((sightings.whitening[:, 2] > 0).sum())
     count += int((sightings.whitening[sightings.whitening[:, 2] == 0].any(axis=1)).sum())
     count += int((sightings.depths[:, 1] > 0).sum())
-    count += 2 * len(evidence.directions.image) + len(evidence.lengths.weight)
-    count += len(evidence.heights.weight) + len(evidence.planes.weight)
+    count += 2 * len(evidence.directions.image) + len(evidence.offsets.weight)
+    count += len(evidence.planes.weight)
     count += len(evidence.shape.modes)
     if has_scale_prior(evidence.scales):
         count += int(np.linalg.matrix_rank(evidence.scales.precision))
@@ -161,13 +165,9 @@ def summaries_of(
     for view, camera in enumerate(cameras):
         found.extend(_of_keypoints(evidence, state, points, view, camera))
         found.extend(_of_depths(evidence, state, points, view))
-        found.extend(_of_up(evidence, state, view))
-        found.extend(_of_height(evidence, state, points, view))
-    lengths = evidence.lengths
-    if len(lengths.value):
-        box = points[lengths.points[:, 1]] - points[lengths.points[:, 0]]
-        errors = box[np.arange(len(box)), lengths.axis] - lengths.value
-        found.append(_summary("size", None, errors, errors * lengths.weight, ""))
+        for kind in kind_names():
+            found.extend(_of_known(evidence, state, Piece(kind, view)))
+    found.extend(_of_known(evidence, state, Piece(SIZE, None)))
     return tuple(found)
 
 
@@ -253,34 +253,26 @@ def plane_distances(
     return met, planes.depth, planes.weight, planes.image
 
 
-def _of_up(evidence: Evidence, state: State, view: int) -> list[EvidenceSummary]:
-    directions, rig = evidence.directions, evidence.rig
-    rows = directions.image == view
-    if not rows.any():
-        return []
-    rotation = rig.cam_from_rig[view][:9].reshape(3, 3) @ state.poses[rig.pose[view]][:9].reshape(
-        3, 3
-    )
-    differences = directions.model[rows] @ rotation.T - directions.camera[rows]
-    whitened = np.einsum("nij,nj->ni", directions.whitening[rows], differences)
-    halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)
-    angles = np.degrees(2 * np.arcsin(halves))
-    return [_summary("gravity", view, angles, np.linalg.norm(whitened, axis=1), "deg", 2)]
-
-
-def _of_height(
-    evidence: Evidence, state: State, points: FloatArray, view: int
-) -> list[EvidenceSummary]:
-    heights, rig = evidence.heights, evidence.rig
-    rows = heights.image == view
-    if not rows.any():
-        return []
-    seen = seen_in_cameras(evidence, state, points[heights.point[rows]], heights.image[rows])
-    rotation = rig.cam_from_rig[view][:9].reshape(3, 3) @ state.poses[rig.pose[view]][:9].reshape(
-        3, 3
-    )
-    errors = -(seen * (heights.direction[rows] @ rotation.T)).sum(axis=1) - heights.value[rows]
-    return [_summary("camera height", view, errors, errors * heights.weight[rows], "")]
+def _of_known(evidence: Evidence, state: State, piece: Piece) -> list[EvidenceSummary]:
+    """The summaries of a piece's known directions and distances."""
+    rows, count = _known_in(evidence, piece), len(evidence.directions.kind)
+    found = []
+    directions = kept_rows(evidence.directions, rows[:count])
+    if len(directions.kind):
+        origin = seen_in_cameras(evidence, state, 0.0 * directions.model, directions.image)
+        seen = seen_in_cameras(evidence, state, directions.model, directions.image)
+        differences = seen - origin - directions.camera
+        whitened = np.einsum("nij,nj->ni", directions.whitening, differences)
+        halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)
+        angles = np.degrees(2 * np.arcsin(halves))
+        found.append(_summary(*piece, angles, np.linalg.norm(whitened, axis=1), "deg", 2))
+    offsets = kept_rows(evidence.offsets, rows[count:])
+    if len(offsets.kind):
+        points = points_of(evidence.shape, state)
+        measured = evidence._replace(offsets=offsets)
+        errors = distances_of(measured, state.poses, points) - offsets.value
+        found.append(_summary(*piece, errors, errors * offsets.weight, ""))
+    return found
 
 
 def _numbers(rows: BoolArray, view: int) -> IntArray:

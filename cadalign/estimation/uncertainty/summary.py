@@ -10,18 +10,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.evidence_kinds import field_of
 from cadalign.estimation.uncertainty.weakness import Uncertainty
 
-KINDS = ("keypoints", "mask", "depth", "gravity", "size", "camera height", "rig")
-"""Kinds of evidence."""
-_FIELDS = {
-    "keypoints": "points_2d",
-    "mask": "mask",
-    "depth": "depth",
-    "gravity": "up",
-    "camera height": "camera_height",
-    "rig": "cam_from_rig",
-}
 _MOST_NAMED = 5  # outliers, in a sentence
 
 
@@ -32,7 +23,8 @@ class EvidenceSummary:
     Parameters
     ----------
     kind : str
-        "keypoints", "mask", "depth", "gravity", "size", "camera height" or "rig".
+        "keypoints", "mask", "depth", "gravity", "size", "camera height", "rig", or the name of a
+        registered kind.
     view : int, optional
         Number of the view; None for the object's size.
     count : int
@@ -94,7 +86,7 @@ def name_of(kind: str, view: int | None) -> str:
     >>> name_of("size", None), name_of("depth", 0)
     ('size', 'views[0].depth')
     """
-    return kind if view is None else f"views[{view}].{_FIELDS[kind]}"
+    return kind if view is None else f"views[{view}].{field_of(kind)}"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
-from cadalign.estimation.model import Size
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound
@@ -27,6 +26,7 @@ from cadalign.evaluation.evidence.options import (
 from cadalign.evaluation.evidence.scene import ObjectScene, Shot
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.alignment import Alignment
+from cadalign.io.evidence import Size
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 

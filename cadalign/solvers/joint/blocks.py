@@ -1,4 +1,4 @@
-"""Blocks of evidence beside sightings: priors, directions, lengths, heights and planes.
+"""Blocks of evidence beside sightings: priors, directions, offsets and planes.
 
 Each adds equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by
 the pose, the log focals, the log scales and the coefficients, and a residual. Displacements don't
@@ -21,8 +21,7 @@ def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add all evidence but sightings; returns its cost."""
     cost = _add_priors(evidence, state, arrow)
     cost += _add_directions(evidence, state, arrow)
-    cost += _add_lengths(evidence, state, arrow)
-    cost += _add_heights(evidence, state, arrow)
+    cost += _add_offsets(evidence, state, arrow)
     cost += _add_planes(evidence, state, arrow)
     return cost
 
@@ -95,59 +94,47 @@ def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
 
 
 @kernel
-def _add_lengths(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add known lengths along the model's axes."""
-    lengths = evidence.lengths
-    row = np.empty(6 + arrow.border.shape[0])
-    cost = 0.0
-    for j in range(lengths.axis.shape[0]):
-        low, high, a = lengths.points[j, 0], lengths.points[j, 1], lengths.axis[j]
-        extent = np.exp(state.log_scales[a]) * (
-            _undisplaced(evidence, state, high, a) - _undisplaced(evidence, state, low, a)
-        )
-        weight = lengths.weight[j]
-        value = (extent - lengths.value[j]) * weight
-        cost += value * value
-        row[:] = 0.0
-        _add_shape(evidence, state, high, a, weight, row)
-        _add_shape(evidence, state, low, a, -weight, row)
-        add_row(arrow, 0, row, value)
-    return cost
+def _add_offsets(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add known distances along directions of the model.
 
-
-@kernel
-def _add_heights(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add heights of cameras above the plane through a point, across a direction of the model.
-
-    The height is ``-direction . (x + R' q)`` with the stretched point x and the camera's place
-    ``-q`` in the rig's frame, which the pose (R, t) leads to.
+    A camera's place in the model's frame is ``-R' q``, with the pose (R, t), the camera's (C, c) in
+    the rig and ``q = t + C' c``: along the direction d it is ``-(R d) . q``.
     """
-    heights, rig = evidence.heights, evidence.rig
+    offsets, rig = evidence.offsets, evidence.rig
     row = np.empty(6 + arrow.border.shape[0])
-    up, q = np.empty(3), np.empty(3)
+    turned, q = np.empty(3), np.empty(3)
     cost = 0.0
-    for j in range(heights.point.shape[0]):
-        v, i = heights.image[j], heights.point[j]
-        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        weight = heights.weight[j]
-        value = heights.value[j]
+    for j in range(offsets.value.shape[0]):
+        v, weight = offsets.image[j], offsets.weight[j]
+        p = 0 if v < 0 else rig.pose[v]
+        value = -offsets.value[j]
         row[:] = 0.0
-        for r in range(3):
-            up[r] = 0.0
-            q[r] = pose[9 + r]
+        for end in range(2):
+            sign = 2.0 * end - 1.0
+            i = offsets.ends[j, end]
+            if i < 0:
+                camera, pose = rig.cam_from_rig[v], state.poses[p]
+                for r in range(3):
+                    turned[r] = 0.0
+                    q[r] = pose[9 + r]
+                    for a in range(3):
+                        turned[r] += pose[3 * r + a] * offsets.direction[j, a]
+                        q[r] += camera[3 * a + r] * camera[9 + a]
+                _write_turn(turned, q, row)
+                for r in range(3):
+                    value -= sign * turned[r] * q[r]
+                    row[r] *= -sign * weight
+                    row[3 + r] = -sign * weight * turned[r]
+                continue
             for a in range(3):
-                up[r] += pose[3 * r + a] * heights.direction[j, a]
-                q[r] += camera[3 * a + r] * camera[9 + a]
-            stretched = np.exp(state.log_scales[r]) * _undisplaced(evidence, state, i, r)
-            value += up[r] * q[r] + heights.direction[j, r] * stretched
-            row[3 + r] = weight * up[r]
-            _add_shape(evidence, state, i, r, weight * heights.direction[j, r], row)
+                along = sign * offsets.direction[j, a]
+                if along != 0.0:
+                    stretched = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+                    value += along * stretched
+                    _add_shape(evidence, state, i, a, weight * along, row)
         value *= weight
         cost += value * value
-        _write_turn(up, q, row)
-        for r in range(3):
-            row[r] *= weight
-        add_row(arrow, rig.pose[v], row, value)
+        add_row(arrow, p, row, value)
     return cost
 
 

@@ -75,35 +75,30 @@ class Directions(NamedTuple):
     """Directions ``model`` (D, 3) seen as ``camera`` (D, 3) in a view.
 
     ``whitening`` (D, 3, 3) [1/rad] gives the difference of the unit vectors unit covariance.
+    ``kind`` (D,) numbers the kind of evidence, for what is said of a result.
     """
 
     model: FloatArray
     camera: FloatArray
     image: IntArray
     whitening: FloatArray
+    kind: IntArray
 
 
-class Lengths(NamedTuple):
-    """Differences of coordinate ``axis`` (L,) of two ``points`` (L, 2), and their ``weight``."""
+class Offsets(NamedTuple):
+    """Distances ``value`` (L,) along a ``direction`` (L, 3) of the model between two of its points.
 
-    points: IntArray
-    axis: IntArray
-    value: FloatArray
-    weight: FloatArray
-
-
-class Heights(NamedTuple):
-    """Heights ``value`` (H,) of the cameras ``image`` (H,) above planes through ``point`` (H,).
-
-    The planes lie across ``direction`` (H, 3) of the model; ``weight`` (H,) is the inverse
-    deviation.
+    ``ends`` (L, 2) numbers the points from and to which they are measured, -1 for the place of the
+    camera ``image`` (L,), which is -1 where neither end is a camera. ``weight`` (L,) is the inverse
+    standard deviation and ``kind`` (L,) as in `Directions`.
     """
 
-    point: IntArray
+    ends: IntArray
     image: IntArray
     direction: FloatArray
     value: FloatArray
     weight: FloatArray
+    kind: IntArray
 
 
 class Planes(NamedTuple):
@@ -139,8 +134,7 @@ class Evidence(NamedTuple):
     rig: Rig
     focals: Focals
     directions: Directions
-    lengths: Lengths
-    heights: Heights
+    offsets: Offsets
     planes: Planes
     scales: ScalePriors
 
@@ -177,6 +171,16 @@ def packed(state: State) -> FloatArray:
 def log_focals_of(evidence: Evidence, state: State) -> FloatArray:
     """Log focal length (V,) of every view over that of its rays; 0 where it is known."""
     return np.append(state.log_focals, 0.0)[evidence.focals.group]  # the last, for -1
+
+
+def distances_of(evidence: Evidence, poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Distances (L,) of the evidence's offsets, under poses (P, 12) of the points (m, 3)."""
+    offsets, rig = evidence.offsets, evidence.rig
+    cameras, pose = rig.cam_from_rig[offsets.image], poses[rig.pose[offsets.image]]
+    turned = np.einsum("lji,lj->li", cameras[:, :9].reshape(-1, 3, 3), cameras[:, 9:])
+    in_model = -np.einsum("lji,lj->li", pose[:, :9].reshape(-1, 3, 3), pose[:, 9:] + turned)
+    places = np.where((offsets.ends < 0)[:, :, None], in_model[:, None], points[offsets.ends])
+    return np.asarray(((places[:, 1] - places[:, 0]) * offsets.direction).sum(axis=1))
 
 
 @kernel
@@ -216,8 +220,7 @@ def with_shape(evidence: Evidence, shape: Shape) -> Evidence:
         evidence.rig,
         evidence.focals,
         evidence.directions,
-        evidence.lengths,
-        evidence.heights,
+        evidence.offsets,
         evidence.planes,
         evidence.scales,
     )

@@ -105,12 +105,13 @@ def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
     used = _sighted_points(evidence)
-    lengths = evidence.lengths.points
-    for named in (evidence.heights.point, evidence.planes.point):
-        for i in named:
-            used[i] = True
-    for j in range(lengths.shape[0]):
-        used[lengths[j, 0]] = used[lengths[j, 1]] = True
+    ends = evidence.offsets.ends
+    for i in evidence.planes.point:
+        used[i] = True
+    for j in range(ends.shape[0]):
+        for end in range(2):
+            if ends[j, end] >= 0:
+                used[ends[j, end]] = True
     return used
 
 

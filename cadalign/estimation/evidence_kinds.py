@@ -1,0 +1,258 @@
+"""Kinds of evidence that are known directions and distances: gravity, camera height, size, others.
+
+A kind is a name, the fields that tell it, and a function that turns them into `KnownDirection` and
+`KnownDistance`: whoever writes it sees neither kernels nor derivatives. `register_evidence` adds
+one, and estimates, `result.evidence`, contributions, warnings, observation files and the command
+line follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
+from cadalign.estimation.prior import ShapePrior
+from cadalign.io.evidence import EvidenceField, Size, register_fields, remove_fields
+from cadalign.solvers.joint.evidence import Directions, Offsets
+
+CAMERA = -1
+"""The end of a `KnownDistance` that is the view's camera."""
+SIZE = "size"
+
+
+class KnownDirection(NamedTuple):
+    """A direction of the model that is known in the camera's frame.
+
+    Parameters
+    ----------
+    model, camera : (3,) float
+        Unit vectors.
+    sigma_deg : float or (3, 3) float
+        Standard deviation about each axis across it [degrees], or covariance [degrees squared].
+    """
+
+    model: FloatArray
+    camera: FloatArray
+    sigma_deg: Any
+
+    @property
+    def whitening(self) -> FloatArray:
+        """Whitening (3, 3) of the difference [1/rad]; along the direction as weak as across."""
+        sigma = np.asarray(self.sigma_deg, dtype=np.float64)
+        if not sigma.ndim:
+            return np.asarray(np.eye(3) / np.radians(sigma))
+        along = np.outer(self.camera, self.camera)
+        across = np.eye(3) - along
+        covariance = across @ np.radians(np.radians(sigma)) @ across
+        largest = np.linalg.eigvalsh(covariance)[-1]
+        return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance + largest * along)).T)
+
+
+class KnownDistance(NamedTuple):
+    """A distance along a direction of the model, from one of its points or the camera to another.
+
+    Parameters
+    ----------
+    ends : (int, int)
+        Rows of the shape's points, as `ShapePrior` has them, or `CAMERA`.
+    direction : (3,) float
+        Unit vector of the model's frame.
+    value, sigma : float
+        The distance, signed, and its standard deviation [model units, or those of the size].
+    """
+
+    ends: tuple[int, int]
+    direction: FloatArray
+    value: float
+    sigma: float
+
+
+Known = KnownDirection | KnownDistance
+
+
+@dataclass(frozen=True)
+class EvidenceKind:
+    """A kind of evidence of an image.
+
+    Parameters
+    ----------
+    name : str
+        As `EvidenceSummary.kind` says it.
+    field : str
+        The field of `View` without which a view has no such evidence.
+    known : function of (mapping of str to values, ShapePrior)
+        What the fields of a view tell; raises InputError that names the field where the model does
+        not allow it.
+    fields : tuple of EvidenceField
+        Fields to declare, of a kind that is registered. `View` takes them as ``more``.
+    """
+
+    name: str
+    field: str
+    known: Callable[[Mapping[str, Any], ShapePrior], Sequence[Known]]
+    fields: tuple[EvidenceField, ...] = ()
+
+
+def _upward(field: str, prior: ShapePrior) -> FloatArray:
+    """The model's up axis."""
+    if prior.up is None:
+        fix = f"learn it with an up axis, or leave `{field}` away"
+        raise InputError("the model has no up axis", where=field, fix=fix)
+    return prior.up
+
+
+def _gravity(given: Mapping[str, Any], prior: ShapePrior) -> list[Known]:
+    return [KnownDirection(_upward("up", prior), given["up"], given["up_sigma_deg"])]
+
+
+def _camera_height(given: Mapping[str, Any], prior: ShapePrior) -> list[Known]:
+    """From the box's corner in its lowest face to the camera."""
+    up = _upward("camera_height", prior)
+    lowest = len(prior.components[0].mean) - (2 if up.sum() > 0 else 1)
+    height = given["camera_height"]
+    sigma = np.hypot(height * given["camera_height_sigma"], prior.components[0].spread[lowest])
+    return [KnownDistance((lowest, CAMERA), up, height, float(sigma))]
+
+
+_KINDS = [
+    EvidenceKind("gravity", "up", _gravity),
+    EvidenceKind("camera height", "camera_height", _camera_height),
+]
+
+
+def register_evidence(kind: EvidenceKind) -> None:
+    """Add a kind of evidence to all estimates, files and commands of this process.
+
+    Parameters
+    ----------
+    kind : EvidenceKind
+        Takes the place of one of the same name.
+
+    Raises
+    ------
+    InputError
+        If the name is taken by keypoints, masks, depth, size or rig, or the kind does not declare
+        the field that gives it.
+
+    Examples
+    --------
+    The object's front, seen along the optical axis:
+
+    >>> import numpy as np
+    >>> from cadalign.io.evidence import EvidenceField
+    >>> def known(given, prior):
+    ...     front, axis = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+    ...     return [KnownDirection(front, axis, given["frontal_sigma_deg"])]
+    >>> field = EvidenceField("frontal_sigma_deg", float, "Deviation from a frontal view.", float)
+    >>> register_evidence(EvidenceKind("frontal", field.name, known, (field,)))
+    >>> remove_evidence("frontal")
+    """
+    if kind.name in _STRUCTURAL:
+        what = f"{kind.name!r} is a kind of its own"
+        raise InputError(what, where="name", fix="choose another name")
+    if kind.field not in {each.name for each in kind.fields}:
+        what = f"{kind.field!r} is not among the kind's fields"
+        raise InputError(what, where="field", fix="declare it in `fields`")
+    remove_evidence(kind.name)
+    register_fields(*kind.fields)
+    _KINDS.append(kind)
+
+
+def remove_evidence(name: str) -> None:
+    """Remove a registered kind."""
+    for kind in [each for each in _KINDS if each.name == name]:
+        _KINDS.remove(kind)
+        remove_fields(*(each.name for each in kind.fields))
+
+
+_STRUCTURAL = {"keypoints": "points_2d", "mask": "mask", "depth": "depth", "rig": "cam_from_rig"}
+
+
+def kind_names() -> tuple[str, ...]:
+    """Names of the kinds by their numbers in `Directions` and `Offsets`."""
+    return (SIZE, *(kind.name for kind in _KINDS))
+
+
+def field_of(kind: str) -> str:
+    """The field of `View` that gives a kind of evidence."""
+    return _STRUCTURAL.get(kind) or next(each.field for each in _KINDS if each.name == kind)
+
+
+def is_told(given: Mapping[str, Any]) -> bool:
+    """True where the fields of a view tell a direction or a distance."""
+    return any(kind.field in given for kind in _KINDS)
+
+
+def known_of(
+    prior: ShapePrior, views: Sequence[Mapping[str, Any]], size: Size | None
+) -> tuple[Directions, Offsets]:
+    """All known directions and distances of the fields of views, and of the size.
+
+    Raises
+    ------
+    InputError
+        If the model does not allow one.
+    """
+    found = [(0, -1, known) for known in _lengths(size, prior)]
+    for view, given in enumerate(views):
+        for number, kind in enumerate(_KINDS, start=1):
+            if kind.field not in given:
+                continue
+            try:
+                told = kind.known(given, prior)
+            except InputError as error:
+                where = f"views[{view}].{error.where}"
+                raise InputError(error.what, where=where, fix=error.fix) from None
+            found.extend((number, view, each) for each in told)
+    seen = [each for each in found if isinstance(each[2], KnownDirection)]
+    far = [each for each in found if isinstance(each[2], KnownDistance)]
+    return _directions(seen), _offsets(far)
+
+
+def _lengths(size: Size | None, prior: ShapePrior) -> list[Known]:
+    """Lengths between the corners of the box, which move by themselves."""
+    if size is None:
+        return []
+    corners = len(prior.components[0].mean) - 2
+    own = (prior.components[0].spread[-2:] ** 2).sum()
+    found: list[Known] = []
+    for axis in np.flatnonzero(np.isfinite(size.lengths)).tolist():
+        if not prior.lengths[axis] > 0:
+            what = f"the model has no extent along its {'xyz'[axis]}"
+            where = f"size.{('width', 'height', 'length')[axis]}"
+            raise InputError(what, where=where, fix="leave it away")
+        sigma = float(np.sqrt(size.deviations[axis] ** 2 + own))
+        ends = (corners, corners + 1)
+        found.append(KnownDistance(ends, np.eye(3)[axis], float(size.lengths[axis]), sigma))
+    return found
+
+
+_Numbered = tuple[int, int, Any]  # kind, view, what is known
+
+
+def _directions(found: Sequence[_Numbered]) -> Directions:
+    known: list[KnownDirection] = [each for _, _, each in found]
+    return Directions(
+        np.array([each.model for each in known], dtype=float).reshape(-1, 3),
+        np.array([each.camera for each in known], dtype=float).reshape(-1, 3),
+        np.array([view for _, view, _ in found], dtype=np.int64),
+        np.array([each.whitening for each in known]).reshape(-1, 3, 3),
+        np.array([kind for kind, _, _ in found], dtype=np.int64),
+    )
+
+
+def _offsets(found: Sequence[_Numbered]) -> Offsets:
+    known: list[KnownDistance] = [each for _, _, each in found]
+    return Offsets(
+        np.array([each.ends for each in known], dtype=np.int64).reshape(-1, 2),
+        np.array([view for _, view, _ in found], dtype=np.int64),
+        np.array([each.direction for each in known], dtype=float).reshape(-1, 3),
+        np.array([each.value for each in known], dtype=float),
+        np.array([1.0 / each.sigma for each in known], dtype=float),
+        np.array([kind for kind, _, _ in found], dtype=np.int64),
+    )

@@ -22,6 +22,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "command_help",
     "json_schemas",
+    "public_names",
 ]
 exclude_patterns = ["_build", "tutorials/*.md", "tutorials/*.rst", "sg_execution_times.rst"]
 suppress_warnings = ["myst.xref_missing", "config.cache"]

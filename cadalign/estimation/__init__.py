@@ -10,6 +10,13 @@ from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
+    from cadalign.estimation.evidence_kinds import (
+        EvidenceKind,
+        KnownDirection,
+        KnownDistance,
+        register_evidence,
+        remove_evidence,
+    )
     from cadalign.estimation.exporting import object_of
     from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
@@ -34,10 +41,13 @@ __all__ = [
     "Advice",
     "Alternative",
     "Contribution",
+    "EvidenceKind",
     "EvidenceSummary",
     "FitOptions",
     "FitStats",
     "FocalPrior",
+    "KnownDirection",
+    "KnownDistance",
     "MaskResiduals",
     "Misfit",
     "Model",
@@ -53,6 +63,8 @@ __all__ = [
     "model_of",
     "object_of",
     "rank_evidence",
+    "register_evidence",
+    "remove_evidence",
     "to_dataframe",
     "views_from",
     "views_of",

@@ -1,1 +1,69 @@
 """Cameras, alignments, boxes and meshes, their conventions and their metrics."""
+
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.box import Box
+    from cadalign.geometry.camera import Camera
+    from cadalign.geometry.conventions import (
+        alignment_from_opengl,
+        opengl_from_model,
+        opengl_projection,
+        resized_camera,
+    )
+    from cadalign.geometry.gravity import (
+        up_from_gravity,
+        up_from_pitch_roll,
+        up_from_pose,
+        up_from_vertical_edges,
+    )
+    from cadalign.geometry.mesh import Material, Mesh
+    from cadalign.geometry.metrics import (
+        alignment_box_iou,
+        box_iou,
+        box_iou_up_to_scale,
+        nearest_truth,
+        reprojection_error,
+        rotation_error,
+        scale_error,
+        translation_error,
+        translation_error_up_to_scale,
+    )
+    from cadalign.geometry.symmetry import Symmetry, SymmetryAxis, symmetric_rotation_error
+
+__all__ = [
+    "Alignment",
+    "Box",
+    "Camera",
+    "Material",
+    "Mesh",
+    "Symmetry",
+    "SymmetryAxis",
+    "alignment_box_iou",
+    "alignment_from_opengl",
+    "box_iou",
+    "box_iou_up_to_scale",
+    "nearest_truth",
+    "opengl_from_model",
+    "opengl_projection",
+    "reprojection_error",
+    "resized_camera",
+    "rotation_error",
+    "scale_error",
+    "symmetric_rotation_error",
+    "translation_error",
+    "translation_error_up_to_scale",
+    "up_from_gravity",
+    "up_from_pitch_roll",
+    "up_from_pose",
+    "up_from_vertical_edges",
+]
+
+__getattr__ = lazy_names(__name__)
+
+
+def __dir__() -> list[str]:
+    return __all__

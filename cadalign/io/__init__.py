@@ -1,1 +1,28 @@
 """Read and write files: whole or not at all, with errors that say what is wrong and where."""
+
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.io.camera_file import read_camera
+    from cadalign.io.evidence import EvidenceField, ImageEvidence, Size
+    from cadalign.io.meshes.load import load_mesh
+    from cadalign.io.observation import Observation
+    from cadalign.io.observed_image import ObservedImage
+
+__all__ = [
+    "EvidenceField",
+    "ImageEvidence",
+    "Observation",
+    "ObservedImage",
+    "Size",
+    "load_mesh",
+    "read_camera",
+]
+
+__getattr__ = lazy_names(__name__)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -12,10 +12,10 @@ from sphinx.application import Sphinx
 
 from cadalign.datasets.models import model_keypoints
 from cadalign.estimation import document
-from cadalign.io.observation_file import OneView, SeveralViews
+from cadalign.io.observation_file import OneView, SeveralViews, with_evidence
 
 FORMATS: dict[str, tuple[Any, ...]] = {
-    "observation": (OneView, SeveralViews),
+    "observation": (with_evidence(OneView), with_evidence(SeveralViews)),
     "model_keypoints": (model_keypoints._File,),
     "fit": (document._Result,),
 }

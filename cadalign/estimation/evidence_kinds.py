@@ -20,8 +20,6 @@ from cadalign.estimation.prior import ShapePrior
 from cadalign.io.evidence import EvidenceField, Size, register_fields, remove_fields
 from cadalign.solvers.joint.evidence import Directions, Offsets
 
-CAMERA = -1
-"""The end of a `KnownDistance` that is the view's camera."""
 SIZE = "size"
 
 
@@ -59,7 +57,7 @@ class KnownDistance(NamedTuple):
     Parameters
     ----------
     ends : (int, int)
-        Rows of the shape's points, as `ShapePrior` has them, or `CAMERA`.
+        Rows of the shape's points, as `ShapePrior` has them, or `KnownDistance.CAMERA`.
     direction : (3,) float
         Unit vector of the model's frame.
     value, sigma : float
@@ -70,6 +68,8 @@ class KnownDistance(NamedTuple):
     direction: FloatArray
     value: float
     sigma: float
+
+    CAMERA = -1
 
 
 Known = KnownDirection | KnownDistance
@@ -116,7 +116,7 @@ def _camera_height(given: Mapping[str, Any], prior: ShapePrior) -> list[Known]:
     lowest = len(prior.components[0].mean) - (2 if up.sum() > 0 else 1)
     height = given["camera_height"]
     sigma = np.hypot(height * given["camera_height_sigma"], prior.components[0].spread[lowest])
-    return [KnownDistance((lowest, CAMERA), up, height, float(sigma))]
+    return [KnownDistance((lowest, KnownDistance.CAMERA), up, height, float(sigma))]
 
 
 _KINDS = [

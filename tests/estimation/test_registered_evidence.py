@@ -15,9 +15,6 @@ from cadalign import Model, View, align
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.evidence_kinds import (
-    CAMERA as THE_CAMERA,
-)
-from cadalign.estimation.evidence_kinds import (
     EvidenceKind,
     KnownDistance,
     register_evidence,
@@ -35,7 +32,9 @@ DISTANCE = float(-(TRUTH.rotation.T @ TRUTH.translation)[0])  # of the camera al
 def _wall(given: Any, prior: Any) -> list[KnownDistance]:
     """The camera's place along x, from the first keypoint, which touches the wall."""
     sigma = given.get("wall_sigma", 0.01)
-    return [KnownDistance((0, THE_CAMERA), np.array([1.0, 0.0, 0.0]), given["wall"], sigma)]
+    return [
+        KnownDistance((0, KnownDistance.CAMERA), np.array([1.0, 0.0, 0.0]), given["wall"], sigma)
+    ]
 
 
 def _finite(value: Any) -> float:

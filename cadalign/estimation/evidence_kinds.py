@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,7 +23,8 @@ from cadalign.solvers.joint.evidence import Directions, Offsets
 SIZE = "size"
 
 
-class KnownDirection(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class KnownDirection:
     """A direction of the model that is known in the camera's frame.
 
     Parameters
@@ -51,7 +52,8 @@ class KnownDirection(NamedTuple):
         return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance + largest * along)).T)
 
 
-class KnownDistance(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class KnownDistance:
     """A distance along a direction of the model, from one of its points or the camera to another.
 
     Parameters
@@ -69,7 +71,7 @@ class KnownDistance(NamedTuple):
     value: float
     sigma: float
 
-    CAMERA = -1
+    CAMERA: ClassVar[int] = -1
 
 
 Known = KnownDirection | KnownDistance

@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -253,7 +254,9 @@ def learn_components(
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
-    # Threads of the linear algebra library make products of such small matrices 30 times slower.
+    # Threads of the linear algebra libraries make products of such small matrices 30 times slower.
+    # The limit reaches those that are loaded: SciPy brings one of its own.
+    import_module("scipy.linalg.lapack")
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
             choice = _Choice(_Recipe(components=options.components or 1), options.modes)

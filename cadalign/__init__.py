@@ -24,9 +24,11 @@ if TYPE_CHECKING:
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.symmetry import Symmetry
     from cadalign.io.evidence import Size
+    from cadalign.io.meshes.load import load_mesh
     from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
+    from cadalign.shapes.examples import Example
     from cadalign.shapes.model import ShapeModel
 
 __version__ = "0.1.0"
@@ -40,6 +42,7 @@ __all__ = [
     "Camera",
     "Contribution",
     "EvidenceSummary",
+    "Example",
     "FitResult",
     "FocalPrior",
     "Library",
@@ -63,6 +66,7 @@ __all__ = [
     "fit",
     "fit_batch",
     "geometry",
+    "load_mesh",
     "metrics",
     "render",
     "retrieval",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypeVar, cast
@@ -106,8 +106,7 @@ def align(
     ((8, 3), ('the length along z is known only to +-19 %',))
     """
     start = time.perf_counter()
-    given = [views] if isinstance(views, View) else list(views)
-    _check_views(given)
+    given = _checked_views(views)
     _check_size(size)
     inits = _checked_inits(init, given)
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
@@ -258,13 +257,21 @@ def _one_each(
     return given
 
 
-def _check_views(views: Sequence[object]) -> None:
+def _checked_views(given: object) -> list[View]:
+    """The views, one or several."""
+    if isinstance(given, View):
+        return [given]
+    if not isinstance(given, Iterable):
+        what = f"expected a cadalign.View or several, got {type(given).__name__}"
+        raise InputError(what, where="views", fix="give the model first, then the views")
+    views = list(given)
     if not views:
         raise InputError("none is given", where="views")
     for number, view in enumerate(views):
         if not isinstance(view, View):
             what = f"expected a cadalign.View, got {type(view).__name__}"
             raise InputError(what, where=f"views[{number}]")
+    return views
 
 
 def _check_size(size: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +22,7 @@ Photo = Path | str | ByteImage | None
 def object_of(
     result: ResultData,
     *,
-    mesh: Mesh | None = None,
+    mesh: Mesh | str | os.PathLike[str] | None = None,
     image: Photo = None,
     images: Sequence[Photo] = (),
     world_from_cam: FloatArray | None = None,
@@ -33,7 +34,7 @@ def object_of(
     Parameters
     ----------
     result : Result
-    mesh : Mesh, optional
+    mesh : Mesh or path, optional
         The model's as given; it is warped where the result knows its model, see `Result.mesh`.
     image : path or (h, w, 3) uint8, optional
         The photo of the only view.

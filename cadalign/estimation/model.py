@@ -78,6 +78,13 @@ class Model:
             raise InputError("a model needs keypoints", where="points_3d", fix="or give a mesh")
         object.__setattr__(self, "points_3d", read_only(points))
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        mesh: object = self.mesh
+        if mesh is not None and not isinstance(mesh, Mesh):
+            what = f"expected a cadalign.Mesh, got {type(mesh).__name__}"
+            raise InputError(what, where="mesh", fix="read it with cadalign.load_mesh")
+        if self.shape_sigma is not None and not len(points):
+            fix = "give points_3d, whose positions it is about, or leave it away"
+            raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
         given = self.bounds
         if given is None:
             given = self.mesh.bounds if self.mesh is not None else _extent(points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -301,13 +302,13 @@ class ResultData:
             raise InputError(f"{dimension!r} is not a positive number", where="dimension")
         return radius_of(probability, dimension, self.degrees_of_freedom)
 
-    def mesh(self, mesh: Mesh | None = None) -> Mesh:
+    def mesh(self, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh:
         """A model's mesh, warped so that its keypoints are the object's.
 
         Parameters
         ----------
-        mesh : Mesh, optional
-            By default that of the `Model`. For a learned shape, that of `nearest`. Where the model
+        mesh : Mesh or path, optional
+            By default that of the `Model` or, for a learned shape, of `nearest`. Where the model
             is not known, it is taken for the object's own.
 
         Returns
@@ -320,25 +321,29 @@ class ResultData:
         InputError
             If there is no mesh to warp.
         """
+        from cadalign.io.meshes.load import as_mesh
         from cadalign.shapes.model import ShapeModel
         from cadalign.shapes.warp import warp_mesh
 
         model = self.model
         if isinstance(model, ShapeModel):
-            if mesh is None:
-                fix = "give that of the training model `nearest`, read from its mesh_path"
-                raise InputError("a learned shape has no mesh of its own", where="mesh", fix=fix)
             source = self.nearest.points_3d
             known = np.isfinite(source).all(axis=1)
-            return warp_mesh(mesh, source[known], self.points_3d[known], bounds=self.bounds)
+            path = self.nearest.mesh_path if mesh is None else mesh
+            if path is None:
+                fix = "give the mesh of `nearest`"
+                raise InputError("the training models have no meshes", where="mesh", fix=fix)
+            own = as_mesh(path, where="mesh")
+            return warp_mesh(own, source[known], self.points_3d[known], bounds=self.bounds)
         given = mesh if mesh is not None or model is None else model.mesh
         if given is None:
             raise InputError("the model has no mesh", where="mesh", fix="give one")
+        given = as_mesh(given, where="mesh")
         if model is None or model.shape_sigma is None:
             return given
         return warp_mesh(given, model.points_3d, self.points_3d, bounds=self.bounds)
 
-    def known_mesh(self, mesh: Mesh | None) -> Mesh | None:
+    def known_mesh(self, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
         """As `mesh`; None where there is no mesh to warp."""
         known = mesh if mesh is not None else getattr(self.model, "mesh", None)
         return None if known is None else self.mesh(known)

@@ -144,14 +144,15 @@ class Observation(ObservedImage):
         return f"Observation({source}{len(self.views)} views with {counts} keypoints)"
 
     @classmethod
-    def load(cls, path: str | Path, *, needs_xyz: bool = True) -> Observation:
+    def load(cls, path: str | Path, *, needs_xyz: bool | None = None) -> Observation:
         """Read an observation file.
 
         Parameters
         ----------
         path : str or Path
-        needs_xyz : bool
-            Whether keypoints must have ``xyz``, which is zero otherwise where it is missing.
+        needs_xyz : bool, optional
+            Whether keypoints must have ``xyz``, which is zero otherwise where it is missing; by
+            default unless the file names a learned shape.
 
         Raises
         ------
@@ -161,6 +162,8 @@ class Observation(ObservedImage):
         """
         path = Path(path)
         data = read_json(path)
+        if needs_xyz is None:
+            needs_xyz = not (isinstance(data, dict) and data.get("shape"))
         if not needs_xyz:
             data = fill_xyz(data)
         with in_file(path):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from cadalign.datasets import KeypointNet
+from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
@@ -62,8 +62,11 @@ class Library:
         self._table = table
 
     @classmethod
-    def from_models(cls, models: Iterable[LibraryModel]) -> Library:
-        """Make a library; raises InputError if two models have the same category and id."""
+    def from_models(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> Library:
+        """Make a library; raises InputError if two models have the same category and id.
+
+        Models of a data set are read, with the bounds of their meshes.
+        """
         return cls(ModelTable.of(models))
 
     @classmethod

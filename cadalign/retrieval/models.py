@@ -134,9 +134,9 @@ class ModelTable:
         self.table = table.combine_chunks()
 
     @classmethod
-    def of(cls, models: Iterable[LibraryModel]) -> ModelTable:
+    def of(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> ModelTable:
         """Make a table; raises InputError if two models have the same category and id."""
-        in_order = sorted(models, key=lambda model: model.key)
+        in_order = sorted(map(_library_model, models), key=lambda model: model.key)
         for first, second in pairwise(in_order):
             if first.key == second.key:
                 raise InputError(
@@ -228,6 +228,16 @@ class ModelTable:
     def _column(self, name: str) -> Any:
         column = self.table[name]
         return column.chunk(0) if column.num_chunks else pa.array([], type=column.type)
+
+
+def _library_model(model: object) -> LibraryModel:
+    """A library's model; one of a data set is read."""
+    if isinstance(model, LibraryModel):
+        return model
+    if isinstance(model, AnnotatedModel):
+        return LibraryModel.of_annotated(model)
+    what = f"expected a LibraryModel or a data set's model, got {type(model).__name__}"
+    raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
 
 
 def _row(model: LibraryModel) -> dict[str, Any]:

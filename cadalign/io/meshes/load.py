@@ -94,6 +94,24 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         raise DataError(f"the mesh file cannot be read ({reason})", where=str(path)) from None
 
 
+def as_mesh(given: object, *, where: str) -> Mesh:
+    """A mesh, or the one that a path names.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    DataError
+        If the file cannot be read.
+    """
+    if isinstance(given, Mesh):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return load_mesh(given)
+    what = f"expected a cadalign.Mesh or a path, got {type(given).__name__}"
+    raise InputError(what, where=where, fix="read it with cadalign.load_mesh")
+
+
 def flat_axes(mesh: Mesh, *, tolerance: float = FLAT_TOLERANCE) -> tuple[str, ...]:
     """Name the axes along which a mesh has no thickness.
 

@@ -7,16 +7,26 @@ bop_toolkit's ``docs/bop_datasets_format.md``.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from msgspec import Meta, Raw
+from msgspec import Raw
 
-from cadalign.datasets.photos.bop_models import BopModels
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.bop_files import (
+    TRUTH,
+    BopModels,
+    Nine,
+    PoseEstimate,
+    ScenePose,
+    object_name,
+    write_model,
+    write_models_info,
+    write_scene_gt,
+)
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, parse, read_each, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
     DepthImage,
@@ -25,39 +35,31 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.records import parse, read_table
+from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import nearest_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
     NotNegative,
-    Point3,
     Positive,
     convert,
     in_file,
     read_json,
 )
+from cadalign.io.files import write_json, writing
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
-TRUTH = "scene_gt.json"
 _CAMERAS = "scene_camera.json"
 _INFO = "scene_gt_info.json"
 _CAMERA = "camera.json"
 _COLOR_FOLDERS = ("rgb", "gray")
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif")
-_Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
-
-
-class _Pose(ForeignDocument):
-    cam_R_m2c: _Nine
-    cam_t_m2c: Point3
-    obj_id: Annotated[int, Meta(ge=0, le=10**6)]
+_WRITTEN_SCENE = Path("test", "000001")
 
 
 class _Info(ForeignDocument):
@@ -66,7 +68,7 @@ class _Info(ForeignDocument):
 
 
 class _FrameCamera(ForeignDocument):
-    cam_K: _Nine
+    cam_K: Nine
     depth_scale: NotNegative = 1.0
 
 
@@ -169,7 +171,7 @@ class Bop(PhotoDataset):
             infos = parse(scene.info[key], list[_Info], path=folder / _INFO, where=key)
 
         def read_object(number: int, pose: Any) -> PhotoObject:
-            checked: _Pose = convert(pose, _Pose)
+            checked: ScenePose = convert(pose, ScenePose)
             found = _object(number, checked, *self._model(checked.obj_id))
             if number < len(infos):
                 found = _with_info(found, infos[number])
@@ -257,15 +259,16 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
     return None
 
 
-def _object(number: int, pose: _Pose, model: CadModel | None, symmetry: Symmetry) -> PhotoObject:
-    rotation = nearest_rotation(np.reshape(pose.cam_R_m2c, (3, 3)).astype(float))
-    alignment = Alignment(rotation, np.array(pose.cam_t_m2c), np.ones(3), is_valid=True)
+def _object(
+    number: int, pose: ScenePose, model: CadModel | None, symmetry: Symmetry
+) -> PhotoObject:
+    alignment = pose.alignment()
     box = None
     if model is not None and model.bounds is not None:
         box = Box.from_model(model.bounds, alignment)
     return PhotoObject(
         object_id=str(number),
-        category=f"obj_{pose.obj_id:06d}",
+        category=object_name(pose.obj_id),
         truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
         model=model,
         symmetry=symmetry,
@@ -278,3 +281,65 @@ def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:
         left, top, width, height = info.bbox_obj
         bbox = np.array([left, top, left + width, top + height])
     return replace(found, bbox=bbox, visible_fraction=info.visib_fract)
+
+
+def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write objects as one scene, a photo for each, with the stretched meshes [mm] as its models.
+
+    Each object has a model of its own, ``obj_000001`` and so on: poses have no stretch. Returns
+    why objects were left out.
+    """
+    scene = folder / _WRITTEN_SCENE
+    models, cameras, infos, poses = {}, {}, {}, list[PoseEstimate]()
+    problems = []
+    for number, placed in numbered:
+        image, model_id = str(number), number + 1
+        try:
+            placed.require_plain_camera("BOP")
+            left, top, right, bottom = placed.bbox.tolist()
+            mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
+        except InputError as error:
+            problems.append(error)
+            continue
+        models[model_id] = write_model(folder, mesh, model_id)
+        placed.copy_image(scene / "rgb" / f"{number:06d}")
+        placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
+        shift = placed.pose.translation / MILLIMETRES
+        pose = Alignment(placed.pose.rotation, shift, np.ones(3))
+        poses.append(PoseEstimate("1", image, str(model_id), pose))
+        cameras[image] = placed.camera
+        infos[image] = [{"bbox_obj": [left, top, right - left, bottom - top]}]
+    write_models_info(folder, models)
+    write_scene(scene, poses, cameras)
+    write_json(scene / _INFO, infos)
+    return problems
+
+
+def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:
+    """Write ``scene_gt.json`` and ``scene_camera.json`` of photos named by their numbers.
+
+    Raises
+    ------
+    InputError
+        If a camera has lens distortion, or a pose a stretch, which the format lacks.
+    """
+    table = {}
+    for number, (image, camera) in enumerate(cameras.items()):
+        if any(camera.distortion):
+            fix = "undistort the photo and fit again, or export the result CSV alone"
+            what = "BOP's camera files have no place for lens distortion"
+            raise InputError(what, where=f"views[{number}].camera", fix=fix)
+        table[image] = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / _CAMERAS, table)
+    write_scene_gt(folder / TRUTH, poses)
+
+
+FORMAT = PhotoFormat(
+    "bop",
+    f"BOP: {TRUTH}, in the folder or one or two below",
+    lambda folder: next(find_scenes(folder), None) is not None,
+    Bop,
+    write_bop,
+)

@@ -120,6 +120,28 @@ class ModelFiles:
 
 
 @dataclass(frozen=True, eq=False)
+class LoadedModel:
+    """A model that is in memory.
+
+    Parameters
+    ----------
+    mesh : Mesh, optional
+    keypoints : NamedPoints, optional
+    """
+
+    mesh: Mesh | None = None
+    keypoints: NamedPoints | None = None
+
+    def load_mesh(self) -> Mesh | None:
+        """The mesh."""
+        return self.mesh
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """The keypoints."""
+        return self.keypoints
+
+
+@dataclass(frozen=True, eq=False)
 class CadModel:
     """The CAD model that an object is aligned with, read when it is asked for.
 

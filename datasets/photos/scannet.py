@@ -1,4 +1,4 @@
-"""Frames of ScanNet scenes: photos with intrinsics and poses."""
+"""Frames of ScanNet scenes, read and written: photos with intrinsics and poses."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.photos.records import read_matrix
+from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.files import damaged, reading, write_text, writing
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -98,3 +99,41 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
         images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
         image = next((path for path in images if path.is_file()), folder / f"{stem}.jpg")
         yield ScanNetFrame(stem.removeprefix(prefix), image, pose, intrinsics)
+
+
+def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
+    """Read a text file of a matrix, a row on each line.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or is not a matrix of finite numbers of this shape.
+    """
+    with reading(path):
+        text = path.read_text(encoding="utf-8")
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    try:
+        matrix = np.array(rows, dtype=np.float64)
+    except ValueError:
+        raise damaged("not a table of numbers", path) from None
+    if matrix.shape != shape:
+        raise damaged(f"shape {matrix.shape}, expected {shape}", path)
+    if not np.isfinite(matrix).all():
+        raise DataError("some of its numbers are not finite", where=str(path))
+    return matrix
+
+
+def write_matrix(path: Path, matrix: FloatArray) -> None:
+    """Write a text file of a matrix, a row on each line; folders above it are made."""
+    with writing(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    rows = (" ".join(f"{value:.17g}" for value in row) for row in matrix.tolist())
+    write_text(path, "".join(f"{row}\n" for row in rows))
+
+
+def write_frame(folder: Path, matrix: FloatArray, scan_from_cam: FloatArray) -> None:
+    """Write pose (4, 4) and intrinsics (3, 3) of the only frame of a scene, number 0."""
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = matrix
+    write_matrix(folder / "pose" / "0.txt", scan_from_cam)
+    write_matrix(folder / _INTRINSICS[0], intrinsics)

@@ -123,6 +123,35 @@ class Correspondences:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """A camera and where it stands.
+
+    Parameters
+    ----------
+    camera : Camera
+    cam_from_world : Alignment
+        Its pose, with all scales 1.
+    name : str
+        The image's name; empty where the file has none.
+    """
+
+    camera: Camera
+    cam_from_world: Alignment
+    name: str = ""
+
+    def rigid(self, where: str) -> Alignment:
+        """The pose; raises InputError, which names the place, where it has a scale."""
+        if (self.cam_from_world.scale != 1).any():
+            raise InputError(
+                f"the pose has the scale {self.cam_from_world.scale.tolist()}",
+                where=where,
+                fix="camera files hold rigid poses: stretch the model and give the pose with scale "
+                "1",
+            )
+        return self.cam_from_world
+
+
 class CorrespondenceSet(ABC):
     """The images of a file, each with its correspondences, read one by one.
 

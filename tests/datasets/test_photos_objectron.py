@@ -10,8 +10,7 @@ from support.photo_data import assert_damage_is_told, message, rigid, write_phot
 
 import cadalign.datasets
 from cadalign.datasets import Objectron
-from cadalign.datasets.photos.objectron_files import read_sequence
-from cadalign.datasets.photos.protobuf import Field, decode
+from cadalign.datasets.photos.objectron_files import Field, decode, read_sequence
 from cadalign.errors import DataError, InputError
 
 SCALE = [0.2, 0.5, 0.3]

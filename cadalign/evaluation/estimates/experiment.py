@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cadalign.datasets.photos.bop_files import PoseEstimate
 from cadalign.datasets.photos.photo import NamedPoints, Photo
 from cadalign.errors import CadalignError, DataError, DegenerateError
 from cadalign.evaluation.estimates.files import opened_estimates
@@ -25,7 +26,6 @@ from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns
 from cadalign.evaluation.runs.work import AbortError, Rows
-from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.box import Box
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))

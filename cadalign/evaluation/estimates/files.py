@@ -9,12 +9,16 @@ from functools import lru_cache
 from pathlib import Path
 
 from cadalign.datasets.photos.bop import Bop
+from cadalign.datasets.photos.bop_files import (
+    Estimates,
+    PoseEstimate,
+    read_bop_results,
+    read_scene_gt,
+)
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import DataError, InputError, quote
-from cadalign.export.bop import read_bop_results, read_scene_gt
-from cadalign.export.estimates import Estimates, PoseEstimate
 from cadalign.io.documents import read_json
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cadalign.datasets.photos.bop_files import PoseEstimate
 from cadalign.errors import CadalignError
 from cadalign.evaluation.photos.metrics.bop import mssd
 from cadalign.evaluation.photos.sighting import PhotoTarget
-from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.alignment import Alignment
 
 _STEP = 0.1  # of rotations about an axis of symmetry, coarse: it only decides which object is meant

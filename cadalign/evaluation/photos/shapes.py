@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.photos.kitti_shape import car_shape
+from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.errors import InputError, quote
 from cadalign.shapes.model import ShapeModel
 

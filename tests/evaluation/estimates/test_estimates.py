@@ -15,6 +15,7 @@ from support.pages import embedded_payload
 from cadalign import Alignment
 from cadalign.cli import main
 from cadalign.datasets import Bop, Scan2CAD
+from cadalign.datasets.photos.bop_files import PoseEstimate, write_bop_results, write_scene_gt
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.estimates.files import method_names, open_estimates
 from cadalign.evaluation.estimates.matching import match_estimates
@@ -22,8 +23,6 @@ from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.spec import Spec
-from cadalign.export.bop import write_bop_results, write_scene_gt
-from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = {"fx": 500.0, "fy": 500.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}

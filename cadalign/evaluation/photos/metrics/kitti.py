@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.datasets.photos.kitti_files import car_box, yaw_of_car
+from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
 

@@ -11,14 +11,10 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera
+from cadalign.datasets.sfm.colmap import write_colmap
+from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError
-from cadalign.export.camera_files import (
-    CameraView,
-    read_camera_views,
-    write_colmap,
-    write_nerf,
-    write_open3d,
-)
+from cadalign.export.camera_files import read_camera_views, write_nerf, write_open3d
 from cadalign.geometry.conventions import (
     alignment_from_opengl,
     opengl_from_model,

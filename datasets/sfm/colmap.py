@@ -16,6 +16,7 @@ from cadalign.arrays import IntArray
 from cadalign.datasets.sfm import colmap_files
 from cadalign.datasets.sfm.correspondences import (
     CameraView,
+    CorrespondenceFormat,
     Correspondences,
     CorrespondenceSet,
     rigid_pose,
@@ -167,3 +168,15 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     write_text(folder / "cameras.txt", "".join(cameras))
     write_text(folder / "images.txt", "".join(images))
     write_text(folder / "points3D.txt", "")
+
+
+FORMAT = CorrespondenceFormat(
+    "colmap",
+    Colmap,
+    "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
+    tuple(
+        tuple(f"{folder}/{stem}{suffix}" for stem in _STEMS)
+        for folder in _SUBFOLDERS
+        for suffix in colmap_files.READERS
+    ),
+)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -16,6 +16,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import reading
 
 logger = logging.getLogger("cadalign")
 
@@ -279,3 +280,43 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
         raise InputError(f"not a rotation matrix: {shown}", where="rotation")
     left, _, right = np.linalg.svd(matrix)
     return Alignment(left @ right, shift, np.ones(3))
+
+
+@dataclass(frozen=True)
+class CorrespondenceFormat:
+    """A format of correspondences, and the files that it is recognised by.
+
+    Parameters
+    ----------
+    name : str
+    load : callable
+        Makes the set of a folder.
+    sought : str
+        The files of this format, for messages.
+    layouts : tuple of tuples of str
+        Patterns of the files below a folder, which all belong to one of the layouts.
+    header : bytes
+        The first bytes of each file.
+    """
+
+    name: str
+    load: Callable[[Path], CorrespondenceSet]
+    sought: str
+    layouts: tuple[tuple[str, ...], ...]
+    header: bytes = b""
+
+    def fit(self, folder: Path) -> int:
+        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
+        best = 0
+        for layout in self.layouts:
+            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
+            if all(any(begins_with(file, self.header) for file in found) for found in files):
+                return 2
+            best = max(best, int(any(files)))
+        return best
+
+
+def begins_with(file: Path, header: bytes) -> bool:
+    """True if a file begins with these bytes."""
+    with reading(file), file.open("rb") as stream:
+        return stream.read(len(header)) == header

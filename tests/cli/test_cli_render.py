@@ -19,8 +19,8 @@ from cadalign import Camera
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
-from cadalign.errors import DataError, InputError, RenderError
 from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.errors import DataError, InputError, RenderError
 from cadalign.export.camera_files import write_open3d
 from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at

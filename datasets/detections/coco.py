@@ -1,4 +1,4 @@
-"""COCO: keypoints in images, from its JSON and what detectors make of it, and masks; written, too.
+"""COCO: keypoints in images, read from its JSON and what detectors make of it, and written.
 
 Four forms are read:
 
@@ -17,38 +17,30 @@ The third number of a keypoint is its visibility flag where all of an object's a
 is 2: 0 for not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in
 COCO, integer coordinates are pixel centres.
 
-A ``segmentation`` beside the keypoints is kept as it is, for `decode_segmentation`: a list of
-polygons ``[x, y, x, y, ...]`` in a frame whose origin is the top-left corner of the image, or
-``{"size": [height, width], "counts": ...}``: lengths of runs of pixels outside and inside in turn,
-column by column, as a list or as COCO's text, which holds the difference of every length from the
-last but one in groups of five bits.
+A ``segmentation`` beside the keypoints is kept as it is, for
+`cadalign.datasets.detections.coco_masks`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.conventions import PIXEL_CENTRE
-from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
+from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.files import write_json
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco"
-_MASK_FIX = "give COCO polygons, or the run lengths of a mask of this image"
-_FIRST, _LAST = 48, 111  # characters of compressed run lengths
-_MOST_BITS = 35  # of a length: more than any image has pixels
-_MOST_PIXELS = 2**28
-_Polygon = Annotated[list[Finite], Meta(min_length=6)]
 _OUTSIDE, _INFERRED, _OBSERVED = 0, 1, 2  # visibility flags
 _Id = int | str
 _Size = Annotated[float, Meta(ge=1, le=2**31)]
@@ -242,6 +234,74 @@ def _scores(third: FloatArray) -> FloatArray:
 # Writing ----------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class CocoObject:
+    """One object's keypoints, as an annotation of COCO.
+
+    Parameters
+    ----------
+    image, category : int
+        Rows of its image and its category in the document.
+    points_2d : (k, 2) float
+        Pixels of all keypoints of the category.
+    flags : (k,) int
+        2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels don't
+        count.
+    rectangle : (4,) float
+        Left, top, right and bottom.
+    """
+
+    image: int
+    category: int
+    points_2d: FloatArray
+    flags: IntArray
+    rectangle: FloatArray
+
+    def annotation(self, number: int) -> dict[str, Any]:
+        """The annotation of a number."""
+        left, top, right, bottom = self.rectangle.tolist()
+        pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
+        rows = zip(pixels, self.flags.tolist(), strict=True)
+        return {
+            "id": number,
+            "image_id": self.image,
+            "category_id": 1 + self.category,
+            "keypoints": [value for (x, y), flag in rows for value in (x, y, flag)],
+            "num_keypoints": int(np.count_nonzero(self.flags)),
+            "bbox": [left, top, right - left, bottom - top],
+            "area": (right - left) * (bottom - top),
+            "iscrowd": 0,
+        }
+
+
+def coco_document(
+    images: Iterable[tuple[str, int, int]],
+    categories: Iterable[tuple[str, Sequence[str]]],
+    objects: Iterable[CocoObject],
+) -> dict[str, Any]:
+    """Keypoints as COCO's JSON.
+
+    Parameters
+    ----------
+    images : iterable of (str, int, int)
+        File name, width and height.
+    categories : iterable of (str, sequence of str)
+        Name, and names of the keypoints.
+    objects : iterable of CocoObject
+    """
+    return {
+        "images": [
+            {"id": row, "file_name": name, "width": width, "height": height}
+            for row, (name, width, height) in enumerate(images)
+        ],
+        "categories": [
+            {"id": number, "name": name, "keypoints": list(points), "skeleton": []}
+            for number, (name, points) in enumerate(categories, start=1)
+        ],
+        "annotations": [each.annotation(number) for number, each in enumerate(objects, start=1)],
+    }
+
+
 def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
     """Write the keypoints of aligned objects as COCO annotations, one category for each model.
 
@@ -254,162 +314,27 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
     InputError
         If the camera, a pose or a model is not known.
     """
-    objects = [
+    placed = [
         (row, PlacedObject(photo, found))
         for row, photo in enumerate(photos)
         for found in photo.objects
     ]
-    names = {placed.model.model_id: list(placed.names) for _, placed in objects}
-    numbers = {model_id: number for number, model_id in enumerate(names, start=1)}
-    write_json(
-        path,
-        {
-            "images": [
-                {"id": row, "file_name": photo.name, "width": size.width, "height": size.height}
-                for row, photo in enumerate(photos)
-                if (size := photo.camera) is not None
-            ],
-            "categories": [
-                {"id": numbers[name], "name": name, "keypoints": points, "skeleton": []}
-                for name, points in names.items()
-            ],
-            "annotations": [
-                {
-                    "id": number,
-                    "image_id": row,
-                    "category_id": numbers[placed.model.model_id],
-                    **_annotation(placed),
-                }
-                for number, (row, placed) in enumerate(objects, start=1)
-            ],
-        },
-    )
+    models = {each.model.model_id: each.names for _, each in placed}
+    rows = {model_id: row for row, model_id in enumerate(models)}
+    cameras = [photo.known_camera for photo in photos]
+    images = [(p.name, c.width, c.height) for p, c in zip(photos, cameras, strict=True)]
+    objects = (_projected(each, row, rows[each.model.model_id]) for row, each in placed)
+    write_json(path, coco_document(images, models.items(), objects))
 
 
-def _annotation(placed: PlacedObject) -> dict[str, Any]:
+def _projected(placed: PlacedObject, image: int, category: int) -> CocoObject:
     pixels = placed.camera.project_where_ahead(placed.pose.apply(placed.points))
     inside: BoolArray = np.asarray(np.isfinite(pixels).all(axis=1))
     inside[inside] = placed.camera.contains(pixels[inside])
     observed = [name in placed.marked for name in placed.names]
     flags = np.where(inside, np.where(observed, _OBSERVED, _INFERRED), _OUTSIDE)
-    rows = np.column_stack([np.where(inside[:, None], pixels, 0.0), flags])
     try:
-        left, top, right, bottom = (placed.bbox + PIXEL_CENTRE).tolist()
+        rectangle = placed.bbox + PIXEL_CENTRE
     except InputError:  # an object behind the camera
-        left = top = right = bottom = 0.0
-    return {
-        "keypoints": [
-            value for x, y, flag in rows.tolist() for value in (round(x, 4), round(y, 4), int(flag))
-        ],
-        "num_keypoints": int(inside.sum()),
-        "bbox": [left, top, right - left, bottom - top],
-        "area": (right - left) * (bottom - top),
-        "iscrowd": 0,
-    }
-
-
-# Masks ------------------------------------------------------------------------------------------
-
-
-class _Runs(ForeignDocument):
-    size: tuple[Count, Count]
-    counts: list[Count] | str
-
-
-def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolArray:
-    """Decode the ``segmentation`` of a COCO annotation or result.
-
-    Parameters
-    ----------
-    segmentation : list or dict
-        As it is in the JSON.
-    width, height : int
-        Of the image [px].
-
-    Returns
-    -------
-    (height, width) bool
-
-    Raises
-    ------
-    DataError
-        If it is neither, or of another image size, or the mask is empty.
-
-    Examples
-    --------
-    >>> square = [[1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]]
-    >>> decode_segmentation(square, width=4, height=2).astype(int).tolist()
-    [[0, 1, 1, 0], [0, 1, 1, 0]]
-    >>> runs = {"size": [2, 4], "counts": [2, 4, 2]}
-    >>> decode_segmentation(runs, width=4, height=2).astype(int).tolist()
-    [[0, 1, 1, 0], [0, 1, 1, 0]]
-    """
-    if width * height > _MOST_PIXELS:
-        raise DataError(f"an image of {width} x {height} pixels is too large for a mask")
-    if isinstance(segmentation, dict):
-        mask = _decode_runs(convert(segmentation, _Runs, "segmentation"), width, height)
-    else:
-        polygons = convert(segmentation, list[_Polygon], "segmentation")
-        mask = _fill(polygons, width, height)
-    if not mask.any():
-        raise DataError("the mask is empty", where="segmentation", fix=_MASK_FIX)
-    return mask
-
-
-def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
-    if runs.size != (height, width):
-        what = f"the mask is {runs.size[1]} x {runs.size[0]}, the image {width} x {height}"
-        raise DataError(what, where="segmentation.size", fix=_MASK_FIX)
-    is_text = isinstance(runs.counts, str)
-    counts = _decompress(runs.counts) if isinstance(runs.counts, str) else runs.counts
-    if sum(counts) != width * height or min(counts, default=0) < 0:
-        what = f"the runs have {sum(counts)} pixels, the image {width * height}"
-        if is_text:
-            what += "; is the text whole?"
-        raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
-    inside = np.arange(len(counts)) % 2 == 1
-    return np.ascontiguousarray(np.repeat(inside, counts).reshape(width, height).T)
-
-
-def _decompress(text: str) -> list[int]:
-    """Run lengths of COCO's text; see ``rleFrString`` in its ``maskApi.c``."""
-    counts: list[int] = []
-    value = shift = 0
-    for place, character in enumerate(text):
-        bits = ord(character) - _FIRST
-        if not 0 <= bits <= _LAST - _FIRST or shift > _MOST_BITS:
-            what = f"character {place} is not of compressed run lengths"
-            raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
-        value |= (bits & 0x1F) << shift
-        shift += 5
-        if bits & 0x20:
-            continue
-        if bits & 0x10:
-            value -= 1 << shift
-        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-        value = shift = 0
-    if shift:
-        raise DataError("the text is cut short", where="segmentation.counts", fix=_MASK_FIX)
-    return counts
-
-
-def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolArray:
-    """Pixels (height, width) inside any of the polygons."""
-    from pycocotools import mask  # takes a while to import
-
-    for number, polygon in enumerate(polygons):
-        where = f"segmentation[{number}]"
-        if len(polygon) % 2:
-            raise DataError(
-                f"{len(polygon)} numbers are not x, y of points", where=where, fix=_MASK_FIX
-            )
-        points = np.reshape(polygon, (-1, 2))
-        # Its memory grows with the polygon's length, which far points would make large.
-        if (np.abs(points) > 2 * max(width, height)).any():
-            raise DataError("has points far outside of the image", where=where, fix=_MASK_FIX)
-    if not polygons:
-        return np.zeros((height, width), dtype=bool)
-    runs = mask.merge(
-        mask.frPyObjects([list(map(float, each)) for each in polygons], height, width)
-    )
-    return np.asarray(mask.decode(runs) != 0)
+        rectangle = np.zeros(4)
+    return CocoObject(image, category, np.round(pixels, 4), flags, rectangle)

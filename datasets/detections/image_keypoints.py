@@ -46,7 +46,7 @@ class ImageKeypoints:
         How sure the detector is of the whole object.
     segmentation : list or dict, optional
         The object's mask as COCO writes it, unchecked; see
-        `cadalign.datasets.detections.coco.decode_segmentation`.
+        `cadalign.datasets.detections.coco_masks.decode_segmentation`.
     source : str
         The file and the place in it, for messages.
     """

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -340,6 +340,13 @@ class Photo:
     depth: DepthImage | None = None
     up: FloatArray | None = None
     problems: tuple[DataError, ...] = ()
+
+    @property
+    def known_camera(self) -> Camera:
+        """The camera; raises InputError where there is none."""
+        if self.camera is None:
+            raise InputError("the camera of this photo is not known", where=self.name)
+        return self.camera
 
     def read_image(self) -> npt.NDArray[np.uint8]:
         """Read the photo's pixels, (h, w, 3) uint8.

@@ -58,10 +58,7 @@ class PlacedObject:
     @property
     def camera(self) -> Camera:
         """The camera that the pose fits the photo with."""
-        camera = self.found.truth.camera or self.photo.camera
-        if camera is None:
-            raise InputError("the camera of this photo is not known", where=self.photo.name)
-        return camera
+        return self.found.truth.camera or self.photo.known_camera
 
     @property
     def model(self) -> CadModel:

@@ -281,7 +281,7 @@ def write_objectron(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) 
     """
     problems = []
     for number, placed in numbered:
-        place = folder / ANNOTATIONS / placed.found.category / "batch-1"
+        place = folder / ANNOTATIONS / placed.category / "batch-1"
         try:
             sequence = _sequence(placed)
         except InputError as error:

@@ -201,7 +201,7 @@ def write_pix3d(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> l
 
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    camera, category = placed.camera, placed.found.category
+    camera, category = placed.camera, placed.category
     placed.require_plain_camera("Pix3D")
     middle = (camera.width - 1) / 2, (camera.height - 1) / 2
     is_off = max(abs(camera.cx - middle[0]), abs(camera.cy - middle[1])) > _NEAR_MIDDLE
@@ -228,7 +228,7 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
 
     return {
         "img": written(image),
-        "category": category,
+        "category": placed.found.category,
         "img_size": [camera.width, camera.height],
         "2d_keypoints": [pixels],
         "mask": None if mask is None else written(mask),

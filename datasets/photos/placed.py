@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -65,6 +66,16 @@ class PlacedObject:
         """The CAD model."""
         assert self.found.model is not None
         return self.found.model
+
+    @property
+    def category(self) -> str:
+        """The category as the name of a folder."""
+        return _file_name(self.found.category)
+
+    @property
+    def model_id(self) -> str:
+        """The model's id as the name of a folder."""
+        return _file_name(self.model.model_id)
 
     @property
     def _aligned(self) -> Alignment:
@@ -218,6 +229,12 @@ def converted(
         except InputError as error:
             problems.append(error)
     return entries, problems
+
+
+def _file_name(text: str) -> str:
+    """A text as a name that does not leave its folder."""
+    name = re.sub(r"[/\\\0]", "_", text)
+    return name if name.strip(".") else f"_{name}"
 
 
 def upright_rotation(up: FloatArray) -> FloatArray:

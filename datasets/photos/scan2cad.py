@@ -359,8 +359,8 @@ def write_scan2cad(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     placed.require_plain_camera("Scan2CAD")
-    scene, category = f"scene{number:04d}_00", placed.found.category
-    model_id = f"{number:06d}-{placed.model.model_id}"
+    scene, category = f"scene{number:04d}_00", placed.category
+    model_id = f"{number:06d}-{placed.model_id}"
     models = folder / _MODEL_FOLDERS[0] / category / model_id
     placed.write_model(models / _MESH_FILES[0], is_stretched=False)
     pose, turn, scan_from_cam = placed.pose, upright_rotation(placed.up), np.eye(4)

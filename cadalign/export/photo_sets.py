@@ -6,21 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.formats import PHOTO_FORMATS, write_photos
-from cadalign.datasets.photos.photo import (
-    CadModel,
-    LoadedModel,
-    NamedPoints,
-    Photo,
-    PhotoKeypoints,
-    PhotoObject,
-    Truth,
-)
+from cadalign.datasets.photos.photo import Photo
 from cadalign.errors import InputError
-from cadalign.export.aligned_object import AlignedObject
+from cadalign.export.aligned_object import AlignedObject, photos_of
 
 FORMS = tuple(each.name for each in PHOTO_FORMATS if each.write is not None)
 """Names of the forms."""
@@ -54,42 +44,6 @@ class AnnotatedPhoto:
         """The photo as data sets have it."""
         (found,) = photos_of(self.exported, category=self.category, mask=self.mask)
         return Photo(self.image.name, self.image, found.camera, found.objects, up=self.up)
-
-
-def photos_of(
-    exported: AlignedObject, *, category: str = "object", mask: Path | None = None
-) -> tuple[Photo, ...]:
-    """The views of an aligned object as photos of a data set.
-
-    Parameters
-    ----------
-    exported : AlignedObject
-    category : str
-        What the object is.
-    mask : Path, optional
-        Image of the object's pixels.
-    """
-    names = tuple(str(name) for name in exported.ids)
-    model = CadModel(
-        exported.name,
-        LoadedModel(exported.mesh, NamedPoints(names, exported.points_3d)),
-        bounds=exported.bounds if exported.mesh or names else None,
-    )
-    photos = []
-    for number, view in enumerate(exported.views):
-        marked = tuple(str(name) for name in view.ids)
-        found = PhotoObject(
-            object_id="0",
-            category=category,
-            truth=Truth(view.cam_from_model, metres=exported.metres),
-            keypoints=PhotoKeypoints(view.points_2d, marked, np.ones(len(marked), dtype=bool)),
-            model=model,
-            mask_path=mask,
-        )
-        image = view.image if isinstance(view.image, Path) else None
-        name = view.image_name or f"{number}.png"
-        photos.append(Photo(name, image, view.camera, (found,)))
-    return tuple(photos)
 
 
 def write_photo_set(

@@ -17,8 +17,6 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.photo import CadModel, ModelFiles, existing
@@ -426,6 +424,9 @@ def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> 
 
 def _diameter(mesh: Mesh) -> float:
     """The largest distance of two vertices."""
+    from scipy.spatial import ConvexHull, QhullError  # only writing needs SciPy
+    from scipy.spatial.distance import pdist
+
     points = mesh.vertices[mesh.is_used]
     try:
         points = points[ConvexHull(points).vertices]

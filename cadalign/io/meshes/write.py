@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
@@ -48,6 +47,8 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
     DataError
         If the file cannot be written.
     """
+    import trimesh  # takes long to import, which OBJ files need not
+
     _make_folder(path)
     colors = np.round(255 * _vertex_colors(mesh)).astype(np.uint8)
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)

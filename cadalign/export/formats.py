@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.datasets.detections.coco import write_coco_keypoints
 from cadalign.datasets.photos import bop, bop_files
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.datasets.photos.scan2cad import scan_entry
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
@@ -131,7 +132,7 @@ def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
     _write_bop_model(folder, exported, options)
 
 
-def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[bop_files.PoseEstimate]:
+def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEstimate]:
     """The poses of an object in its photos, in millimetres, of its stretched mesh.
 
     A photo's number is that of its file's name, where that is one, or else its view's; the given
@@ -147,7 +148,7 @@ def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[bop_file
             image = options.image_id + number
         rigid = Alignment(pose.rotation, shift, np.ones(3))
         ids = str(options.scene_id), str(image), str(options.object_id)
-        poses.append(bop_files.PoseEstimate(*ids, rigid))
+        poses.append(PoseEstimate(*ids, rigid))
     return poses
 
 

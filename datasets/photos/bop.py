@@ -7,7 +7,8 @@ bop_toolkit's ``docs/bop_datasets_format.md``.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from cadalign.datasets.photos.bop_files import (
     TRUTH,
     BopModels,
     Nine,
-    PoseEstimate,
     ScenePose,
     object_name,
+    read_bop_results,
+    read_scene_gt,
     write_model,
     write_models_info,
     write_scene_gt,
@@ -36,6 +38,7 @@ from cadalign.datasets.photos.photo import (
     existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject
+from cadalign.datasets.photos.poses import Estimates, PoseEstimate, PoseFile
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -184,6 +187,14 @@ class Bop(PhotoDataset):
         depth = None if depth_path is None else DepthImage(depth_path, depth_scale)
         return Photo(self.names[index], image, camera, objects, depth=depth, problems=problems)
 
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open a CSV file of results of the BOP challenge, or one as ``scene_gt.json``."""
+        if path.suffix.lower() == ".csv":
+            return _Poses(read_bop_results(path), self)
+        if isinstance(read_json(path), list):
+            raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
+        return _Poses(read_scene_gt(path), self)
+
     def _model(self, obj_id: int) -> tuple[CadModel | None, Symmetry]:
         """A model and its symmetries, read once while photos have the same models."""
         if self._models is None:
@@ -281,6 +292,40 @@ def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:
         left, top, width, height = info.bbox_obj
         bbox = np.array([left, top, left + width, top + height])
     return replace(found, bbox=bbox, visible_fraction=info.visib_fract)
+
+
+class _Poses(PoseFile):
+    """BOP's poses, by the numbers of scene and image."""
+
+    def __init__(self, estimates: Estimates, dataset: Bop) -> None:
+        self.problems = estimates.problems
+        self._own = str(int(dataset.root.name)) if dataset.root.name.isdecimal() else ""
+        scenes = {each.scene for each in estimates.poses}
+        is_numbered = self._own or any("/" in name for name in dataset.names)
+        if not is_numbered and len(scenes) > 1:
+            raise DataError(
+                f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number",
+                where=str(estimates.path),
+                fix="give the data set's folder, or a file of that scene alone",
+            )
+        # A file or a folder that tells no number is of the one scene there is.
+        self._any_scene = not is_numbered or scenes == {""}
+        self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
+        for each in estimates.poses:
+            self._poses["" if self._any_scene else each.scene, each.image].append(each)
+
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        return tuple(self._poses.get(self._key(photo.name), ()))
+
+    def strays(self, names: Sequence[str]) -> int:
+        known = {self._key(name) for name in names}
+        return sum(len(poses) for key, poses in self._poses.items() if key not in known)
+
+    def _key(self, name: str) -> tuple[str, str]:
+        scene, _, image = name.rpartition("/")
+        scene = scene.rpartition("/")[2]
+        number = str(int(scene)) if scene.isdecimal() else self._own
+        return "" if self._any_scene else number, str(int(image)) if image.isdecimal() else image
 
 
 def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:

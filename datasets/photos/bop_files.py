@@ -20,6 +20,7 @@ from msgspec import Meta
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.photo import CadModel, ModelFiles, existing
+from cadalign.datasets.photos.poses import Estimates, PoseEstimate
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -61,50 +62,6 @@ class ScenePose(ForeignDocument):
     def alignment(self) -> Alignment:
         """The pose; a rotation of few digits becomes the nearest one."""
         return _alignment(np.array(self.cam_R_m2c), np.array(self.cam_t_m2c))
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """A model's estimated pose in a photo.
-
-    Parameters
-    ----------
-    scene : str
-        The scene's id; empty where the file does not tell it.
-    image : str
-        The photo's id in its scene.
-    model_id : str
-        The model's id.
-    cam_from_model : Alignment
-        The pose, in the unit of the data set.
-    score : float
-        Confidence; higher is better.
-    seconds : float, optional
-        Time that the estimate took, of all objects in the photo.
-    """
-
-    scene: str
-    image: str
-    model_id: str
-    cam_from_model: Alignment
-    score: float = 1.0
-    seconds: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """The poses in a result file, and why some of its records could not be read.
-
-    Parameters
-    ----------
-    path : Path
-    poses : tuple of PoseEstimate
-    problems : tuple of DataError
-    """
-
-    path: Path
-    poses: tuple[PoseEstimate, ...]
-    problems: tuple[DataError, ...] = ()
 
 
 # Poses -----------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.photos.placed import PlacedObject
+from cadalign.datasets.photos.poses import PoseFile
 from cadalign.errors import CadalignError, DataError, InputError, brief
 from cadalign.io.documents import convert, in_file
 from cadalign.io.files import damaged, reading
@@ -137,6 +138,23 @@ class PhotoDataset(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}): {len(self)} photos"
+
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open a file of poses that were estimated on this data set.
+
+        Raises
+        ------
+        InputError
+            If it is not of the form of this data set.
+        DataError
+            If it cannot be read.
+        """
+        raise self.other_poses(path, "give poses on a data set of BOP or Scan2CAD")
+
+    def other_poses(self, path: Path, fix: str) -> InputError:
+        """The error of a file of poses that this data set's format does not know."""
+        what = f"not a file of poses for {self.kind}, which {self.root} holds"
+        return InputError(what, where=str(path), fix=fix)
 
     def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
         """Read all records, not the images, and count what there is.

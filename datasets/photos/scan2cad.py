@@ -6,7 +6,7 @@ Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +37,7 @@ from cadalign.datasets.photos.photo import (
     existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
+from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
 from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
@@ -44,7 +45,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
-from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, read_json
 from cadalign.io.files import write_json
 
 FULL = "full_annotations.json"
@@ -172,19 +173,15 @@ class Scan2CAD(PhotoDataset):
                 fix="give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)",
             )
 
-    def with_annotations(self, path: str | os.PathLike[str]) -> Scan2CAD:
-        """Open a file of annotations, such as an estimate's, on the frames of this data set.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read, or there is no frame of its scans.
-        """
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open annotations in the form of these, such as an estimate's, seen from these frames."""
+        if path.suffix.lower() == ".csv" or not isinstance(read_json(path), list):
+            raise self.other_poses(path, f"give JSON as {FULL}")
         *others, last = self._frame_folders
         for folder in others:
             with suppress(DataError):
-                return Scan2CAD(path, scannet=folder)
-        return Scan2CAD(path, scannet=last)
+                return _Poses(Scan2CAD(path, scannet=folder))
+        return _Poses(Scan2CAD(path, scannet=last))
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -306,6 +303,27 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
         where=str(path),
         fix="give the folder of Scan2CAD's annotations",
     )
+
+
+class _Poses(PoseFile):
+    """Poses in the form of Scan2CAD's annotations, seen from the frames of the data set."""
+
+    def __init__(self, photos: Scan2CAD) -> None:
+        self._photos, self._names = photos, set(photos.names)
+        self.problems = tuple(photos.problems.values())
+
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        if photo.name not in self._names:
+            return ()
+        seen = self._photos[photo.name]
+        return tuple(
+            PoseEstimate("", photo.name, each.model.model_id, each.truth.cam_from_model)
+            for each in seen.objects
+            if each.model is not None and each.truth.cam_from_model is not None
+        )
+
+    def strays(self, names: Sequence[str]) -> int:
+        return len(self._names - set(names))
 
 
 def scan_entry(

@@ -13,12 +13,12 @@ from support.exported import POSE, aligned, wedge
 from cadalign import Alignment
 from cadalign.datasets import Bop, load_mesh
 from cadalign.datasets.photos.bop_files import (
-    PoseEstimate,
     read_bop_results,
     read_scene_gt,
     write_bop_results,
     write_scene_gt,
 )
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import DataError, InputError
 from cadalign.export import export_object
 from cadalign.geometry.rotations import rotation_from_vector

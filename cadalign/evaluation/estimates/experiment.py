@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cadalign.datasets.photos.bop_files import PoseEstimate
 from cadalign.datasets.photos.photo import NamedPoints, Photo
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import CadalignError, DataError, DegenerateError
 from cadalign.evaluation.estimates.files import opened_estimates
 from cadalign.evaluation.estimates.matching import match_estimates

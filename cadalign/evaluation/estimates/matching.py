@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cadalign.datasets.photos.bop_files import PoseEstimate
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import CadalignError
 from cadalign.evaluation.photos.metrics.bop import mssd
 from cadalign.evaluation.photos.sighting import PhotoTarget

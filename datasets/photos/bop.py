@@ -35,7 +35,7 @@ from cadalign.datasets.photos.photo import (
     Photo,
     PhotoObject,
     Truth,
-    existing,
+    first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.datasets.photos.poses import Estimates, PoseEstimate, PoseFile
@@ -179,8 +179,8 @@ class Bop(PhotoDataset):
             if number < len(infos):
                 found = _with_info(found, infos[number])
             name = f"{int(key):06d}_{number:06d}.png"
-            masks = (existing(folder / kind / name) for kind in ("mask_visib", "mask"))
-            return replace(found, mask_path=next(filter(None, masks), None))
+            masks = (folder / kind / name for kind in ("mask_visib", "mask"))
+            return replace(found, mask_path=first_existing(masks))
 
         objects, problems = read_each(poses, read_object, where=f"{folder / TRUTH}, {key}")
         depth_path = _image(folder, ("depth",), key)
@@ -223,12 +223,8 @@ def _read_scene(folder: Path) -> _Scene:
 def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
     if not key.isdecimal():
         raise DataError(f"{key!r} is not the number of an image", where=str(folder / TRUTH))
-    for kind in kinds:
-        for suffix in _IMAGES:
-            path = folder / kind / f"{int(key):06d}{suffix}"
-            if path.is_file():
-                return path
-    return None
+    name = f"{int(key):06d}"
+    return first_existing(folder / kind / f"{name}{end}" for kind in kinds for end in _IMAGES)
 
 
 def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None, float]:
@@ -250,23 +246,19 @@ def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None,
         )
     if size is None:
         return None, scale
-    try:
+    with in_file(f"{scene.folder}, camera of photo {key}"):
         return Camera(*size, *values), scale
-    except InputError as error:
-        where = f"{scene.folder}, camera of photo {key}"
-        raise DataError(error.what, where=where) from None
 
 
 def _common_camera(folder: Path) -> _SceneCamera | None:
     """The camera of all photos of a scene: its own, or that of a folder above it."""
     for place in (folder, *folder.parents[:2]):
         path = place / _CAMERA
-        if path.is_file():
-            data = read_json(path)
-            if isinstance(data, dict) and "fx" in data:
-                with in_file(path):
-                    found: _SceneCamera = convert(data, _SceneCamera)
-                return found
+        data = read_json(path) if path.is_file() else None
+        if isinstance(data, dict) and "fx" in data:
+            with in_file(path):
+                found: _SceneCamera = convert(data, _SceneCamera)
+            return found
     return None
 
 

@@ -28,6 +28,7 @@ from cadalign.datasets.photos.photo import Photo, PhotoObject, Truth, existing
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.io.documents import in_file
 from cadalign.io.files import damaged, reading
 from cadalign.io.images import photo_size
 
@@ -290,11 +291,9 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
             matrix = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
         except ValueError:
             raise damaged("P2 is not a 3 x 4 matrix", path) from None
-        try:
-            k = matrix[:, :3]
+        k = matrix[:, :3]
+        with in_file(f"{path}: P2"):
             camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        except InputError as error:
-            raise DataError(error.what, where=f"{path}: P2") from None
         return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
     raise damaged("there is no line P2", path)
 

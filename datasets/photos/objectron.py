@@ -34,8 +34,9 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    first_existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, upright_rotation
+from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -43,7 +44,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import write_json
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -258,10 +259,10 @@ def _cam_from_world(found: ArCamera) -> Alignment:
 
 def _image(root: Path, annotation: Path, frame_id: int) -> Path | ImageReader | None:
     for folder in _image_folders(root, annotation):
-        for name in (f"{frame_id}", f"{frame_id:06d}"):
-            for suffix in (".jpg", ".png"):
-                if (folder / f"{name}{suffix}").is_file():
-                    return folder / f"{name}{suffix}"
+        names = (str(frame_id), f"{frame_id:06d}")
+        image = first_existing(folder / f"{n}{end}" for n in names for end in (".jpg", ".png"))
+        if image is not None:
+            return image
         if (folder / "video.MOV").is_file():
             return VideoFrame(folder / "video.MOV", frame_id)
     return None
@@ -279,19 +280,16 @@ def write_objectron(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) 
 
     The scene's y points up. Returns why objects were left out.
     """
-    problems = []
-    for number, placed in numbered:
-        place = folder / ANNOTATIONS / placed.category / "batch-1"
-        try:
-            sequence = _sequence(placed)
-        except InputError as error:
-            problems.append(error)
-            continue
-        with writing(place):
-            place.mkdir(parents=True, exist_ok=True)
-        write_json(place / f"{number}.json", sequence)
-        placed.copy_image(place / f"{number}" / "0")
+    _, problems = converted(numbered, partial(_written, folder))
     return problems
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    sequence = _sequence(placed)
+    place = folder / ANNOTATIONS / placed.category / "batch-1"
+    placed.copy_image(place / f"{number}" / "0")
+    write_json(place / f"{number}.json", sequence)
+    return sequence
 
 
 def _sequence(placed: PlacedObject) -> dict[str, Any]:

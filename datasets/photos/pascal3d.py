@@ -23,13 +23,22 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    first_existing,
 )
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Text, read_document
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    PathText,
+    Point2,
+    Text,
+    in_file,
+    read_document,
+)
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
@@ -117,12 +126,9 @@ class Pascal3D(PhotoDataset):
 
 def find_image(root: Path, name: str) -> Path | None:
     """Find the image of an annotation, named without its ending; None where it is missing."""
-    for folder in _IMAGE_FOLDERS:
-        for suffix in _IMAGES:
-            path = root / folder / f"{name}{suffix}"
-            if path.is_file():
-                return path
-    return None
+    return first_existing(
+        root / folder / f"{name}{end}" for folder in _IMAGE_FOLDERS for end in _IMAGES
+    )
 
 
 def cad_folder(root: Path) -> Path | None:
@@ -270,22 +276,17 @@ class PascalCad:
         """Read the mesh."""
         found = self._find()
         where = f"{self.path}: model {self.index}"
-        try:
+        with in_file(where):
             vertices, faces = found.array("vertices", 3), found.array("faces", 3)
             return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
-        except InputError as error:
-            raise DataError(error.what, where=f"{where}: {error.where}") from None
 
     def load_keypoints(self) -> NamedPoints | None:
         """Read the anchors that this model has."""
         found = self._find()
-        try:
+        with in_file(f"{self.path}: model {self.index}"):
             anchors = {
                 name: found.array(name, 3) for name in found.texts("pnames") if name in found.names
             }
-        except InputError as error:
-            where = f"{self.path}: model {self.index}: {error.where}"
-            raise DataError(error.what, where=where) from None
         present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
         if not present:
             return None
@@ -358,14 +359,11 @@ class Pascal3DDetections(PhotoDataset):
         names: list[str] = []
         for path in sorted((folder / DETECTED).glob("*.mat")):
             found = read_structs(path, "annot")[0]
-            try:
+            with in_file(path):
                 images, categories = found.texts("imgname"), found.texts("class")
                 indices = found.array("cad_index").ravel()
-            except InputError as error:
-                raise DataError(error.what, where=f"{path}: {error.where}") from None
-            counts = {len(each) for each in (images, categories, indices)}
-            if len(counts) != 1:
-                raise DataError("its lists have different lengths", where=str(path))
+                if len({len(each) for each in (images, categories, indices)}) != 1:
+                    raise InputError("its lists have different lengths")
             names += images
             self._records += [
                 _Detected(category, int(index))

@@ -34,7 +34,7 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    existing,
+    first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
 from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
@@ -273,12 +273,12 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
 
 
 def _mesh_path(folders: Iterable[Path], synset: str, model_id: str) -> Path | None:
-    for folder in folders:
-        for place in (folder / synset / model_id, folder / model_id):
-            found = next((place / file for file in _MESH_FILES if existing(place / file)), None)
-            if found is not None:
-                return found
-    return None
+    return first_existing(
+        place / file
+        for folder in folders
+        for place in (folder / synset / model_id, folder / model_id)
+        for file in _MESH_FILES
+    )
 
 
 def _inverse(alignment: Alignment) -> Alignment:
@@ -295,9 +295,9 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
     """The folder and the annotation file that a path means."""
     if path.is_file():
         return path.parent, path
-    for name in (FULL, *_SAMPLES):
-        if (path / name).is_file():
-            return path, path / name
+    found = first_existing(path / name for name in (FULL, *_SAMPLES))
+    if found is not None:
+        return path, found
     raise DataError(
         f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here",
         where=str(path),

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError, InputError
+from cadalign.datasets.photos.photo import first_existing
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.documents import in_file
 from cadalign.io.files import damaged, reading, write_text, writing
 from cadalign.io.images import photo_size
 
@@ -44,10 +46,8 @@ class ScanNetFrame:
         matrix = read_matrix(self.intrinsics_path, (4, 4))
         width, height = photo_size(self.image_path)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
-        try:
+        with in_file(self.intrinsics_path):
             return Camera(width, height, fx, fy, cx, cy)
-        except InputError as error:
-            raise DataError(error.what, where=str(self.intrinsics_path)) from None
 
     def cam_from_scan(self) -> Alignment:
         """Read the pose: the camera's coordinates from the scan's [m].
@@ -58,10 +58,8 @@ class ScanNetFrame:
             If it is no pose, such as ScanNet's -inf of a frame whose tracking was lost.
         """
         pose = read_matrix(self.pose_path, (4, 4))
-        try:
+        with in_file(self.pose_path):
             rotation = nearest_rotation(pose[:3, :3]).T
-        except InputError as error:
-            raise DataError(error.what, where=str(self.pose_path)) from None
         return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
 
 
@@ -81,7 +79,7 @@ def list_frames(folders: Iterable[Path], scene: str) -> tuple[ScanNetFrame, ...]
 
 
 def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
-    intrinsics = next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
+    intrinsics = first_existing(folder / name for name in _INTRINSICS)
     if intrinsics is None:
         return
     for image in (folder / "color").glob("*"):
@@ -97,7 +95,7 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")
         images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
-        image = next((path for path in images if path.is_file()), folder / f"{stem}.jpg")
+        image = first_existing(images) or folder / f"{stem}.jpg"
         yield ScanNetFrame(stem.removeprefix(prefix), image, pose, intrinsics)
 
 

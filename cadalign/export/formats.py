@@ -119,17 +119,17 @@ def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _bop_results(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    poses = _bop_poses(exported, options)
-    _write_bop_model(path.parent, exported, options)
+    mesh, poses = _bop_mesh(exported), _bop_poses(exported, options)
+    _write_bop_model(path.parent, mesh, options)
     bop_files.write_bop_results(path, poses)
 
 
 def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
     folder = path.parent if path.name == bop_files.TRUTH else path
-    poses = _bop_poses(exported, options)
+    mesh, poses = _bop_mesh(exported), _bop_poses(exported, options)
     cameras = {each.image: view.camera for each, view in zip(poses, exported.views, strict=True)}
     bop.write_scene(folder, poses, cameras)
-    _write_bop_model(folder, exported, options)
+    _write_bop_model(folder, mesh, options)
 
 
 def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEstimate]:
@@ -152,16 +152,19 @@ def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEsti
     return poses
 
 
-def _write_bop_model(folder: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    """Write the stretched mesh; poses alone are enough of a model without stretch and mesh."""
+def _bop_mesh(exported: AlignedObject) -> Mesh | None:
+    """The stretched mesh [mm]; poses alone are enough of a model without stretch and mesh."""
     scale = exported.views[0].cam_from_model.scale * exported.metres / bop.MILLIMETRES
-    if exported.mesh is not None:
-        number = options.object_id
-        entry = bop_files.write_model(folder, exported.mesh.stretched(scale), number)
-        bop_files.write_models_info(folder, {number: entry})
-    elif np.abs(scale - 1).max() > _SAME:
+    if exported.mesh is None and np.abs(scale - 1).max() > _SAME:
         what = "BOP's poses have no stretch, and there is no mesh to stretch instead"
         raise InputError(what, where="mesh", fix="give it: an observation's `model`")
+    return None if exported.mesh is None else exported.mesh.stretched(scale)
+
+
+def _write_bop_model(folder: Path, mesh: Mesh | None, options: ExportOptions) -> None:
+    if mesh is not None:
+        entry = bop_files.write_model(folder, mesh, options.object_id)
+        bop_files.write_models_info(folder, {options.object_id: entry})
 
 
 def _scan2cad(path: Path, exported: AlignedObject, options: ExportOptions) -> None:

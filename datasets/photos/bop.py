@@ -10,8 +10,9 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Raw
@@ -37,10 +38,9 @@ from cadalign.datasets.photos.photo import (
     Truth,
     first_existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject
+from cadalign.datasets.photos.placed import PlacedObject, converted
 from cadalign.datasets.photos.poses import Estimates, PoseEstimate, PoseFile
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -327,29 +327,37 @@ def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> lis
     why objects were left out.
     """
     scene = folder / _WRITTEN_SCENE
-    models, cameras, infos, poses = {}, {}, {}, list[PoseEstimate]()
-    problems = []
-    for number, placed in numbered:
-        image, model_id = str(number), number + 1
-        try:
-            placed.require_plain_camera("BOP")
-            left, top, right, bottom = placed.bbox.tolist()
-            mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
-        except InputError as error:
-            problems.append(error)
-            continue
-        models[model_id] = write_model(folder, mesh, model_id)
-        placed.copy_image(scene / "rgb" / f"{number:06d}")
-        placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
-        shift = placed.pose.translation / MILLIMETRES
-        pose = Alignment(placed.pose.rotation, shift, np.ones(3))
-        poses.append(PoseEstimate("1", image, str(model_id), pose))
-        cameras[image] = placed.camera
-        infos[image] = [{"bbox_obj": [left, top, right - left, bottom - top]}]
-    write_models_info(folder, models)
-    write_scene(scene, poses, cameras)
-    write_json(scene / _INFO, infos)
+    entries, problems = converted(numbered, partial(_written, folder))
+    write_models_info(folder, {int(each.pose.model_id): each.model for each in entries})
+    cameras = {each.pose.image: each.camera for each in entries}
+    write_scene(scene, [each.pose for each in entries], cameras)
+    write_json(scene / _INFO, {each.pose.image: [each.info] for each in entries})
     return problems
+
+
+class _Written(NamedTuple):
+    """What the tables of a scene say of a written object."""
+
+    pose: PoseEstimate
+    camera: Camera
+    model: dict[str, float]
+    info: dict[str, list[float]]
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> _Written:
+    placed.require_plain_camera("BOP")
+    scene, image, model_id = folder / _WRITTEN_SCENE, str(number), number + 1
+    left, top, right, bottom = placed.bbox.tolist()
+    mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
+    placed.copy_image(scene / "rgb" / f"{number:06d}")
+    placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
+    pose = replace(placed.pose, translation=placed.pose.translation / MILLIMETRES)
+    return _Written(
+        PoseEstimate("1", image, str(model_id), pose),
+        placed.camera,
+        write_model(folder, mesh, model_id),
+        {"bbox_obj": [left, top, right - left, bottom - top]},
+    )
 
 
 def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:

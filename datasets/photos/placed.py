@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.photo import CadModel, Photo, PhotoObject
+from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -26,6 +27,8 @@ LEVEL_UP = (0.0, -1.0, 0.0)
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _LEAST = 0.9  # of the cosine between an axis and up that another axis is taken
+
+_Entry = TypeVar("_Entry")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +104,17 @@ class PlacedObject:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the model's keypoints."""
-        points = self.model.load_keypoints()
-        return () if points is None else points.names
+        return self._keypoints.names
 
     @property
     def points(self) -> FloatArray:
         """The keypoints on the stretched model, (k, 3) float [m]."""
-        points = self.model.load_keypoints()
-        return np.empty((0, 3)) if points is None else points.xyz * self.scale
+        return self._keypoints.xyz * self.scale
+
+    @property
+    def _keypoints(self) -> NamedPoints:
+        with _left_out():
+            return self.model.load_keypoints() or NamedPoints((), np.empty((0, 3)))
 
     @property
     def marked(self) -> dict[str, FloatArray]:
@@ -141,17 +147,16 @@ class PlacedObject:
     @property
     def mesh(self) -> Mesh:
         """The model's mesh; raises InputError where there is none that can be read."""
-        try:
+        with _left_out():
             return self.model.load_mesh()
-        except DataError as error:
-            raise InputError(error.what, where=error.where, fix=error.fix) from None
 
     @property
     def bbox(self) -> FloatArray:
         """Left, top, right and bottom of the object in the image, (4,) float [px]."""
         if self.found.bbox is not None:
             return self.found.bbox
-        mesh = self.model.source.load_mesh()
+        with _left_out():
+            mesh = self.model.source.load_mesh()
         points = self.points if mesh is None else mesh.vertices * self.scale
         pixels = self.camera.project_where_ahead(self.pose.apply(points))
         pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -175,7 +180,7 @@ class PlacedObject:
         with writing(stem):
             stem.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(self.photo.image, Path):
-            with open_photo(self.photo.image) as image:
+            with _left_out(), open_photo(self.photo.image) as image:
                 ending = _COPIED.get(image.format or "")
                 is_upright = image.getexif().get(_ORIENTATION, 1) == 1
             if ending is not None and is_upright:
@@ -184,7 +189,9 @@ class PlacedObject:
                     shutil.copyfile(self.photo.image, path)
                 return path
         path = stem.with_name(f"{stem.name}.png")
-        write_image(path, self.photo.read_image())
+        with _left_out():
+            pixels = self.photo.read_image()
+        write_image(path, pixels)
         return path
 
     def write_mask(self, path: Path) -> Path | None:
@@ -193,7 +200,9 @@ class PlacedObject:
             return None
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, np.where(self.found.read_mask(), 255, 0).astype(np.uint8))
+        with _left_out():
+            mask = self.found.read_mask()
+        write_image(path, np.where(mask, 255, 0).astype(np.uint8))
         return path
 
     def write_model(self, path: Path, *, is_stretched: bool) -> None:
@@ -219,8 +228,8 @@ def placed_objects(
 
 def converted(
     numbered: Iterable[tuple[int, PlacedObject]],
-    convert: Callable[[int, PlacedObject], dict[str, Any]],
-) -> tuple[list[dict[str, Any]], list[InputError]]:
+    convert: Callable[[int, PlacedObject], _Entry],
+) -> tuple[list[_Entry], list[InputError]]:
     """Entries of the objects that a format can hold, and why the others are left out."""
     entries, problems = [], []
     for number, placed in numbered:
@@ -229,6 +238,15 @@ def converted(
         except InputError as error:
             problems.append(error)
     return entries, problems
+
+
+@contextmanager
+def _left_out() -> Iterator[None]:
+    """Let what cannot be read of an object be the reason why it is left out."""
+    try:
+        yield
+    except DataError as error:
+        raise InputError(error.what, where=error.where, fix=error.fix) from None
 
 
 def _file_name(text: str) -> str:

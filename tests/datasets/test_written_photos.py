@@ -137,6 +137,11 @@ def test_what_objects_lack_is_told_and_the_others_are_written(tmp_path: Path) ->
     (problem,) = write_photos(tmp_path / "new", given, "pix3d")
     assert str(problem).endswith("test/000001/1: the image of this photo is not there")
     assert len(cadalign.datasets.open(tmp_path / "new")) == 1
+    damaged = cadalign.datasets.open(write_pix3d(tmp_path / "damaged"))
+    (tmp_path / "damaged/img/1.png").write_bytes(b"no picture")
+    (problem,) = write_photos(tmp_path / "rest", damaged, "bop")
+    assert "1.png: not an image that can be read" in str(problem)
+    assert len(cadalign.datasets.open(tmp_path / "rest")) == 2
     bare = cadalign.datasets.open(write_bop(tmp_path / "bare"))
     (tmp_path / "bare/models/obj_000001.ply").unlink()
     with pytest.raises(InputError, match="model obj_000001: there is no mesh of this model"):

@@ -123,14 +123,16 @@ def write_photos(
     if form not in writers:
         fix = f"known are {', '.join(writers)}"
         raise InputError(f"unknown form {quote(form)}", where="form", fix=fix)
-    placed, problems = placed_objects(photos)
-    if not placed and not problems:
+    photos = list(photos)
+    count = sum(len(photo.objects) for photo in photos)
+    if not count:
         raise InputError("there is no object to write", where="photos")
     with writing(folder):
         if folder.exists() and any(folder.iterdir()):
             raise DataError("the folder is not empty", where=str(folder), fix="give a new one")
         folder.mkdir(parents=True, exist_ok=True)
-    left_out = writers[form](folder, placed) if placed else []
-    if len(left_out) == len(placed):
-        raise (problems + left_out)[0]
-    return (*problems, *left_out)
+    problems: list[InputError] = []
+    problems += writers[form](folder, placed_objects(photos, problems))
+    if len(problems) == count:
+        raise problems[0]
+    return tuple(problems)

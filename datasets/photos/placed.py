@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -111,7 +112,7 @@ class PlacedObject:
         """The keypoints on the stretched model, (k, 3) float [m]."""
         return self._keypoints.xyz * self.scale
 
-    @property
+    @cached_property
     def _keypoints(self) -> NamedPoints:
         with _left_out():
             return self.model.load_keypoints() or NamedPoints((), np.empty((0, 3)))
@@ -144,7 +145,7 @@ class PlacedObject:
         up = np.array(LEVEL_UP) if self.photo.up is None else self.photo.up
         return np.asarray(up / np.linalg.norm(up))
 
-    @property
+    @cached_property
     def mesh(self) -> Mesh:
         """The model's mesh; raises InputError where there is none that can be read."""
         with _left_out():
@@ -212,18 +213,18 @@ class PlacedObject:
 
 
 def placed_objects(
-    photos: Iterable[Photo],
-) -> tuple[list[tuple[int, PlacedObject]], list[InputError]]:
-    """Objects of photos with their numbers, and why others cannot be written."""
-    placed, problems = [], []
+    photos: Iterable[Photo], problems: list[InputError]
+) -> Iterator[tuple[int, PlacedObject]]:
+    """Objects of photos with their numbers; why others cannot be written is added to problems."""
     for number, (photo, found) in enumerate((p, each) for p in photos for each in p.objects):
         try:
             if photo.image is None:
                 raise InputError("the image of this photo is not there", where=photo.name)
-            placed.append((number, PlacedObject(photo, found)))
+            placed = PlacedObject(photo, found)
         except InputError as error:
             problems.append(error)
-    return placed, problems
+        else:
+            yield number, placed
 
 
 def converted(

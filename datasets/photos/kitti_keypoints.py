@@ -49,6 +49,7 @@ from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, converted
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
@@ -218,8 +219,7 @@ def car_box(dims_hwl: FloatArray, location: FloatArray, rotation_y: float) -> Bo
     height, width, length = dims_hwl.tolist()
     if not min(height, width, length) > 0:
         raise InputError(f"{dims_hwl.tolist()} are not positive", where="dimensions")
-    cosine, sine = np.cos(rotation_y), np.sin(rotation_y)
-    turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    turn = rotation_from_vector(np.array([0.0, rotation_y, 0.0]))
     center = location - np.array([0, height / 2, 0])
     return Box(center, turn @ _OBJECT_FROM_CAR, np.array([width, length, height]))
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
 from cadalign.datasets.photos.mat_files import MatStruct, read_structs
 from cadalign.datasets.photos.photo import (
@@ -30,6 +31,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
@@ -190,7 +192,7 @@ def _object(
 
 def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
     """The anchors that are visible."""
-    marked: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {}
+    marked: dict[str, FloatArray] = {}
     for name in () if anchors is None else anchors.names:
         each = None if anchors is None else anchors.struct(name)
         if each is None or each.number("status", default=0.0) != _VISIBLE:
@@ -224,9 +226,11 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
             np.sin(elevation),
         ]
     )
-    tilt = elevation - np.pi / 2
-    upright = _about_x(tilt) @ _about_z(-azimuth)
-    rotation = OPENGL_AXES[:, None] * (_about_z(theta) @ upright)
+    about_x, about_z = np.eye(3)[[0, 2]]
+    upright = rotation_from_vector((elevation - np.pi / 2) * about_x) @ rotation_from_vector(
+        -azimuth * about_z
+    )
+    rotation = OPENGL_AXES[:, None] * (rotation_from_vector(theta * about_z) @ upright)
     annotated = Camera(
         camera.width,
         camera.height,
@@ -237,16 +241,6 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
     )
     pose = Alignment(rotation, -rotation @ center, np.ones(3))
     return Truth(cam_from_model=pose, camera=annotated)
-
-
-def _about_x(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
-
-
-def _about_z(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 # CAD models -------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from cadalign.datasets.photos.photo import (
     existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted
-from cadalign.datasets.photos.scannet import write_matrix
+from cadalign.datasets.photos.scannet import read_matrix, write_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -42,7 +42,7 @@ from cadalign.io.documents import (
     Positive,
     Text,
 )
-from cadalign.io.files import damaged, reading, write_json
+from cadalign.io.files import write_json
 from cadalign.io.meshes.load import load_mesh
 
 ANNOTATIONS = "pix3d.json"
@@ -95,14 +95,7 @@ class _Model:
     def load_keypoints(self) -> NamedPoints | None:
         if self.keypoints_path is None or not self.keypoints_path.is_file():
             return None
-        with reading(self.keypoints_path):
-            rows = self.keypoints_path.read_text(encoding="utf-8").split("\n")
-        try:
-            xyz = np.array([row.split() for row in rows if row.strip()], dtype=np.float64)
-        except ValueError:
-            raise damaged("not a table of numbers", self.keypoints_path) from None
-        if xyz.ndim != 2 or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
-            raise damaged("not a table of x, y, z", self.keypoints_path)
+        xyz = read_matrix(self.keypoints_path, (None, 3))
         return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
 
 

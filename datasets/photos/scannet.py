@@ -99,8 +99,8 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
         yield ScanNetFrame(stem.removeprefix(prefix), image, pose, intrinsics)
 
 
-def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
-    """Read a text file of a matrix, a row on each line.
+def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
+    """Read a text file of a matrix, a row on each line; None for any number of rows.
 
     Raises
     ------
@@ -114,8 +114,10 @@ def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
         raise damaged("not a table of numbers", path) from None
-    if matrix.shape != shape:
-        raise damaged(f"shape {matrix.shape}, expected {shape}", path)
+    rows_wanted, columns = shape
+    if matrix.shape != (rows_wanted or len(matrix), columns):
+        wanted = f"{rows_wanted or 'some'} rows of {columns} numbers"
+        raise damaged(f"shape {matrix.shape}, expected {wanted}", path)
     if not np.isfinite(matrix).all():
         raise DataError("some of its numbers are not finite", where=str(path))
     return matrix

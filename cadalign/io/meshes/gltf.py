@@ -240,6 +240,8 @@ class Document(_Part):
 class GltfFile:
     """A glTF file: its document, and the arrays of its buffers, which are read when asked for.
 
+    Errors of arrays name their place in the document; who asks for them names the file.
+
     Parameters
     ----------
     path : Path
@@ -272,19 +274,18 @@ class GltfFile:
     def array(self, number: int) -> Array:
         """The array (n, width) of an accessor; of normalized integers as fractions."""
         accessor = nth(self.document.accessors, number, "accessors")
-        with in_file(self.path):
-            place = f"accessors[{number}]"
-            dtype, width = _form(accessor, place)
-            if accessor.buffer_view is None:
-                if accessor.count > self.size:
-                    raise damaged(f"{accessor.count} values, but no data", place)
-                values = np.zeros((accessor.count, width), dtype=dtype)
-            else:
-                values = self._values(
-                    accessor.buffer_view, accessor.byte_offset, (accessor.count, width), dtype
-                )
-            if accessor.sparse is not None:
-                values = self._with_sparse(values, accessor.sparse, place)
+        place = f"accessors[{number}]"
+        dtype, width = _form(accessor, place)
+        if accessor.buffer_view is None:
+            if accessor.count > self.size:
+                raise damaged(f"{accessor.count} values, but no data", place)
+            values = np.zeros((accessor.count, width), dtype=dtype)
+        else:
+            values = self._values(
+                accessor.buffer_view, accessor.byte_offset, (accessor.count, width), dtype
+            )
+        if accessor.sparse is not None:
+            values = self._with_sparse(values, accessor.sparse, place)
         return _fractions(values) if accessor.normalized else values
 
     def view(self, number: int) -> memoryview:

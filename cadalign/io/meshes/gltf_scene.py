@@ -107,7 +107,7 @@ def _local(node: Node) -> FloatArray:
         return np.array(node.matrix).reshape(4, 4).T
     transform = np.eye(4)
     x, y, z, w = node.rotation
-    if any(node.rotation):
+    if x or y or z:
         transform[:3, :3] = rotation_from_quat_wxyz(np.array([w, x, y, z]))
     transform[:3, :3] *= node.scale
     transform[:3, 3] = node.translation

@@ -30,7 +30,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, Point3, convert, in_file, read_json
-from cadalign.io.files import reading, write_json, write_text, writing
+from cadalign.io.files import read_text, write_json, write_text, writing
 
 RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 TRUTH_FILE = "scene_gt.json"
@@ -107,8 +107,7 @@ def read_bop_results(path: Path) -> Estimates:
     DataError
         If the file cannot be read, or is not such a file.
     """
-    with reading(path):
-        text = path.read_text(encoding="utf-8-sig")
+    text = read_text(path)
     rows = list(csv.reader(io.StringIO(text)))
     if not rows or tuple(cell.strip() for cell in rows[0]) != RESULT_COLUMNS:
         what = f"the first line is not {','.join(RESULT_COLUMNS)}"

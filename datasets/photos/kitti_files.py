@@ -11,7 +11,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_text
 
 # The numbers after an object's type: truncated, occluded, alpha, bbox 4, dimensions h w l,
 # location 3, rotation_y; a detector's score may follow.
@@ -112,8 +112,7 @@ def read_labels(path: Path, *, tracking: bool) -> list[KittiLabel | DataError]:
     DataError
         If the file cannot be read.
     """
-    with reading(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path).splitlines()
     found: list[KittiLabel | DataError] = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
@@ -153,8 +152,7 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
     DataError
         If it cannot be read, or holds no valid P2.
     """
-    with reading(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path).splitlines()
     for line in lines:
         name, _, rest = line.partition(" ")
         if name.rstrip(":") != "P2":

@@ -23,7 +23,7 @@ from cadalign.datasets.photos.kitti_keypoints import TRACKS, MeanCar, car_bounds
 from cadalign.datasets.photos.records import parse, read_table
 from cadalign.errors import DataError
 from cadalign.io.documents import convert, in_file
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_text
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.reflections import find_reflection
 
@@ -79,8 +79,7 @@ def _mean_car(path: Path) -> MeanCar:
 
 def _numbers(path: Path, multiple: int) -> FloatArray:
     """All numbers of a text file, a multiple of so many."""
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     try:
         values = np.array(text.split(), dtype=np.float64)
     except ValueError:

@@ -42,6 +42,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
+from cadalign.io.files import open_input
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -188,7 +189,7 @@ def has_annotations(folder: Path) -> bool:
 
 
 def _is_sequence(path: Path) -> bool:
-    with suppress(OSError), path.open("rb") as file:
+    with suppress(DataError), open_input(path) as (file, _):
         begin = file.read(_BEGINNING)
         return b"frame_annotations" in begin or b"frameAnnotations" in begin
     return False

@@ -18,7 +18,7 @@ from msgspec import Meta
 from cadalign.datasets.photos.protobuf import Field, decode, entries
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json
-from cadalign.io.files import reading
+from cadalign.io.files import read_bytes
 
 _POINT_2D = {1: Field("x", "float"), 2: Field("y", "float"), 3: Field("depth", "float")}
 _KEYPOINT = {1: Field("id", "int"), 3: Field("point_2d", _POINT_2D)}
@@ -165,8 +165,7 @@ def read_sequence(path: Path) -> Sequence:
             tuple(objects if isinstance(objects, list) else ()),
             tuple(data["frame_annotations"]),
         )
-    with reading(path):
-        content = path.read_bytes()
+    content = read_bytes(path)
     messages: dict[int, list[bytes]] = {_OBJECTS: [], _FRAMES: []}
     try:
         for number, _, value in entries(content):

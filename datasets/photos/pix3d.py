@@ -39,7 +39,7 @@ from cadalign.io.documents import (
     Positive,
     Text,
 )
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_text
 from cadalign.io.meshes.load import load_mesh
 
 ANNOTATIONS = "pix3d.json"
@@ -89,8 +89,7 @@ class _Model:
     def load_keypoints(self) -> NamedPoints | None:
         if self.keypoints_path is None or not self.keypoints_path.is_file():
             return None
-        with reading(self.keypoints_path):
-            rows = self.keypoints_path.read_text(encoding="utf-8").split("\n")
+        rows = read_text(self.keypoints_path).split("\n")
         try:
             xyz = np.array([row.split() for row in rows if row.strip()], dtype=np.float64)
         except ValueError:

@@ -12,7 +12,7 @@ from msgspec import Raw
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, brief
 from cadalign.io.documents import convert, in_file
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_bytes, read_text
 
 T = TypeVar("T")
 
@@ -65,8 +65,7 @@ def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
     DataError
         If it cannot be read, or is not a matrix of finite numbers of this shape.
     """
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     rows = [line.split() for line in text.splitlines() if line.strip()]
     try:
         matrix = np.array(rows, dtype=np.float64)
@@ -80,8 +79,7 @@ def read_matrix(path: Path, shape: tuple[int, int]) -> FloatArray:
 
 
 def _read_raw(path: Path, kind: Any, name: str) -> Any:
-    with reading(path):
-        data = path.read_bytes()
+    data = read_bytes(path)
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from cadalign.datasets.sfm.bundler import Bundler
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
-from cadalign.io.files import reading
+from cadalign.io.files import open_input
 
 AUTO = "auto"
 """Recognise the format by the names of the files."""
@@ -144,5 +145,5 @@ def _recognize(root: Path) -> _Format:
 
 
 def _begins_with(file: Path, header: bytes) -> bool:
-    with reading(file), file.open("rb") as stream:
+    with open_input(file, most=sys.maxsize) as (stream, _):
         return stream.read(len(header)) == header

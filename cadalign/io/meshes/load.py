@@ -82,7 +82,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             fix=f"known are {', '.join(_READERS)}",
         )
     try:
-        if path.stat().st_size == 0:
+        if not path.stat().st_size and path.is_file():
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
         return reader(path)
     except InputError as error:  # what Mesh refuses

@@ -55,7 +55,7 @@ from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
 from cadalign.export import AlignedObject, ExportView, export_object
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Material
-from cadalign.io.images import write_image
+from cadalign.io.images import photo_size, read_photo, write_image
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, visible_keypoints
 from cadalign.render.views.viewpoints import frame_object, look_at
 
@@ -211,8 +211,7 @@ def _new(folder: Path) -> Path:
 def measure_list(arguments: AnnotatorArguments, browser: Browser, folder: Path) -> dict[str, Any]:
     """The list of a folder of photos, and going from one to the next."""
     case = case_of(arguments, folder)
-    with Image.open(case.photo) as image:
-        large = image.convert("RGB").resize((2000, 1500))
+    large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
     case.photo.unlink()
     for number in range(arguments.photos):
         large.save(case.folder / f"photo_{number}.jpg", quality=90)
@@ -431,8 +430,7 @@ def _at_rest(pose: Alignment) -> Alignment:
 
 def write_sheet(path: Path, shots: list[tuple[str, Path]], *, columns: int = 2) -> None:
     """Write pictures with their names as one, ``columns`` wide."""
-    with Image.open(shots[0][1]) as first:
-        width, height = first.size
+    width, height = photo_size(shots[0][1])
     if width < 600:
         columns = 5
     share = min(1.0, 900 / width)
@@ -443,8 +441,7 @@ def write_sheet(path: Path, shots: list[tuple[str, Path]], *, columns: int = 2) 
     for number, (name, shot) in enumerate(shots):
         x, y = number % columns * size[0], number // columns * (size[1] + 20)
         draw.text((x + 4, y + 4), name, fill="black")
-        with Image.open(shot) as image:
-            sheet.paste(image.convert("RGB").resize(size), (x, y + 20))
+        sheet.paste(Image.fromarray(read_photo(shot)).resize(size), (x, y + 20))
     sheet.save(path)
 
 

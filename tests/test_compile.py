@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,52 @@ def test_nothing_is_lost_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     write(tmp_path / "a", "1.0")
     assert call(tmp_path / "a", "kernels", 2.0, NUMBA_CACHE_DIR=str(tmp_path / "file")) == 0
+
+
+def emptied(data: bytes) -> bytes:
+    return b""
+
+
+def cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def zeroed(data: bytes) -> bytes:
+    """The last pages of a file that were not written when the power failed."""
+    return data[: len(data) // 3] + bytes(len(data) - len(data) // 3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("damage", "ending"), [(emptied, ".nbi"), (zeroed, ".nbi"), (cut, ".nbc")])
+def test_damaged_code_is_compiled_anew_and_told_in_one_line(
+    tmp_path: Path, damage: Callable[[bytes], bytes], ending: str
+) -> None:
+    (tmp_path / "a").mkdir()
+    source = SOURCES.format(imports="", term="1.0")
+    # What another kernel calls has files of its own.
+    (tmp_path / "a" / "kernels.py").write_text(
+        source.replace("one", "inner")
+        + source.replace("x + 1.0", "inner(x)").split("import kernel")[1]
+    )
+    cache = tmp_path / "cache"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    code = CALL.format(folder=str(tmp_path / "a"), module="kernels", value=2.0)
+
+    def run() -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+
+    assert (run().stdout, run().stdout) == ("0\n", "1\n")
+    files = sorted(cache.glob(f"*{ending}"))
+    assert len(files) == 2
+    for path in files:
+        path.write_bytes(damage(path.read_bytes()))
+    again = run()
+    assert again.stdout == "0\n"
+    told = f"{cache}: some of the compiled code is damaged; it is compiled anew"
+    assert again.stderr.splitlines() == [told]
+    after = run()
+    assert (after.stdout, after.stderr) == ("1\n", "")
 
 
 SHIPPED = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
 import socket
@@ -19,6 +20,8 @@ from cadalign.annotate.options import LOOPBACK
 
 TOKEN_HEADER = "x-cadalign-token"
 MAX_BODY = 512 * 1024
+PATIENCE = 10.0
+"""Seconds within which a request's head, and then its body, have to be there."""
 _EVERYWHERE = "0.0.0.0"
 _NAMES = (LOOPBACK, "localhost")
 _POLICY = (
@@ -115,7 +118,7 @@ def _outward_address() -> str:
 
 
 class Guard:
-    """ASGI middleware that enforces `Access` and limits the length of bodies."""
+    """ASGI middleware that enforces `Access` and limits the length of bodies, and their time."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -127,11 +130,16 @@ class Guard:
             return
         refused = self._access.refusal(scope)
         if refused is None:
-            body = await _read_body(receive)
-            if body is not None:
-                await self._app(scope, _replay(body), _with_headers(send))
-                return
-            refused = 413, f"more than {MAX_BODY} bytes"
+            try:
+                async with asyncio.timeout(PATIENCE):
+                    body = await _read_body(receive)
+            except TimeoutError:
+                refused = 408, f"the request takes more than {PATIENCE:.0f} s"
+            else:
+                if body is not None:
+                    await self._app(scope, _replay(body), _with_headers(send))
+                    return
+                refused = 413, f"more than {MAX_BODY} bytes"
         status, reason = refused
         # The rest of the body is unread, so the connection cannot be reused.
         headers = HEADERS | {"Connection": "close"}

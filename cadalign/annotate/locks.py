@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 
 from cadalign.annotate.names import file_name
 from cadalign.errors import DataError
+from cadalign.io.files import read_text
 
 logger = logging.getLogger("cadalign")
 
@@ -160,10 +161,10 @@ class _Lock:
     def _refusal(self) -> DataError:
         note = ""
         try:
-            note = self._path.read_text(encoding="utf-8", errors="replace")[:_LONGEST_NOTE]
-        except FileNotFoundError:
-            return self._unwritable("No lock can be made")
-        except OSError:
+            if not self._path.exists():
+                return self._unwritable("No lock can be made")
+            note = read_text(self._path, errors="replace")[:_LONGEST_NOTE]
+        except (OSError, DataError):
             pass
         return DataError(
             "another annotator has it open" + (f": {note}" if note else ""),

@@ -19,7 +19,7 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
-from cadalign.io.files import reading
+from cadalign.io.files import read_bytes, reading
 from cadalign.io.images import open_photo, photo_size, read_photo
 
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
@@ -71,7 +71,7 @@ class PhotoFile:
             image.load()
             is_turned = image.getexif().get(_ORIENTATION) in _TURNED
             if not is_turned and image.format in _SHOWN_AS_IS:
-                return _SHOWN_AS_IS[image.format], self.path.read_bytes()
+                return _SHOWN_AS_IS[image.format], read_bytes(self.path)
             upright = ImageOps.exif_transpose(image).convert("RGB")
         data = io.BytesIO()
         upright.save(data, format="JPEG", quality=_QUALITY, subsampling=0)

@@ -7,7 +7,7 @@ import json
 import secrets
 import socket
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -32,6 +32,9 @@ from cadalign.annotate.worklist_state import worklist_state
 from cadalign.errors import CadalignError, InputError
 from cadalign.errors import quote as quoted
 from cadalign.web import asset
+
+if TYPE_CHECKING:
+    import uvicorn
 
 _LONGEST_NUMBER = 9  # digits
 _BROWSER = "cadalign-browser"  # cookie that tells browsers apart, not the tabs of one
@@ -89,14 +92,26 @@ def listen(port: int, host: str = LOOPBACK) -> socket.socket:
     return listener
 
 
-def serve(app: ASGIApp, listener: socket.socket) -> None:
-    """Serve until interrupted."""
+def make_server(app: ASGIApp) -> uvicorn.Server:
+    """Make the server of an application, which `serve` runs."""
     import uvicorn
 
+    from cadalign.annotate.connections import BoundedProtocol
+
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1
+        app,
+        http=BoundedProtocol,
+        log_level="warning",
+        access_log=False,
+        lifespan="off",
+        timeout_graceful_shutdown=1,
     )
-    uvicorn.Server(config).run(sockets=[listener])
+    return uvicorn.Server(config)
+
+
+def serve(app: ASGIApp, listener: socket.socket) -> None:
+    """Serve until interrupted."""
+    make_server(app).run(sockets=[listener])
 
 
 class _Routes:

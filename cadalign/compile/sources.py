@@ -9,7 +9,10 @@ from functools import cache
 from pathlib import Path
 
 _PACKAGE = Path(__file__).parents[1]
-_COMPILERS = tuple(Path(__file__).parent / name for name in ("decorators.py", "libraries.py"))
+# What compiles, and what the files of code are like.
+_COMPILERS = tuple(
+    Path(__file__).parent / name for name in ("decorators.py", "libraries.py", "loading.py")
+)
 
 # Imports at the left margin: what stands further right is for type checking or imported when
 # called, and no kernel can use it. Parsing properly would take longer than reading the code.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.io.documents import in_file, read_json
-from cadalign.io.files import reading
+from cadalign.io.files import read_bytes, read_text
 
 _ARRAY = ".npy"
+_MOST_BYTES = 2**20  # of an array, which has nine numbers
 _MATRIX_NAMES = ("matrix", "K", "camera_matrix", "cam_K")
 _FIX = "give 3 x 3 numbers, or a JSON file with model, width, height and params as COLMAP does"
 
@@ -82,16 +84,15 @@ def _read_form(path: Path) -> dict[str, Any]:
 
 
 def _is_json(path: Path) -> bool:
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     return path.suffix.lower() == ".json" or text.lstrip()[:1] in ("{", "[")
 
 
 def _read_array(path: Path) -> Any:
     try:
-        with reading(path):
-            values = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        values = np.load(io.BytesIO(read_bytes(path, most=_MOST_BYTES)), allow_pickle=False)
+    # MemoryError: of a header that announces more numbers than there is room for.
+    except (ValueError, EOFError, MemoryError) as error:
         what = f"not a NumPy array that can be read ({brief(error)})"
         raise DataError(what, where=str(path)) from None
     return _square(values, path)
@@ -99,8 +100,7 @@ def _read_array(path: Path) -> Any:
 
 def _read_numbers(path: Path) -> Any:
     """Numbers of a text file, separated by blanks, commas or semicolons."""
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     return _square(text.replace(",", " ").replace(";", " ").split(), path)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from cadalign.errors import CadalignError, DataError, InputError, quote
-from cadalign.io.files import reading
+from cadalign.io.files import read_text
 
 _MAX = sys.float_info.max
 Finite = Annotated[float, Meta(ge=-_MAX, le=_MAX)]
@@ -68,16 +68,19 @@ def read_document(path: Path, kind: type[T]) -> T:
 
 def read_json(path: Path) -> Any:
     """Read a JSON file of any content; errors name the file and the line."""
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
-    where, reason = str(path), "nested too deeply"
+    return parse_json(read_text(path), str(path))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Parse JSON of any content; errors name its place and the line."""
+    reason = "nested too deeply"
     try:
         data = json.loads(text)
         if _HALF_CHARACTER.search(text):  # perhaps one half of two
             json.dumps(data, ensure_ascii=False).encode("utf-8")
         return data
     except json.JSONDecodeError as error:
-        where, reason = f"{path}, line {error.lineno}", error.msg
+        where, reason = f"{where}, line {error.lineno}", error.msg
     except UnicodeEncodeError:
         reason = _HALF_REASON
     except ValueError as error:  # a whole number of thousands of digits

@@ -1,18 +1,24 @@
-"""Atomic writes: a file is there whole or as it was, and errors name it."""
+"""Atomic writes, and reads of regular files of bounded size; errors name the file."""
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from cadalign.errors import DataError, quote
 
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
+MOST_BYTES = 2**32
+"""Size of the largest file that is read where its reader states no other."""
+# Opening a pipe would wait for its other end; the flags are not known everywhere.
+_OPENING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -75,6 +81,46 @@ def reading(path: Path) -> Iterator[None]:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise DataError(f"cannot be read ({reason})", where=str(path)) from None
+
+
+@contextmanager
+def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[tuple[BinaryIO, int]]:
+    """Open a regular file of at most ``most`` bytes; gives the open file and its size.
+
+    Every file that somebody names is opened here: a device has no end, and a pipe may have no other
+    end.
+
+    Raises
+    ------
+    DataError
+        If it is missing, no regular file, larger, or cannot be read.
+    """
+    with reading(path), open(os.open(path, _OPENING), "rb") as file:
+        status = os.fstat(file.fileno())
+        if stat.S_ISDIR(status.st_mode):
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(status.st_mode):
+            fix = "give a file, no pipe and no device"
+            raise DataError("not a regular file", where=printable(path), fix=fix)
+        if status.st_size > most:
+            what = f"{status.st_size} bytes, more than the {most} that are read of such a file"
+            raise DataError(what, where=printable(path))
+        yield file, status.st_size
+
+
+def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
+    """Read a regular file of at most ``most`` bytes; see `open_input`."""
+    with open_input(path, most=most) as (file, size):
+        # No more than it had when it was opened: some files of the system grow without end.
+        return file.read(size)
+
+
+def read_text(path: Path, *, most: int = MOST_BYTES, errors: str = "strict") -> str:
+    """Read a regular text file, UTF-8 with or without a mark; see `open_input`."""
+    data = read_bytes(path, most=most)
+    with reading(path):
+        text = data.decode("utf-8-sig", errors=errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 @contextmanager

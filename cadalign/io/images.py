@@ -7,19 +7,21 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import write_whole
+from cadalign.io.files import open_input, write_whole
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 ByteImage = npt.NDArray[np.uint8]
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF", "TGA", "PPM")
+"""Formats of pictures that are read, by Pillow's names; PPM stands for PGM and PBM as well."""
 JPEG_ENDING = ".jpg"
 _JPEG_QUALITY = 95
 
@@ -33,27 +35,41 @@ _FREE_BYTES = 2**26
 @contextmanager
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are read when they are asked for, errors then named as well."""
-    from PIL import Image
-
     path = Path(path)
-    if not path.exists():
-        raise DataError("no such file", where=str(path))
+    with open_input(path) as (file, size), open_picture(file, size, where=str(path)) as image:
+        yield image
+
+
+@contextmanager
+def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
+    """Open a picture of ``size`` bytes, of one of `FORMATS`: every picture is decoded here.
+
+    Left to itself, Pillow goes by the content and tries all the formats that it knows; of some,
+    such as EPS, it starts other programs.
+
+    Raises
+    ------
+    DataError
+        If it is of another format, damaged, or has far more pixels than its bytes can describe.
+    """
+    from PIL import Image, UnidentifiedImageError
+
     try:
-        # Waiting for the other end of a pipe could take for ever, and images need random access.
-        if not path.is_file():
-            raise OSError("not a regular file")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's about EXIF data of which it skips a part
-            with Image.open(path) as image:
-                check_pixels(image, path.stat().st_size)
+            with Image.open(file, formats=FORMATS) as image:
+                _check_pixels(image, size)
                 yield image
-    # ValueError: a NUL in the path; SyntaxError: Pillow's word for a broken PNG.
+    except UnidentifiedImageError:
+        reason = f"it begins like none of {', '.join(FORMATS)}"
+        raise DataError(f"not an image that can be read ({reason})", where=where) from None
+    # SyntaxError: Pillow's word for a broken PNG.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         what = f"not an image that can be read ({brief(error)})"
-        raise DataError(what, where=str(path)) from None
+        raise DataError(what, where=where) from None
 
 
-def check_pixels(image: Image, file_size: int) -> None:
+def _check_pixels(image: Image, file_size: int) -> None:
     """Refuse an image whose pixels take far more memory than its file can describe.
 
     Raises

@@ -16,7 +16,7 @@ import msgspec
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.runs.opened import Run
-from cadalign.io.files import dense_json, reading, write_text, write_whole, writing
+from cadalign.io.files import dense_json, read_bytes, reading, write_text, write_whole, writing
 from cadalign.report.instances import InstanceTable
 
 INLINE_LIMIT = 60_000_000
@@ -181,8 +181,7 @@ class _Files:
         if name not in self.names:
             return None
         path = self.folder / name
-        with reading(path):
-            return path.read_bytes()
+        return read_bytes(path)
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:

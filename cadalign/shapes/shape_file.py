@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Document, Finite, Index, NotNegative, PathText, Positive
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import read_bytes
 from cadalign.io.sealed import Seal
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
@@ -153,12 +153,7 @@ def write_shape(path: str | os.PathLike[str], model: ShapeFields) -> None:
 def read_shape(path: str | os.PathLike[str]) -> ShapeFields:
     """Read and check a shape model's file."""
     file = Path(path)
-    with reading(file):
-        size = file.stat().st_size
-        if size > _MAX_BYTES:
-            raise damaged(f"{size} bytes are too many for a shape file", file)
-        content = file.read_bytes()
-    payload = SEAL.unwrap(content, str(file))
+    payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:
         return _fields(msgspec.msgpack.decode(payload, type=_Shape))
     except (msgspec.DecodeError, InputError, ValueError, RecursionError) as error:

@@ -28,6 +28,7 @@ Only ``u`` and ``v`` must be there. Example::
 from __future__ import annotations
 
 import csv
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ from cadalign.datasets.detections.coco import read_coco_keypoints
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
-from cadalign.io.files import reading
+from cadalign.io.files import read_text
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _COLUMNS: dict[str, Any] = {
@@ -80,13 +81,12 @@ def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
     """Read a CSV file, one object for each image."""
     by_image: dict[str | None, list[dict[str, Any]]] = {}
     try:
-        with reading(path), path.open(newline="", encoding="utf-8-sig") as file:
-            lines = csv.reader(file, strict=True)
-            header = _header(next(lines, []), f"{path}, line 1")
-            for line in lines:
-                row = _row(header, line, f"{path}, line {lines.line_num}")
-                if row is not None:
-                    by_image.setdefault(row.get("image") or None, []).append(row)
+        lines = csv.reader(io.StringIO(read_text(path)), strict=True)
+        header = _header(next(lines, []), f"{path}, line 1")
+        for line in lines:
+            row = _row(header, line, f"{path}, line {lines.line_num}")
+            if row is not None:
+                by_image.setdefault(row.get("image") or None, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
     if not by_image:

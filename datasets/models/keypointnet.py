@@ -29,6 +29,7 @@ from cadalign.datasets.models.shapenet import MeshLocator
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.files import read_text
 from cadalign.io.meshes.load import load_mesh
 
 logger = logging.getLogger("cadalign")
@@ -381,7 +382,7 @@ class _Source:
 
 def _read_split(path: Path) -> frozenset[ModelKey]:
     members = set()
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = read_text(path, errors="replace").splitlines()
     for number, line in enumerate(lines, start=1):
         synset, dash, model_id = line.strip().partition("-")
         if not line.strip():

@@ -36,7 +36,7 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
-from cadalign.io.files import reading, write_json, write_text, writing
+from cadalign.io.files import read_text, write_json, write_text, writing
 from cadalign.io.meshes.write import write_ply_mesh
 
 TRUTH = "scene_gt.json"
@@ -128,8 +128,7 @@ def read_bop_results(path: Path) -> Estimates:
     DataError
         If the file cannot be read, or is not such a file.
     """
-    with reading(path):
-        text = path.read_text(encoding="utf-8-sig")
+    text = read_text(path)
     rows = list(csv.reader(io.StringIO(text)))
     if not rows or tuple(cell.strip() for cell in rows[0]) != RESULT_COLUMNS:
         what = f"the first line is not {','.join(RESULT_COLUMNS)}"

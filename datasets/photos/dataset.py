@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
@@ -18,7 +19,7 @@ from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.datasets.photos.poses import PoseFile
 from cadalign.errors import CadalignError, DataError, InputError, brief
 from cadalign.io.documents import convert, in_file
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_bytes
 
 logger = logging.getLogger("cadalign")
 
@@ -192,7 +193,8 @@ class PhotoDataset(ABC):
 
     def _read(self, index: int) -> Photo:
         try:
-            return self.read(index)
+            with np.errstate(all="ignore"):  # what is not finite in the end is refused by name
+                return self.read(index)
         except DataError:
             raise
         except CadalignError as error:  # a value that a camera or a pose refuses
@@ -320,8 +322,7 @@ def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
 
 
 def _read_raw(path: Path, kind: Any, name: str) -> Any:
-    with reading(path):
-        data = path.read_bytes()
+    data = read_bytes(path)
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError:

@@ -29,7 +29,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 
 SIZE = (1242, 375)
@@ -240,8 +240,7 @@ def read_labels(path: Path, *, tracking: bool) -> list[KittiLabel | DataError]:
     DataError
         If the file cannot be read.
     """
-    with reading(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path).splitlines()
     found: list[KittiLabel | DataError] = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
@@ -281,8 +280,7 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
     DataError
         If it cannot be read, or holds no valid P2.
     """
-    with reading(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_text(path).splitlines()
     for line in lines:
         name, _, rest = line.partition(" ")
         if name.rstrip(":") != "P2":

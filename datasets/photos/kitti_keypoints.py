@@ -62,7 +62,7 @@ from cadalign.io.documents import (
     in_file,
     within,
 )
-from cadalign.io.files import damaged, reading, write_json
+from cadalign.io.files import damaged, read_text, write_json
 from cadalign.io.images import photo_size
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.reflections import find_reflection
@@ -405,8 +405,7 @@ def _mean_car(path: Path, table: dict[str, Raw]) -> MeanCar:
 
 def _numbers(path: Path, multiple: int) -> FloatArray:
     """All numbers of a text file, a multiple of so many."""
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     try:
         values = np.array(text.split(), dtype=np.float64)
     except ValueError:

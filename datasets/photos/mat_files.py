@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError, InputError, brief, quote
-from cadalign.io.files import damaged, reading
+from cadalign.datasets.photos.mat_format import read_variables
+from cadalign.errors import DataError, InputError, quote
+from cadalign.io.files import damaged, read_bytes
 
 
 class MatStruct:
@@ -17,20 +19,20 @@ class MatStruct:
 
     Parameters
     ----------
-    value : scipy.io.matlab.mat_struct
-        What SciPy read.
+    value : mapping
+        Its fields, as `cadalign.datasets.photos.mat_format` reads them.
     where : str
         The file and the place in it, for messages.
     """
 
-    def __init__(self, value: Any, where: str) -> None:
+    def __init__(self, value: Mapping[str, Any], where: str) -> None:
         self._value = value
         self.where = where
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of its fields."""
-        return tuple(self._value._fieldnames)
+        return tuple(self._value)
 
     def struct(self, name: str) -> MatStruct | None:
         """A field that is one struct; None where it is missing or empty."""
@@ -39,12 +41,12 @@ class MatStruct:
 
     def structs(self, name: str) -> tuple[MatStruct, ...]:
         """A field that is an array of structs, or a single one."""
-        value = getattr(self._value, name, None)
+        value = self._value.get(name)
         values = np.atleast_1d(np.asarray(value, dtype=object)).ravel()
         return tuple(
             MatStruct(each, f"{self.where}: {name}[{number}]")
             for number, each in enumerate(values)
-            if hasattr(each, "_fieldnames")
+            if isinstance(each, dict)
         )
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -55,7 +57,7 @@ class MatStruct:
         InputError
             If it is not, or it is missing and there is no default.
         """
-        value = getattr(self._value, name, None)
+        value = self._value.get(name)
         array = np.asarray(value)
         if array.size == 0 or value is None:
             if default is None:
@@ -73,14 +75,14 @@ class MatStruct:
         InputError
             If it is not.
         """
-        value = getattr(self._value, name, None)
+        value = self._value.get(name)
         if not isinstance(value, str) or not value.strip() or "\0" in value:
             raise InputError(f"{quote(value)} is not a text", where=name)
         return value
 
     def texts(self, name: str) -> tuple[str, ...]:
         """A field that is a list of texts, or a single one."""
-        value = np.atleast_1d(np.asarray(getattr(self._value, name, ()), dtype=object)).ravel()
+        value = np.atleast_1d(np.asarray(self._value.get(name, ()), dtype=object)).ravel()
         return tuple(str(each) for each in value)
 
     def array(self, name: str, columns: int | None = None) -> FloatArray:
@@ -91,7 +93,7 @@ class MatStruct:
         InputError
             If it is missing, holds other things, or cannot have so many columns.
         """
-        value = np.asarray(getattr(self._value, name, None))
+        value = np.asarray(self._value.get(name))
         if value.dtype.kind not in "biuf":
             raise InputError("not an array of numbers", where=name)
         array = value.astype(np.float64)
@@ -118,23 +120,15 @@ def read_structs(path: Path, name: str | None = None) -> tuple[MatStruct, ...]:
     DataError
         If the file cannot be read, is none of MATLAB's up to version 7, or holds no such structs.
     """
-    from scipy.io import loadmat  # takes longer to import than all the rest
-
-    with reading(path):
-        if not path.is_file():
-            raise FileNotFoundError
-        try:
-            names = None if name is None else [name]
-            data = loadmat(path, squeeze_me=True, struct_as_record=False, variable_names=names)
-        except (OSError, NotImplementedError) as error:
-            raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
-        except Exception as error:  # SciPy's reader raises what its parts do on damaged files
-            raise damaged(f"not a .mat file that can be read ({brief(error)})", path) from None
-    variables = {key: value for key, value in data.items() if not key.startswith("__")}
+    data = read_bytes(path)
+    try:
+        variables = read_variables(data, None if name is None else (name,))
+    except InputError as error:
+        raise damaged(f"not a .mat file that can be read ({error.what})", path) from None
     if name is None and len(variables) == 1:
         name = next(iter(variables))
     value = np.asarray(variables.get(str(name)), dtype=object)
-    found = [each for each in np.atleast_1d(value).ravel() if hasattr(each, "_fieldnames")]
+    found = [each for each in np.atleast_1d(value).ravel() if isinstance(each, dict)]
     if not found:
         what = "no structs" if name is None else f"no structs named {name}"
         raise DataError(f"there are {what} in this file", where=str(path))

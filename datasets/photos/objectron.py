@@ -44,7 +44,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
-from cadalign.io.files import write_json
+from cadalign.io.files import open_input, write_json
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -65,6 +65,8 @@ _CV_FROM_SENSOR = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _VISIBLE = 0.1
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _NEAR, _FAR = 1e-3, 1e3  # of written projection matrices
+_CONTAINERS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+_MOST_BYTES = 2**36  # of a video
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,11 @@ class VideoFrame:
         """
         import cv2  # on first use: it takes longer to import than all the rest
 
-        video = cv2.VideoCapture(str(self.path))
+        # Going by the content, OpenCV would play lists of other files and addresses, too.
+        with open_input(self.path, most=_MOST_BYTES) as (file, _):
+            if file.read(8)[4:] not in _CONTAINERS:
+                raise DataError("not a video in QuickTime's or MP4's form", where=str(self.path))
+        video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         try:
             video.set(cv2.CAP_PROP_POS_FRAMES, self.number)
             is_read, pixels = video.read()
@@ -154,8 +160,10 @@ class Objectron(PhotoDataset):
             stem = path.relative_to(folder).with_suffix("").as_posix()
             self._frames += [(path, number) for number in range(count)]
             names += [f"{stem}/{number}" for number in range(count)]
-        if not names:
+        if bad and not names:
             raise next(iter(bad.values()))
+        if not names:
+            raise DataError("the annotation files have no frames", where=str(folder))
         super().__init__(folder, names)
         self.problems |= bad
         self._sequence: Sequence | None = None
@@ -193,7 +201,7 @@ def has_annotations(folder: Path) -> bool:
 
 
 def _is_sequence(path: Path) -> bool:
-    with suppress(OSError), path.open("rb") as file:
+    with suppress(DataError), open_input(path) as (file, _):
         begin = file.read(_BEGINNING)
         return b"frame_annotations" in begin or b"frameAnnotations" in begin
     return False

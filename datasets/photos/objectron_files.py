@@ -20,7 +20,7 @@ from msgspec import Meta
 
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json
-from cadalign.io.files import reading
+from cadalign.io.files import read_bytes
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT = 10
@@ -189,8 +189,7 @@ def read_sequence(path: Path) -> Sequence:
             tuple(objects if isinstance(objects, list) else ()),
             tuple(data["frame_annotations"]),
         )
-    with reading(path):
-        content = path.read_bytes()
+    content = read_bytes(path)
     messages: dict[int, list[bytes]] = {_OBJECTS: [], _FRAMES: []}
     try:
         for number, _, value in entries(content):

@@ -15,7 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, reading, write_text, writing
+from cadalign.io.files import damaged, read_text, write_text, writing
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -107,8 +107,7 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
     DataError
         If it cannot be read, or is not a matrix of finite numbers of this shape.
     """
-    with reading(path):
-        text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     rows = [line.split() for line in text.splitlines() if line.strip()]
     try:
         matrix = np.array(rows, dtype=np.float64)

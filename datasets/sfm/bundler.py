@@ -24,7 +24,7 @@ from cadalign.datasets.sfm.correspondences import (
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_text
 from cadalign.io.images import open_photo
 
 ImageSize = tuple[int, int]
@@ -153,7 +153,7 @@ def _find_photos(file: Path, count: int) -> tuple[list[str], list[Path | None]]:
 
 def _listed_photos(listing: Path, file: Path, count: int) -> tuple[list[str], list[Path | None]]:
     # A line is a path, optionally followed by 0 and the focal length that the EXIF data give.
-    lines = listing.read_text(encoding="utf-8", errors="replace").split("\n")
+    lines = read_text(listing, errors="replace").split("\n")
     names = [line.split()[0].removeprefix("./") for line in lines if line.strip()]
     if len(names) != count:
         raise DataError(
@@ -257,8 +257,7 @@ def _read_points(
 
 
 def _read_values(path: Path) -> FloatArray:
-    with reading(path):
-        text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path, errors="replace")
     header, _, body = text.partition("\n")
     if header.strip() != _HEADER:
         raise DataError(

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_bytes, read_text
 
 INVALID_POINT = -1
 """The point id of an observation that belongs to no point."""
@@ -137,13 +137,15 @@ def _binary_view(fields: tuple[Any, ...], observations: npt.NDArray[Any]) -> Col
     )
 
 
+_MOST_BYTES = 2**37  # of one file: models of cities have billions of observations
+
+
 class _Cursor:
     """Reads a file piece by piece and says where it ends too early."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with reading(path):
-            self._data = path.read_bytes()
+        self._data = read_bytes(path, most=_MOST_BYTES)
         self.offset = 0
 
     def count(self, what: str) -> int:
@@ -278,8 +280,7 @@ def _entries(path: Path) -> Iterator[tuple[int, str]]:
 
 def _lines(path: Path) -> list[str]:
     # Not splitlines, which would also split names at exotic separators.
-    with reading(path):
-        lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    lines = read_text(path, most=_MOST_BYTES, errors="replace").split("\n")
     return lines[:-1] if lines[-1] == "" else lines
 
 

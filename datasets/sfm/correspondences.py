@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import reading
+from cadalign.io.files import open_input
 
 logger = logging.getLogger("cadalign")
 
@@ -318,5 +319,5 @@ class CorrespondenceFormat:
 
 def begins_with(file: Path, header: bytes) -> bool:
     """True if a file begins with these bytes."""
-    with reading(file), file.open("rb") as stream:
+    with open_input(file, most=sys.maxsize) as (stream, _):
         return stream.read(len(header)) == header

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.errors import DataError, quote
-from cadalign.io.files import damaged, reading
+from cadalign.io.files import damaged, read_bytes
 
 # Numbers, text and objects; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
@@ -43,8 +43,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
     Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
     Latin-1, the encoding that keeps its bytes.
     """
-    with reading(Path(path)):
-        data = Path(path).read_bytes()
+    data = read_bytes(Path(path))
     try:
         _check_program(data)
         value = _PlainUnpickler(io.BytesIO(data), str(path)).load()

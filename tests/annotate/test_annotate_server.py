@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import socket
+import time
 from collections.abc import Iterator
 
 import pytest
 from support.annotating import Case, served
 
+from cadalign.annotate import connections, guard
 from cadalign.annotate.guard import MAX_BODY, Access
 from cadalign.annotate.server import listen
 from cadalign.errors import InputError
@@ -214,6 +217,80 @@ def test_an_endless_body_is_cut_off(access: Access) -> None:
 def test_a_wrong_length_is_refused(access: Access) -> None:
     head = post_head(access, "Content-Length: 1e3")
     assert answer_to(access, head, b"x", 1)[0].split()[1] in ("400", "413")
+
+
+# --- requests that do not end ----------------------------------------------------------------
+
+
+def answer_in_time(client: socket.socket) -> bytes:
+    """All that the server sends before it closes the connection."""
+    client.settimeout(20)
+    answer = b""
+    with contextlib.suppress(ConnectionError):
+        while part := client.recv(4096):
+            answer += part
+    return answer
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch, original: Case) -> Iterator[Access]:
+    """An annotator that waits for half a second."""
+    monkeypatch.setattr(connections, "PATIENCE", 0.5)
+    monkeypatch.setattr(guard, "PATIENCE", 0.5)
+    with served(original.open()) as opened:
+        yield opened
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        (b"", b""),
+        (b"GET / HT", b""),
+        (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ", b""),
+        (None, b"HTTP/1.1 408"),
+    ],
+)
+def test_half_requests_are_not_waited_for(
+    patient: Access, sent: bytes | None, status: bytes
+) -> None:
+    head = post_head(patient, "Content-Length: 100") + b"{" if sent is None else sent
+    with socket.create_connection(("127.0.0.1", patient.port)) as client:
+        client.sendall(head)
+        assert answer_in_time(client).startswith(status)
+
+
+@pytest.mark.slow
+def test_second_half_request_is_not_waited_for(patient: Access) -> None:
+    whole = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{patient.port}\r\n"
+    whole += f"X-Cadalign-Token: {patient.token}\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", patient.port)) as client:
+        client.sendall(whole.encode() + b"GET / HTTP/1.1\r\n")
+        client.settimeout(20)
+        client.recv(4096)
+        client.sendall(b"Host: ")
+        answer_in_time(client)  # returns, since the connection is closed
+
+
+@pytest.mark.slow
+def test_connections_are_few_and_others_still_served(access: Access) -> None:
+    with contextlib.ExitStack() as opened:
+        clients = [
+            opened.enter_context(socket.create_connection(("127.0.0.1", access.port)))
+            for _ in range(600)
+        ]
+        assert ask(access, "/")[0] == 200
+        time.sleep(0.5)
+        still_open = 0
+        for client in clients:
+            client.setblocking(False)
+            try:
+                still_open += client.recv(1) != b""
+            except BlockingIOError:
+                still_open += 1
+            except ConnectionError:
+                pass
+        assert still_open <= connections.MOST_CONNECTIONS
 
 
 # --- the socket ------------------------------------------------------------------------------

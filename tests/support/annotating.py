@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
 from playwright.sync_api import Browser, Page
 
 from cadalign.annotate.actions import perform
@@ -21,7 +20,7 @@ from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.server import listen, make_app
+from cadalign.annotate.server import listen, make_app, make_server
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
@@ -147,8 +146,7 @@ def served(session: Session) -> Iterator[Access]:
     """Serve a session on a free port as `cadalign annotate` does."""
     listener = listen(0)
     access = Access(listener.getsockname()[1])
-    config = uvicorn.Config(make_app(session, access), log_level="warning", lifespan="off")
-    server = uvicorn.Server(config)
+    server = make_server(make_app(session, access))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     try:

@@ -23,7 +23,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec, on_datasets
 from cadalign.evaluation.summary import Conclusion, Summary
-from cadalign.io.files import reading
+from cadalign.io.files import read_bytes
 
 logger = logging.getLogger("cadalign")
 
@@ -59,8 +59,7 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
 
 
 def _fingerprint(path: Path) -> str:
-    with reading(path):
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    return hashlib.sha256(read_bytes(path)).hexdigest()[:16]
 
 
 def _describe(run: Run) -> str:

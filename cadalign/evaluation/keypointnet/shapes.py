@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from cadalign.errors import DataError, InputError
+from cadalign.io.files import read_bytes
 from cadalign.shapes.model import ShapeModel
 
 _SUFFIX = ".shape"
@@ -64,7 +65,7 @@ class ShapeFiles:
         """Hash of the files: a run must not go on with others."""
         digest = hashlib.sha256()
         for name, path in self.paths:
-            digest.update(name.encode() + b"\0" + path.read_bytes())
+            digest.update(name.encode() + b"\0" + read_bytes(path))
         return digest.hexdigest()[:16]
 
 

@@ -30,7 +30,7 @@ from msgspec import Meta, field
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
-from cadalign.io.files import refuse_nul, write_json, writing
+from cadalign.io.files import read_text, refuse_nul, write_json, writing
 
 _FORMAT = 2
 _LONGEST_VALUE = 80
@@ -117,11 +117,13 @@ class RunFolder:
         """Read ``run.json``; None where there is none."""
         path = self.config_file
         refuse_nul(path)
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        if not path.exists():
             return None
-        except (OSError, ValueError, RecursionError) as error:
+        try:
+            found = json.loads(read_text(path))
+        except DataError as error:
+            raise DataError(error.what, where=str(path), fix=_FIX) from None
+        except (ValueError, RecursionError) as error:
             what = f"cannot be read ({str(error)[:200]})"
             raise DataError(what, where=str(path), fix=_FIX) from None
         if not isinstance(found, dict):

@@ -9,29 +9,30 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.gltf_scene import read_gltf
 from cadalign.io.meshes.obj import read_obj
 
 
 def _read_ply(path: Path) -> Mesh:
     # Only here: trimesh takes longer to import than an OBJ file to be read.
-    from cadalign.io.meshes.scenes import read_ply
+    from cadalign.io.meshes.trimesh_files import read_ply
 
     return read_ply(path)
 
 
-def _read_scene(path: Path) -> Mesh:
-    from cadalign.io.meshes.scenes import read_scene  # trimesh, as above
+def _read_solids(path: Path) -> Mesh:
+    from cadalign.io.meshes.trimesh_files import read_solids  # trimesh, as above
 
-    return read_scene(path)
+    return read_solids(path)
 
 
 _READERS = {
     ".obj": read_obj,
     ".ply": _read_ply,
-    ".glb": _read_scene,
-    ".gltf": _read_scene,
-    ".stl": _read_scene,
-    ".off": _read_scene,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".stl": _read_solids,
+    ".off": _read_solids,
 }
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5
@@ -81,7 +82,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
             fix=f"known are {', '.join(_READERS)}",
         )
     try:
-        if path.stat().st_size == 0:
+        if not path.stat().st_size and path.is_file():
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
         return reader(path)
     except InputError as error:  # what Mesh refuses

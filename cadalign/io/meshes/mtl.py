@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 import logging
-import warnings
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path, PurePosixPath
-from typing import Any
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.errors import brief, quote
+from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material
-from cadalign.io.images import check_pixels
+from cadalign.io.files import read_text
+from cadalign.io.meshes.textures import Textures, find_file
 
 logger = logging.getLogger("cadalign")
 
-Texture = npt.NDArray[np.uint8]
 _Entry = dict[str, list[str]]
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
@@ -37,39 +33,31 @@ def load_materials(
     ``libraries`` is what the OBJ file's ``mtllib`` lines name; only the textures of ``names`` are
     read.
     """
+    paths = (path for library in dict.fromkeys(libraries) for path in _paths(obj_path, library))
     entries: dict[str, tuple[Path, _Entry]] = {}
-    for library in libraries:
-        for path in _library_paths(obj_path, library):
-            entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
+    for path in {path.resolve(): path for path in paths}.values():
+        entries |= {name: (path, entry) for name, entry in _parse_library(path).items()}
     found: dict[str, Material] = {}
-    # Of each file once, however many materials name it.
-    load_texture = functools.cache(_load_texture)
+    textures = Textures()
     for name in names:
         # The parser joins the words of a name with single blanks.
         key = " ".join(name.split())
         if key in entries:
-            found[name] = _material(name, *entries[key], load_texture)
+            found[name] = _material(name, *entries[key], textures)
         else:
             logger.warning("%s: material %s is not defined; it becomes grey", obj_path, quote(name))
             found[name] = Material(name=name)
     return found
 
 
-def texture_array(image: Any, file_size: int) -> Texture:
-    """Convert a PIL image to (h, w, 3) uint8, or (h, w, 4) where it has transparency."""
-    check_pixels(image, file_size)
-    transparent = "A" in image.getbands() or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if transparent else "RGB"))
-
-
-def _library_paths(obj_path: Path, library: str) -> list[Path]:
+def _paths(obj_path: Path, library: str) -> list[Path]:
     """The files that an ``mtllib`` line names: one with blanks in its name, or several."""
-    whole = _find(obj_path.parent, library)
+    whole = find_file(obj_path.parent, library)
     if whole is not None:
         return [whole]
     paths = []
     for word in library.split():
-        path = _find(obj_path.parent, word)
+        path = find_file(obj_path.parent, word)
         if path is None:
             logger.warning("%s: no material library %s beside it", obj_path, brief(word))
         else:
@@ -77,23 +65,12 @@ def _library_paths(obj_path: Path, library: str) -> list[Path]:
     return paths
 
 
-def _find(folder: Path, name: str) -> Path | None:
-    """The file of this name relative to the folder, also if it is written with backslashes."""
-    for spelling in (name, name.replace("\\", "/")):
-        try:
-            if spelling and (folder / spelling).is_file():
-                return folder / spelling
-        except (OSError, ValueError):
-            continue
-    return None
-
-
 def _parse_library(path: Path) -> dict[str, _Entry]:
     """The materials of a library by name: of each, the words that follow its keywords."""
     try:
-        text = path.read_bytes().decode("utf-8", errors="replace")
-    except OSError as error:
-        logger.warning("%s: the material library cannot be read (%s)", path, brief(error))
+        text = read_text(path, errors="replace")
+    except DataError as error:
+        logger.warning("%s: the material library cannot be read (%s)", path, error.what)
         return {}
     entries: dict[str, _Entry] = {}
     current: _Entry = {}  # of what stands before the first name
@@ -108,13 +85,9 @@ def _parse_library(path: Path) -> dict[str, _Entry]:
     return entries
 
 
-def _material(
-    name: str,
-    path: Path,
-    entry: _Entry,
-    load_texture: Callable[[Path, tuple[str, ...]], Texture | None],
-) -> Material:
-    texture = load_texture(path, tuple(entry.get("map_kd", [])))
+def _material(name: str, path: Path, entry: _Entry, textures: Textures) -> Material:
+    words = _without_options(entry.get("map_kd", []))
+    texture = textures.read(path, " ".join(words)) if words else None
     color = _color(entry)
     if texture is None and "map_kd" in entry:
         color = (*GREY[:3], color[3])
@@ -143,25 +116,6 @@ def _number(words: list[str] | None) -> float | None:
     except ValueError:
         return None
     return value if np.isfinite(value) else None
-
-
-def _load_texture(path: Path, words: tuple[str, ...]) -> Texture | None:
-    import PIL.Image
-
-    if not words:
-        return None
-    name = " ".join(_without_options(words))
-    found = _find(path.parent, name) or _find(path.parent, PurePosixPath(name).name)
-    if found is None:
-        logger.warning("%s: the texture %s is missing; drawn grey", path, brief(name))
-        return None
-    try:
-        with warnings.catch_warnings(action="ignore"), PIL.Image.open(found) as image:
-            return texture_array(image, found.stat().st_size)
-    except Exception as error:  # PIL's plugins raise what they like on damaged files
-        given = path, brief(name), brief(error)
-        logger.warning("%s: the texture %s cannot be read (%s); drawn grey", *given)
-        return None
 
 
 def _without_options(words: Sequence[str]) -> Sequence[str]:

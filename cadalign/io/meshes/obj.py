@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
-from cadalign.io.files import damaged
+from cadalign.io.files import damaged, read_bytes
 from cadalign.io.meshes.mtl import WHITE, load_materials
 
 _DIGITS = b"0123456789+-"
@@ -52,8 +51,7 @@ def read_obj(path: Path) -> Mesh:
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,
     curves and surfaces are not read.
     """
-    with path.open("rb") as file:
-        statements = _sort_statements(file, path)
+    statements = _sort_statements(read_bytes(path), path)
     _require_complete(statements, path)
     try:
         vertices, colors = _parse_vertices(statements.vertices)
@@ -111,13 +109,13 @@ def fan_triangles(sizes: IntArray) -> tuple[IntArray, IntArray]:
     return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
-def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
+def _sort_statements(data: bytes, path: Path) -> _Statements:
     found = _Statements()
     # Nearly all lines are these three.
     vertices, texture_coordinates, faces = found.vertices, found.texture_coordinates, found.faces
     by_assimp = False
     counted = (-1, -1)
-    for number, line in _logical_lines(file):
+    for number, line in _logical_lines(data):
         key, _, body = line.partition(b" ")
         if key == b"f":
             counts = (len(vertices), len(texture_coordinates))
@@ -147,10 +145,10 @@ def _sort_statements(file: BinaryIO, path: Path) -> _Statements:
     return found
 
 
-def _logical_lines(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
     # A tab may separate the keyword too.
-    lines = file.read().replace(b"\t", b" ").split(b"\n")
+    lines = data.replace(b"\t", b" ").split(b"\n")
     return _joined(enumerate(map(bytes.strip, lines), start=1))
 
 
@@ -274,7 +272,8 @@ def _assign_materials(
     block_of_triangle = np.searchsorted(starts, polygon, side="right") - 1
     used, index = np.unique(block_of_triangle, return_inverse=True)
     names = list(dict.fromkeys(blocks[block][1] for block in used))
-    number = np.array([names.index(blocks[block][1]) for block in used])
+    number_of = {name: number for number, name in enumerate(names)}
+    number = np.array([number_of[blocks[block][1]] for block in used])
     known = load_materials(path, statements.libraries, [name for name in names if name])
     plain = Material(color=WHITE) if colored else Material()
     return tuple(known.get(name, plain) for name in names), number[index]
@@ -282,19 +281,18 @@ def _assign_materials(
 
 def _first_malformed(path: Path) -> DataError:
     """Read the file again, slowly, to say which line of it is wrong."""
-    with path.open("rb") as file:
-        for number, line in _logical_lines(file):
-            key, _, body = line.partition(b" ")
-            try:
-                if key == b"v":
-                    _parse_vertices([body])
-                elif key == b"vt":
-                    _parse_rows([body])
-                elif key == b"f":
-                    _parse_faces([body])
-            except (ValueError, OverflowError):
-                shown = line[:60].decode("ascii", errors="replace")
-                return damaged(f"cannot read {shown!r}", f"{path}, line {number}")
+    for number, line in _logical_lines(read_bytes(path)):
+        key, _, body = line.partition(b" ")
+        try:
+            if key == b"v":
+                _parse_vertices([body])
+            elif key == b"vt":
+                _parse_rows([body])
+            elif key == b"f":
+                _parse_faces([body])
+        except (ValueError, OverflowError):
+            shown = line[:60].decode("ascii", errors="replace")
+            return damaged(f"cannot read {shown!r}", f"{path}, line {number}")
     return damaged("cannot be read as an OBJ file", path)
 
 

@@ -1,0 +1,240 @@
+"""glTF files: what is read, and what is refused before it takes memory or time."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.gltf_files import FACES, SQUARE, data_uri, write_gltf
+from support.timing import reference_seconds, timed
+
+from cadalign.datasets import load_mesh
+from cadalign.errors import DataError
+from cadalign.geometry.mesh import Mesh
+
+VIEWS = [
+    {"buffer": 0, "byteLength": 48},
+    {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+]
+POSITIONS = {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"}
+CORNERS = {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"}
+
+
+def read(tmp_path: Path, **changes: Any) -> Mesh:
+    return load_mesh(write_gltf(tmp_path / "a.gltf", **changes))
+
+
+def refusal(tmp_path: Path, **changes: Any) -> str:
+    with pytest.raises(DataError) as caught:
+        read(tmp_path, **changes)
+    return str(caught.value).replace(str(tmp_path / "a.gltf"), "FILE")
+
+
+def primitive(**changes: Any) -> list[dict[str, Any]]:
+    return [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1} | changes]}]
+
+
+# --- what is read ------------------------------------------------------------------------------
+
+
+def test_nodes_are_placed_from_the_root_down(tmp_path: Path) -> None:
+    half = np.sqrt(0.5)
+    nodes = [
+        {"translation": [10, 0, 0], "children": [1]},
+        {"rotation": [0, 0, half, half], "scale": [2, 3, 1], "mesh": 0, "children": [2]},
+        {"matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 5, 1], "mesh": 0},
+    ]
+    mesh = read(tmp_path, nodes=nodes)
+    first = np.column_stack([10 - 3 * SQUARE[:, 1], 2 * SQUARE[:, 0], 0 * SQUARE[:, 0]])
+    second = first * [1, -1, 1] + [0, 0, 5]
+    np.testing.assert_allclose(mesh.vertices, np.concatenate([first, second]), atol=1e-6)
+    # The copy is mirrored twice over, by its node: its normals still point along z.
+    corners = mesh.triangles
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"),
+    [
+        (4, [[0, 1, 2], [0, 2, 3]]),
+        (5, [[0, 1, 2], [1, 0, 2], [2, 0, 2], [0, 3, 2]]),
+        (6, [[1, 2, 0], [2, 0, 0], [0, 2, 0], [2, 3, 0]]),
+    ],
+)
+def test_lists_strips_and_fans(tmp_path: Path, mode: int, expected: list[list[int]]) -> None:
+    assert read(tmp_path, meshes=primitive(mode=mode)).faces.tolist() == expected
+
+
+@pytest.mark.parametrize("mode", [0, 1, 3])
+def test_points_and_lines_are_no_faces(tmp_path: Path, mode: int) -> None:
+    assert refusal(tmp_path, meshes=primitive(mode=mode)) == (
+        "FILE: the file has no faces; is it whole?"
+    )
+
+
+def test_sparse_accessors_change_values(tmp_path: Path) -> None:
+    more = np.array([2], "<u2").tobytes() + b"\0\0" + np.array([[5, 6, 7]], "<f4").tobytes()
+    views = [
+        *VIEWS,
+        {"buffer": 0, "byteOffset": 60, "byteLength": 2},
+        {"buffer": 0, "byteOffset": 64, "byteLength": 12},
+    ]
+    sparse = {
+        "count": 1,
+        "indices": {"bufferView": 2, "componentType": 5123},
+        "values": {"bufferView": 3},
+    }
+    accessors = [POSITIONS | {"sparse": sparse}, CORNERS]
+    mesh = read(tmp_path, more=more, bufferViews=views, accessors=accessors)
+    np.testing.assert_array_equal(mesh.vertices[2], [5, 6, 7])
+    np.testing.assert_array_equal(mesh.vertices[[0, 1, 3]], SQUARE[[0, 1, 3]])
+
+
+def test_interleaved_and_quantized_values(tmp_path: Path) -> None:
+    points = np.array([[0, 0, 0], [127, 0, 0], [127, 127, 0], [-128, 127, 0]], "<i1")
+    more = b"".join(row.tobytes() + b"\0" for row in points)
+    views = [*VIEWS, {"buffer": 0, "byteOffset": 60, "byteLength": 16, "byteStride": 4}]
+    quantized = {
+        "bufferView": 2, "componentType": 5120, "count": 4, "type": "VEC3", "normalized": True,
+    }  # fmt: skip
+    mesh = read(
+        tmp_path,
+        more=more,
+        bufferViews=views,
+        accessors=[quantized, CORNERS],
+        extensionsRequired=["KHR_mesh_quantization"],
+    )
+    np.testing.assert_allclose(mesh.vertices, np.maximum(points / 127, -1))
+
+
+def test_vertices_that_primitives_share_are_not_repeated(tmp_path: Path) -> None:
+    one = {"attributes": {"POSITION": 0}, "indices": 2}
+    accessors = [POSITIONS, CORNERS, CORNERS | {"count": 3}]
+    mesh = read(tmp_path, accessors=accessors, meshes=[{"primitives": [one, one]}])
+    assert len(mesh.vertices) == 6
+    np.testing.assert_array_equal(mesh.triangles[1], SQUARE[:3])
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"nodes": [{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]},
+            "nodes[2]: the node has two parents, or is its own ancestor; the nodes of a scene are "
+            "a tree",
+        ),
+        (
+            {"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]},
+            "nodes[0]: the node has two parents, or is its own ancestor; the nodes of a scene are "
+            "a tree",
+        ),
+        (
+            {"extensionsRequired": ["KHR_materials_unlit", "KHR_draco_mesh_compression"]},
+            "extensionsRequired: KHR_draco_mesh_compression is needed to read this file, and not "
+            "known; export it without this extension; of compressed geometry, uncompressed",
+        ),
+        ({"asset": {"version": "1.0"}}, "asset: version '1.0' of glTF; only version 2 is read"),
+        (
+            {"nodes": [{"mesh": 7}]},
+            "meshes[7]: named, but there are 1 meshes; the file is cut short or damaged; get it "
+            "again",
+        ),
+        (
+            {"accessors": [POSITIONS | {"count": 5}, CORNERS]},
+            "bufferViews[0]: 5 values of 12 bytes do not fit into 48 bytes; the file is cut short "
+            "or damaged; get it again",
+        ),
+        ({"accessors": [{"count": "many"}]}, "accessors[0].count: 'many' is not a whole number"),
+    ],
+)  # fmt: skip
+def test_files_that_are_wrong_are_refused_by_the_place(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    assert refusal(tmp_path, **changes) == f"FILE: {message}"
+
+
+def test_extension_that_is_used_but_not_required_is_passed_over(tmp_path: Path) -> None:
+    assert len(read(tmp_path, extensionsUsed=["KHR_draco_mesh_compression"]).faces) == 2
+
+
+def test_buffers_that_are_no_files_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for uri, reason in (
+        ("pipe", "not a regular file; give a file, no pipe and no device"),
+        ("/dev/zero", "not a regular file; give a file, no pipe and no device"),
+        ("nothing.bin", "no such file"),
+    ):
+        message = refusal(tmp_path, buffers=[{"byteLength": 60, "uri": uri}])
+        assert message == f"FILE: {tmp_path / uri}: {reason}"
+    short = data_uri(b"short")
+    assert "5 bytes, 60 announced" in refusal(tmp_path, buffers=[{"byteLength": 60, "uri": short}])
+
+
+READ = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+from cadalign.datasets import load_mesh
+from cadalign.errors import DataError
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    load_mesh(sys.argv[1])
+except DataError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+
+
+def test_meshes_that_nodes_repeat_are_bounded_by_the_file(tmp_path: Path) -> None:
+    more = np.resize(FACES, 30_000).tobytes()
+    views = [*VIEWS, {"buffer": 0, "byteOffset": 60, "byteLength": len(more)}]
+    many = {"bufferView": 2, "componentType": 5123, "count": 30_000, "type": "SCALAR"}
+    path = write_gltf(
+        tmp_path / "a.gltf",
+        more=more,
+        bufferViews=views,
+        accessors=[POSITIONS, many],
+        nodes=[{"mesh": 0}] * 60_000,
+        scenes=[{"nodes": list(range(60_000))}],
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True
+    )
+    message, megabytes = done.stdout.splitlines()
+    assert message == (
+        f"{path}: its nodes repeat meshes to 600000000 faces, from {path.stat().st_size} bytes; "
+        "simplify it, or leave copies out"
+    )
+    assert int(megabytes) < 300
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB, here as there
+
+
+@pytest.mark.timing
+def test_deep_scenes_take_linear_time(tmp_path: Path) -> None:
+    count = 100_000
+    chain: list[dict[str, Any]] = [
+        {"children": [k + 1], "translation": [0, 0, 1e-3]} for k in range(count - 1)
+    ]
+    path = write_gltf(tmp_path / "a.gltf", nodes=[*chain, {"mesh": 0}])
+    assert load_mesh(path).bounds[0, 2] == pytest.approx((count - 1) * 1e-3)
+    assert reference_seconds(timed(lambda: load_mesh(path)), below=5, rounds=1) < 5
+
+
+@pytest.mark.timing
+def test_many_materials_take_linear_time(tmp_path: Path) -> None:
+    count = 50_000
+    (tmp_path / "a.mtl").write_text("".join(f"newmtl m{k}\nKd 1 0 0\n" for k in range(count)))
+    faces = "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(count))
+    path = tmp_path / "a.obj"
+    path.write_text(f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n{faces}")
+    assert len(load_mesh(path).materials) == count
+    assert reference_seconds(timed(lambda: load_mesh(path)), below=4, rounds=1) < 4

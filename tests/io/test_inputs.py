@@ -1,0 +1,126 @@
+"""Whatever is named as an input: only regular files of bounded size are read."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from support.refusals import refusal_line
+
+from cadalign import Library, ShapeModel
+from cadalign.datasets import load_mesh, read_image_keypoints
+from cadalign.datasets.photos.bop_files import read_bop_results
+from cadalign.datasets.photos.dataset import read_list, read_table
+from cadalign.datasets.photos.kitti import read_labels
+from cadalign.datasets.photos.mat_files import read_structs
+from cadalign.datasets.photos.objectron_files import read_sequence
+from cadalign.datasets.photos.scannet import read_matrix
+from cadalign.datasets.sfm.unpickling import load_pickle
+from cadalign.errors import CadalignError, DataError
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.export.camera_files import read_camera_views
+from cadalign.io.camera_file import read_camera
+from cadalign.io.files import open_input, read_bytes, read_text
+from cadalign.io.images import read_grey, read_photo
+from cadalign.io.observation import Observation
+
+BYTES = 2**33
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of input: the ending of its files, and what reads them."""
+
+    ending: str
+    read: Callable[[Path], object]
+
+
+def same(*endings: str, read: Callable[[Path], object]) -> list[Reader]:
+    return [Reader(ending, read) for ending in endings]
+
+
+READERS = [
+    *same(".obj", ".ply", ".stl", ".off", ".glb", ".gltf", read=load_mesh),
+    *same(".png", read=read_photo),
+    *same(".png", read=read_grey),
+    *same(".json", read=Observation.load),
+    *same(".json", ".csv", read=read_image_keypoints),
+    *same(".json", ".txt", ".npy", read=lambda path: read_camera(path, size=(4, 4))),
+    *same(".json", read=read_camera_views),
+    *same(".shape", read=ShapeModel.open),
+    *same(".cadalign", read=Library.open),
+    *same(".pkl", read=load_pickle),
+    *same(".mat", read=read_structs),
+    *same(".json", read=read_list),
+    *same(".json", read=read_table),
+    *same(".txt", read=lambda path: read_matrix(path, (3, 3))),
+    *same(".txt", read=lambda path: read_labels(path, tracking=False)),
+    *same(".pbdata", ".json", read=read_sequence),
+    *same(".csv", read=read_bop_results),
+]
+
+
+@pytest.fixture(autouse=True)
+def _not_for_ever() -> Iterator[None]:
+    """Fail where a reader waits for a pipe."""
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.ending)
+def test_pipes_and_devices_are_no_inputs(tmp_path: Path, reader: Reader) -> None:
+    pipe, device = tmp_path / f"pipe{reader.ending}", tmp_path / f"zero{reader.ending}"
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    for path in (pipe, device):
+        with pytest.raises(CadalignError, match="not a regular file") as caught:
+            reader.read(path)
+        assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.ending)
+def test_files_without_end_are_no_inputs(tmp_path: Path, reader: Reader) -> None:
+    if reader.ending in (".cadalign", ".png"):  # mapped into memory, and read as far as needed
+        pytest.skip("not read whole")
+    path = tmp_path / f"huge{reader.ending}"
+    path.touch()
+    os.truncate(path, BYTES)
+    with pytest.raises(DataError, match=f"{BYTES} bytes, more than the \\d+ that are read"):
+        reader.read(path)
+
+
+def test_shape_that_an_observation_names_is_no_device(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    observation = {
+        "camera": {"width": 64, "height": 48},
+        "keypoints": [{"xyz": [0, 0, 0], "uv": [1, 1], "name": "a"}] * 8,
+        "shape": "/dev/zero",
+    }
+    path = tmp_path / "o.json"
+    path.write_text(json.dumps(observation))
+    message = refusal_line(capsys, "fit", path, "--no-picture")
+    assert "/dev/zero: not a regular file; give a file, no pipe and no device" in message
+
+
+def test_runs_are_no_pipes(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "run.json")
+    with pytest.raises(DataError, match=r"run\.json: not a regular file"):
+        RunFolder(tmp_path).read_config()
+
+
+def test_no_more_is_read_than_a_file_had(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
+    assert read_text(path) == "one\ntwo\nthree\n"
+    with open_input(path) as (file, size):
+        assert size == len(file.read()) == len(read_bytes(path))
+    with pytest.raises(DataError) as caught:
+        read_bytes(path, most=5)
+    assert str(caught.value) == f"{path}: 18 bytes, more than the 5 that are read of such a file"

@@ -1,0 +1,178 @@
+"""Pictures are decoded by one reader, of plain raster formats: none starts a program."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import PIL.EpsImagePlugin
+import pytest
+from PIL import Image
+
+from cadalign import FocalPrior
+from cadalign.annotate.photos import PhotoFile
+from cadalign.datasets import load_mesh
+from cadalign.datasets.photos.photo import DepthImage, PhotoObject
+from cadalign.errors import DataError
+from cadalign.io.images import photo_size, read_grey, read_photo
+
+ROOT = Path(__file__).resolve().parents[2]
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\nshowpage\n%%EOF\n"
+FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
+PLY = """ply
+format ascii 1.0
+comment TextureFile x.png
+element vertex 3
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 0 0
+1 0 0 1 0
+0 1 0 0 1
+3 0 1 2
+"""
+
+
+def write_obj(folder: Path, picture: bytes) -> Path:
+    (folder / "a.obj").write_text("mtllib a.mtl\n" + FACE)
+    (folder / "a.mtl").write_text("newmtl a\nmap_Kd x.png\n")
+    (folder / "x.png").write_bytes(picture)
+    return folder / "a.obj"
+
+
+def write_ply(folder: Path, picture: bytes) -> Path:
+    (folder / "a.ply").write_text(PLY)
+    (folder / "x.png").write_bytes(picture)
+    return folder / "a.ply"
+
+
+def gltf(picture: dict[str, object], points: bytes) -> dict[str, object]:
+    uv = np.array([[0, 0], [1, 0], [0, 1]], "<f4").tobytes()
+    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + uv + points
+    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
+    return {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [picture],
+        "buffers": [{"byteLength": len(data), "uri": data_uri(data)}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 36},
+            {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+            {"buffer": 0, "byteOffset": 60, "byteLength": len(points)},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5126, "count": 3, "type": "VEC2"},
+        ],
+    }
+
+
+def data_uri(data: bytes) -> str:
+    return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+
+
+def write_gltf_beside(folder: Path, picture: bytes) -> Path:
+    (folder / "x y.png").write_bytes(picture)
+    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": "x%20y.png"}, b"")))
+    return folder / "a.gltf"
+
+
+def write_gltf_embedded(folder: Path, picture: bytes) -> Path:
+    (folder / "a.gltf").write_text(json.dumps(gltf({"uri": data_uri(picture)}, b"")))
+    return folder / "a.gltf"
+
+
+def write_gltf_in_buffer(folder: Path, picture: bytes) -> Path:
+    image: dict[str, object] = {"bufferView": 2, "mimeType": "image/png"}
+    (folder / "a.gltf").write_text(json.dumps(gltf(image, picture)))
+    return folder / "a.gltf"
+
+
+MODELS = [write_obj, write_ply, write_gltf_beside, write_gltf_embedded, write_gltf_in_buffer]
+READERS = [
+    read_photo,
+    photo_size,
+    read_grey,
+    FocalPrior.from_exif,
+    lambda path: PhotoObject(object_id="a", category="a", mask_path=path).read_mask(),
+    lambda path: DepthImage(path, 1.0).read(),
+    lambda path: PhotoFile(path, 4, 4).thumbnail(),
+    lambda path: PhotoFile(path, 4, 4).encoded(),
+]
+
+
+@pytest.fixture
+def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that the program ``gs``, first in PATH, writes whenever it is started."""
+    log, programs = tmp_path / "started", tmp_path / "bin"
+    programs.mkdir()
+    (programs / "gs").write_text(f"#!/bin/sh\necho gs >> {log}\n")
+    (programs / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
+    monkeypatch.setattr(PIL.EpsImagePlugin, "gs_binary", None)
+    return log
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.eps"])
+@pytest.mark.parametrize("read", READERS)
+def test_no_picture_starts_a_program(
+    tmp_path: Path, started: Path, read: Callable[[Path], object], name: str
+) -> None:
+    (tmp_path / name).write_bytes(EPS)
+    with pytest.raises(DataError, match=r"not an image that can be read \(it begins like none of"):
+        read(tmp_path / name)
+    assert not started.exists()
+
+
+@pytest.mark.parametrize("write", MODELS)
+def test_no_texture_starts_a_program(
+    tmp_path: Path,
+    started: Path,
+    write: Callable[[Path, bytes], Path],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    mesh = load_mesh(write(tmp_path, EPS))
+    assert mesh.materials[0].texture is None
+    assert "cannot be read (not an image" in caplog.text
+    assert not started.exists()
+
+
+@pytest.mark.parametrize("write", MODELS)
+def test_textures_are_read(
+    tmp_path: Path, write: Callable[[Path, bytes], Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    Image.fromarray(pixels).save(tmp_path / "picture.png")
+    mesh = load_mesh(write(tmp_path, (tmp_path / "picture.png").read_bytes()))
+    np.testing.assert_array_equal(mesh.materials[0].texture, pixels)
+    assert mesh.materials[0].color[:3] == ((0.7,) * 3 if write is write_obj else (1.0,) * 3)
+    assert mesh.corner_uv is not None
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "webp", "bmp", "tiff", "gif", "tga", "ppm"])
+def test_formats_that_are_promised_are_read(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"a.{ending}"
+    Image.new("RGB", (8, 8), (250, 20, 20)).save(path)
+    assert read_photo(path)[3, 3, 0] > 200
+
+
+def test_one_module_decodes_pictures() -> None:
+    others = re.compile(r"\bImage\.open\(|\bimread\(|\bimdecode\(|trimesh\.load\((?!io\.BytesIO)")
+    files = [p for folder in ("cadalign", "datasets", "render", "scripts")
+             for p in (ROOT / folder).rglob("*.py")]  # fmt: skip
+    found = {p.relative_to(ROOT).as_posix() for p in files if others.search(p.read_text())}
+    assert found == {"cadalign/io/images.py"}

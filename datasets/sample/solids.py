@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from scipy.interpolate import PchipInterpolator
 
 from cadalign.arrays import FloatArray, IntArray
 
@@ -61,7 +60,7 @@ def both_sides(*solids: Solid) -> list[Solid]:
     return [*solids, *(solid.mirrored() for solid in solids)]
 
 
-# Outlines and curves ------------------------------------------------------------------------------
+# Outlines -----------------------------------------------------------------------------------------
 
 
 def ellipse(width: float, height: float, *, count: int, exponent: float = 2.0) -> FloatArray:
@@ -83,13 +82,6 @@ def rectangle(width: float, height: float, *, radius: float = 0.0, steps: int = 
     top = np.array([[0.0, height / 2]])
     right = np.concatenate([upper, [[width / 2, 0.0]], upper[::-1] * (1, -1)])
     return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
-
-
-def curve(knots: npt.ArrayLike, count: int) -> FloatArray:
-    """A smooth curve (count, d) through knots (k, d), which does not overshoot them."""
-    points = np.asarray(knots, dtype=float)
-    last = len(points) - 1
-    return np.asarray(PchipInterpolator(np.arange(last + 1), points)(np.linspace(0, last, count)))
 
 
 # Solids -------------------------------------------------------------------------------------------
@@ -230,15 +222,6 @@ def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
     angle = np.linspace(0, np.pi, count // 2 + 1)
     profile = np.stack([size[0] * np.sin(angle), -size[1] * np.cos(angle)], axis=1) / 2
     return lathe(profile, color, center=center, count=count, depth=size[2] / size[0])
-
-
-def sheet(grid: npt.ArrayLike, thickness: float, color: Color) -> Solid:
-    """A curved plate: a grid of points (rows, columns, 3), thickened to both sides."""
-    points = np.asarray(grid, dtype=float)
-    normal = _normalized(np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1)))
-    upper, lower = points + normal * thickness / 2, points - normal * thickness / 2
-    # Each row becomes an outline around the plate's section: over it and back underneath.
-    return loft(np.concatenate([points[:, :1], upper, points[:, -1:], lower[:, ::-1]], 1), color)
 
 
 def _normalized(vectors: FloatArray) -> FloatArray:

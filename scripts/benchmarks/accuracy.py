@@ -101,7 +101,7 @@ class Solvers:
                 yield {"problems": name, **_accuracy_row(problems, noise, method, limit)}
 
     def _minimal(self, given: Given) -> Row:
-        """Rate of the truth among the minimal solver's solutions, and their number."""
+        """Rate of the truth among the solutions, and their number."""
         rng = np.random.default_rng(given.seed)
         found = solutions = 0
         for _ in range(self.problems):

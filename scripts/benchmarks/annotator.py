@@ -135,7 +135,7 @@ class Annotator:
             last = session.photos[0].document.pairs[-1]
             perform(session, 0, {"do": "delete", "pair": last.number})
             with served(session) as access:
-                page = _laptop(browser, access.url, WATCH_PAINT)
+                page = _page(browser, access.url, WATCH_PAINT)
                 page.evaluate("window.watchPaint()")
                 milliseconds = _timed_clicks(page, session, last.uv, self.clicks)
                 page.context.close()
@@ -160,7 +160,7 @@ class Annotator:
                 place(session, keypoint, [u * scale, v * scale], image=number)
         listed, pictured, switched = [], [], []
         with served(session) as access:
-            page = _laptop(browser, access.url)
+            page = _page(browser, access.url)
             wait = Keyboard(page).wait
             for _ in range(5):
                 listed.append(page.evaluate(_LIST))
@@ -195,8 +195,6 @@ class Annotator:
             rounds.append(each)
             if each.lost:
                 print("lost", each.action, each.differences, flush=True)
-            if len(rounds) % 10 == 0:
-                print(f"killed {len(rounds)} of {self.kills}", flush=True)
         yield {
             "kills": len(rounds),
             "during an action": sum(each.was_busy for each in rounds),
@@ -219,9 +217,11 @@ def _new(folder: Path) -> Path:
     return folder
 
 
-def _laptop(browser: Browser, url: str, *scripts: str) -> Page:
-    width, height = SCREENS["laptop"]
-    return open_page(browser, url, width=width, height=height, scheme="light", scripts=scripts)
+def _page(
+    browser: Browser, url: str, *scripts: str, screen: str = "laptop", scheme: str = "light"
+) -> Page:
+    width, height = SCREENS[screen]
+    return open_page(browser, url, width=width, height=height, scheme=scheme, scripts=scripts)
 
 
 def _timed_clicks(
@@ -259,21 +259,13 @@ def _panels(given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
     root = write_sample_dataset(folder / "sample", per_category=3)
     original = make_case(root, _new(folder / "case"))
     axe = axe_script(folder)
-    for screen, (width, height) in SCREENS.items():
+    for screen in SCREENS:
         for scheme in SCHEMES:
-            case = original.copied_to(folder / f"{screen} {scheme}")
             shift, panels, serious = 0.0, 0, set[str]()
             for with_axe in (False, True):
-                own = case.copied_to(folder / f"{screen} {scheme} {with_axe}")
+                own = original.copied_to(folder / f"{screen} {scheme} {with_axe}")
                 with served(prepare(own, root)) as access:
-                    page = open_page(
-                        browser,
-                        access.url,
-                        width=width,
-                        height=height,
-                        scheme=scheme,
-                        scripts=(WATCH_SHIFTS,),
-                    )
+                    page = _page(browser, access.url, WATCH_SHIFTS, screen=screen, scheme=scheme)
                     keyboard = Keyboard(page)
                     if with_axe:
                         page.evaluate(axe)
@@ -314,9 +306,7 @@ def _pictures(given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
             for name, session in sessions.items():
                 path = folder / f"{screen} {scheme} {name}.png"
                 with served(session) as access:
-                    page = open_page(
-                        browser, access.url, width=width, height=height, scheme=scheme, scripts=()
-                    )
+                    page = _page(browser, access.url, screen=screen, scheme=scheme)
                     page.evaluate("annotator.photo.setOverlay({ mode: 'edges' })")
                     page.wait_for_timeout(300)
                     page.screenshot(path=path)
@@ -342,29 +332,21 @@ def _pictured_models(root: Path | None) -> Iterator[tuple[str, Mesh]]:
     yield "white, doubled faces", real.get("341c9b", _painted(chair, 1.0))
     yield "black", _painted(real.get("1eaf8d", chair), 0.0)
     yield "doubled faces, cup", real.get("1ea9ea", chair)
-    yield "thin", _thinned(real.get("341e24", chair))
+    thin = real.get("341e24", chair)
+    yield "thin", replace(thin, vertices=thin.vertices * [1.0, 1.0, 0.01])
     yield "transparent", real.get("437678", _painted(bottle, 0.9, opacity=0.3))
     yield "glass", _painted(bottle, 0.9, opacity=0.25)
     yield "textured", real.get("88382b", chair)
     yield "many faces", real.get("4e2769", own["vessel"])
-    yield "huge", _scaled(real.get("b08727", own["car"]), 1e5)
-    yield "tiny", _scaled(real.get("1cf98e", bottle), 1e-5)
+    huge, tiny = real.get("b08727", own["car"]), real.get("1cf98e", bottle)
+    yield "huge", replace(huge, vertices=huge.vertices * 1e5)
+    yield "tiny", replace(tiny, vertices=tiny.vertices * 1e-5)
 
 
 def _painted(mesh: Mesh, grey: float, *, opacity: float = 1.0) -> Mesh:
     """The mesh in one grey."""
     material = Material("grey", (grey, grey, grey, opacity))
     return Mesh(mesh.vertices, mesh.faces, polygon=mesh.polygon, materials=(material,))
-
-
-def _thinned(mesh: Mesh) -> Mesh:
-    """The mesh, as thin as a board."""
-    return replace(mesh, vertices=mesh.vertices * [1.0, 1.0, 0.01])
-
-
-def _scaled(mesh: Mesh, factor: float) -> Mesh:
-    """The mesh in another unit."""
-    return replace(mesh, vertices=mesh.vertices * factor)
 
 
 def _pictured_session(mesh: Mesh, folder: Path) -> Session:
@@ -374,11 +356,9 @@ def _pictured_session(mesh: Mesh, folder: Path) -> Session:
     pose = frame_object(scene.bounds, CAMERA, rotation=turned.rotation, fill=0.8)
     frame = RaycastRenderer().render(scene, CAMERA, pose)
     write_image(folder / "photo.png", frame.composite((196, 200, 190)))
-    export_object(
-        folder / "model.obj",
-        AlignedObject((ExportView(CAMERA, _at_rest(pose)),), mesh=mesh),
-        format="obj",
-    )
+    at_rest = Alignment(np.eye(3), np.zeros(3), pose.scale)  # the mesh is written as it is
+    aligned = AlignedObject((ExportView(CAMERA, at_rest),), mesh=mesh)
+    export_object(folder / "model.obj", aligned, format="obj")
     session = open_session(
         SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
     )
@@ -392,8 +372,3 @@ def _pictured_session(mesh: Mesh, folder: Path) -> Session:
         place(session, session.registry.add(point), [float(u), float(v)])
     session.warm_up()
     return session
-
-
-def _at_rest(pose: Alignment) -> Alignment:
-    """The pose before which a mesh is written as it is: camera and model frame are one."""
-    return Alignment(np.eye(3), np.zeros(3), pose.scale)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from benchmarks.section import LIMIT_DRAWS, Given, Row, Table, clocked
-from cadalign import Camera, Model, Result, View, align
+from cadalign import Camera, Model, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.contours.fit import contour_bound
@@ -44,8 +44,6 @@ class Masks:
     """Kinds of masks."""
     neighbours: int = 40
     """Masks of neighbouring objects."""
-    verbose: bool = False
-    """Print every view."""
 
     def run(self, given: Given) -> Iterator[Table]:
         """Measure all kinds of masks, and those of neighbours."""
@@ -83,18 +81,15 @@ class Masks:
             left_out += not residuals.is_used
             sigmas.append(residuals.sigma)
             bounds.append(case.ideal(contour_bound(case.model, view, case.truth), rng))
-            if self.verbose:
-                limit = np.median(bounds[-1], axis=1)
-                print(_account(kind, case, alone[-1], joint[-1], limit, result, wall), flush=True)
         compared = (
             np.median(alone, axis=0),
             np.median(joint, axis=0),
             np.median(np.concatenate(bounds, axis=1), axis=1),
         )
         row: Row = {"mask": kind}
-        for name, *medians in zip(_ERRORS, *(each.tolist() for each in compared), strict=True):
-            suffixes = ("keypoints", "mask", "bound")
-            row |= {f"{name} {s}": value for s, value in zip(suffixes, medians, strict=True)}
+        for suffix, medians in zip(("keypoints", "mask", "bound"), compared, strict=True):
+            names = (f"{name} {suffix}" for name in _ERRORS)
+            row |= dict(zip(names, medians.tolist(), strict=True))
         of_bottles = np.array(joint)[bottles, 2]
         return row | {
             "R ratio": row["R mask"] / row["R keypoints"],
@@ -117,9 +112,6 @@ class Masks:
             result = align(case.model, case.view(mask))
             named.append(any("views[0].mask" in text for text in result.warnings))
             ratios.append(case.errors(result.alignment)[0] / alone[0])
-            if self.verbose:
-                kinds = case.annotated.category, other.annotated.category
-                print(*kinds, named[-1], f"{ratios[-1]:.2f}")
         return {
             "named": float(np.mean(named)),
             "R ratio": float(np.median(ratios)),
@@ -223,36 +215,6 @@ def _cut_by_border(case: _Case, rng: np.random.Generator) -> _Case:
     visible = np.zeros(len(case.annotated.keypoints.xyz), dtype=bool)
     visible[np.array(case.ids)[inside]] = True
     return _case_of(case.annotated, case.scene, camera, case.truth, visible, rng)
-
-
-def _account(
-    kind: str,
-    case: _Case,
-    alone: list[float],
-    joint: list[float],
-    limit: np.ndarray,
-    result: Result,
-    wall: float,
-) -> str:
-    """A line on one view."""
-    (residuals,) = result.mask_residuals
-    assert residuals is not None
-    compared = (
-        f"{name} {before:.4g} -> {after:.4g} ({bound:.4g})"
-        for name, before, after, bound in zip(_ERRORS, alone, joint, limit, strict=True)
-    )
-    parts = [
-        f"{kind} {case.annotated.category}",
-        f"{len(case.ids)} keypoints",
-        *compared,
-        f"sigma {residuals.sigma:.2f}",
-        f"{residuals.correlation:.1f} alike",
-        f"offset {residuals.offset:.2f}",
-        f"support {residuals.support:.2f}",
-        f"{wall:.2f} s",
-        *(text for text in result.warnings if "mask" in text),
-    ]
-    return ", ".join(parts)
 
 
 def _beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import poselib
+from common import COMMAND
 
 import cadalign
 from benchmarks.section import (
-    COMMAND,
     Given,
     Row,
     Table,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -18,8 +17,6 @@ from cadalign.errors import CadalignError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation.problems import Problem
 
-COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
-"""What runs `cadalign`, wherever it is installed."""
 LIMIT_DRAWS = 20
 _DATA = Path(os.environ["CADALIGN_DATA"]) if os.environ.get("CADALIGN_DATA") else None
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from common import COMMAND
 
 import cadalign
 from benchmarks.section import (
-    COMMAND,
     Given,
     Row,
     Table,

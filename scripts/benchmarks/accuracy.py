@@ -370,14 +370,11 @@ def _cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
         pair = rng.choice(len(points_2d), 2, replace=False)
         points_2d[pair] = points_2d[pair[::-1]]
 
-    def shuffle(rng: np.random.Generator, points_2d: np.ndarray) -> None:
-        rng.shuffle(points_2d)
-
     given = {"sigma": noise_px}
     return [
         ("1 wrong of 8", draw(8, misplace), given),
         ("2 swapped of 12", draw(12, swap), given),
-        ("20 shuffled", draw(20, shuffle), given),
+        ("20 shuffled", draw(20, np.random.Generator.shuffle), given),
         ("10, stretch none", draw(10), given | {"stretch": "none"}),
         ("1 wrong of 8, cauchy", draw(8, misplace), given | {"loss": "cauchy"}),
         *((f"{points} right", draw(points), given) for points in _CALIBRATED_SIZES),

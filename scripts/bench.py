@@ -114,12 +114,13 @@ def show(table: Table, stored: dict[str, float]) -> None:
         row if "ratio" not in row else row | {"stored": stored.get(row["name"])}
         for row in table.rows
     ]
-    for column in rows[0] if rows else ():
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    for column in columns:
         printed.add_column(column, justify="right")
     for row in rows:
         style = "red" if "ratio" in row and is_worse(row, stored) else None
-        printed.add_row(*map(cell, row.values()), style=style)
-    Console(width=160, highlight=False).print(printed)
+        printed.add_row(*(cell(row.get(column)) for column in columns), style=style)
+    Console(width=220, highlight=False).print(printed)
 
 
 def cell(value: Any) -> str:

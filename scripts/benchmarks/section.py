@@ -53,7 +53,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Table:
-    """A title, and rows of the same keys; a cell may be a median with a 90th percentile."""
+    """A title, and rows by column; a cell may be a median with a 90th percentile."""
 
     title: str
     rows: list[Row]

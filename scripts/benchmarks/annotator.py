@@ -39,7 +39,7 @@ from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
 from cadalign.export import AlignedObject, ExportView, export_object
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Material
-from cadalign.io.images import write_image
+from cadalign.io.images import read_photo, write_image
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, contact_sheet, visible_keypoints
 from cadalign.render.views.viewpoints import frame_object, look_at
 
@@ -145,8 +145,7 @@ class Annotator:
     def _list(self, given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
         """The list of a folder of photos, and going from one to the next."""
         case = _case(given, folder)
-        with Image.open(case.photo) as image:
-            large = image.convert("RGB").resize((2000, 1500))
+        large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
         case.photo.unlink()
         for number in range(self.photos):
             large.save(case.folder / f"photo_{number}.jpg", quality=90)
@@ -311,8 +310,7 @@ def _pictures(given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
                     page.wait_for_timeout(300)
                     page.screenshot(path=path)
                     page.context.close()
-                with Image.open(path) as image:
-                    shots.append(np.asarray(image.convert("RGB").resize(size)))
+                shots.append(np.asarray(Image.fromarray(read_photo(path)).resize(size)))
             columns = 5 if width < 600 else 2
             sheet = sheets / f"{screen}_{scheme}.png"
             write_image(sheet, contact_sheet(shots, list(sessions), columns=columns))

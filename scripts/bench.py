@@ -19,16 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from benchmarks.accuracy import Calibration, Focal, Solvers
+from benchmarks.accuracy import Coverage, Solvers, UnknownFocal
 from benchmarks.annotator import Annotator
 from benchmarks.masks import Masks
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Ransac
-from benchmarks.section import Given, NotGivenError, Row, Section, Table
+from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
 from benchmarks.shapes import Align, FocalShapes, Similar
-from benchmarks.speed import Calls, Cold, Render
+from benchmarks.speed import Calls, Cold, Rendering
 from rich.console import Console
-from rich.table import Table as Printed
+from rich.table import Table
 
 from cadalign.io.files import write_json
 
@@ -36,10 +36,10 @@ SECTIONS: dict[str, type[Section]] = {
     "solvers": Solvers,
     "cold": Cold,
     "calls": Calls,
-    "focal": Focal,
+    "focal": UnknownFocal,
     "focal_shapes": FocalShapes,
-    "calibration": Calibration,
-    "render": Render,
+    "calibration": Coverage,
+    "render": Rendering,
     "annotator": Annotator,
     "masks": Masks,
     "align": Align,
@@ -55,7 +55,7 @@ TOLERANCE = 0.2
 
 
 @dataclass
-class Common(Given):
+class Common(BenchmarkData):
     """Options of all sections."""
 
     sections: tyro.conf.Positional[tuple[str, ...]] = ()
@@ -107,9 +107,9 @@ def is_worse(row: Row, stored: dict[str, float]) -> bool:
     return row["ratio"] > stored.get(row["name"], float("inf")) * (1 + TOLERANCE)
 
 
-def show(table: Table, stored: dict[str, float]) -> None:
+def show(table: RatioTable, stored: dict[str, float]) -> None:
     """Print a table; figures with the stored ratios beside theirs."""
-    printed = Printed(title=table.title)
+    printed = Table(title=table.title)
     rows = [
         row if "ratio" not in row else row | {"stored": stored.get(row["name"])}
         for row in table.rows

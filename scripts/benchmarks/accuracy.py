@@ -14,7 +14,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 import cadalign
-from benchmarks.section import Given, Row, Table, figure, ideal_errors, medians_in_turns, seconds
+from benchmarks.section import (
+    BenchmarkData,
+    RatioTable,
+    Row,
+    figure,
+    ideal_errors,
+    medians_in_turns,
+    seconds,
+)
 from cadalign import Alignment, Camera, RansacOptions, Result
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
@@ -68,11 +76,11 @@ class Solvers:
     repetitions: int = 300
     """Timed calls per figure; the median counts."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure accuracy, the minimal solver and speed."""
         title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
-        yield Table(title, list(self._accuracy(given)))
-        yield Table(
+        yield RatioTable(title, list(self._accuracy(given)))
+        yield RatioTable(
             "4 points: the truth among the minimal solver's solutions", [self._minimal(given)]
         )
         rng = np.random.default_rng(given.seed)
@@ -80,9 +88,9 @@ class Solvers:
         for points in _SPEED_SIZES:
             problem = simulate_problem(rng, points=points, noise_px=1.0)
             rows += _speed(problem, points, self.repetitions)
-        yield Table("Time over OpenCV's, which does not stretch", rows)
+        yield RatioTable("Time over OpenCV's, which does not stretch", rows)
 
-    def _accuracy(self, given: Given) -> Iterator[Row]:
+    def _accuracy(self, given: BenchmarkData) -> Iterator[Row]:
         sources: list[tuple[str, float, Draw]] = [
             (
                 f"{n} points, {noise:g} px",
@@ -100,7 +108,7 @@ class Solvers:
             for method in _METHODS:
                 yield {"problems": name, **_accuracy_row(problems, noise, method, limit)}
 
-    def _minimal(self, given: Given) -> Row:
+    def _minimal(self, given: BenchmarkData) -> Row:
         """Rate of the truth among the solutions, and their number."""
         rng = np.random.default_rng(given.seed)
         found = solutions = 0
@@ -216,7 +224,7 @@ def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
 
 
 @dataclass
-class Focal:
+class UnknownFocal:
     """Fits with an unknown focal length: accuracy against the Cramer-Rao bound, and outliers."""
 
     problems: int = 1000
@@ -224,14 +232,14 @@ class Focal:
     robust_problems: int = 40
     """Random problems per share of outliers."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure accuracy and the robust search."""
         title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
-        yield Table(title, [self._accuracy(given, points) for points in (10, 20, 50, 200)])
+        yield RatioTable(title, [self._accuracy(given, points) for points in (10, 20, 50, 200)])
         title = f"{_ROBUST_POINTS} points: none of the wrong kept, and over 90 % of the others"
-        yield Table(title, [self._robust(given, share) for share in (0.0, 0.3, 0.5, 0.7, 0.8)])
+        yield RatioTable(title, [self._robust(given, share) for share in (0.0, 0.3, 0.5, 0.7, 0.8)])
 
-    def _accuracy(self, given: Given, points: int) -> Row:
+    def _accuracy(self, given: BenchmarkData, points: int) -> Row:
         """Median errors over those of an ideal estimator."""
         rng = np.random.default_rng(given.seed)
         problems = [
@@ -261,7 +269,7 @@ class Focal:
         row = {"points": points, "limit f %": 100 * limit["focal_error"]}
         return {**row, **ratios, "failed %": failed}
 
-    def _robust(self, given: Given, share: float) -> Row:
+    def _robust(self, given: BenchmarkData, share: float) -> Row:
         """Rate at which outliers are told from inliers."""
         rng = np.random.default_rng(given.seed)
         found = 0
@@ -288,8 +296,8 @@ class Focal:
 
 
 @dataclass
-class Calibration:
-    """How often stated uncertainties hold, and how often large errors come without a warning.
+class Coverage:
+    """Coverage of stated uncertainties, and how often large errors come without a warning.
 
     Problems are the simulation's (f = 150 px). An error is large from 15 deg or 25 % of a scale,
     and silent without warning and alternative.
@@ -300,13 +308,13 @@ class Calibration:
     noise_px: float = 1.0
     """Standard deviation of the noise [px], which sigma states."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure coverage and warnings."""
-        yield Table("Errors within the 95 % ellipsoid", list(self._coverage(given)))
+        yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given)))
         title = "Large errors without a warning, and misfits found"
-        yield Table(title, list(self._warnings(given)))
+        yield RatioTable(title, list(self._warnings(given)))
 
-    def _coverage(self, given: Given) -> Iterator[Row]:
+    def _coverage(self, given: BenchmarkData) -> Iterator[Row]:
         for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
             for points in _CALIBRATED_SIZES[1:]:
                 draw = partial(simulate_problem, points=points, noise_px=self.noise_px)
@@ -323,7 +331,7 @@ class Calibration:
                 row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
                 yield row | dict(zip(names, shares, strict=True))
 
-    def _warnings(self, given: Given) -> Iterator[Row]:
+    def _warnings(self, given: BenchmarkData) -> Iterator[Row]:
         for name, draw, options in _cases(self.noise_px):
             fits = list(self._fits(given, draw, **options))
             large = [result for problem, result in fits if _is_large(result, problem.alignment)]
@@ -338,7 +346,9 @@ class Calibration:
                 "misfits %": 100 * misfits / max(len(fits), 1),
             }
 
-    def _fits(self, given: Given, draw: Draw, **options: Any) -> Iterator[tuple[Problem, Result]]:
+    def _fits(
+        self, given: BenchmarkData, draw: Draw, **options: Any
+    ) -> Iterator[tuple[Problem, Result]]:
         """Problems with their fits; those that are refused are left out."""
         for number in range(self.problems):
             problem = draw(np.random.default_rng([given.seed, number]))

@@ -28,7 +28,7 @@ from support.panels import (
 )
 from support.web import axe_script
 
-from benchmarks.section import Given, Row, Table, clocked
+from benchmarks.section import BenchmarkData, RatioTable, Row, clocked
 from cadalign import Camera, Mesh
 from cadalign.annotate.actions import perform
 from cadalign.annotate.masks import encode_runs
@@ -104,9 +104,9 @@ class Annotator:
     kills: int = 100
     """Annotators to kill."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure the parts."""
-        measures: dict[str, Callable[[Given, Browser, Path], Iterator[Row]]] = {
+        measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
             "times": self._times,
             "list": self._list,
             "panels": _panels,
@@ -119,9 +119,9 @@ class Annotator:
                 before = os.getloadavg()[0]
                 rows = list(measures[part](given, browser, _new(Path(folder) / part)))
                 after = os.getloadavg()[0]
-                yield Table(f"annotator, {part} (load {before:.1f}, then {after:.1f})", rows)
+                yield RatioTable(f"annotator, {part} (load {before:.1f}, then {after:.1f})", rows)
 
-    def _times(self, given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
+    def _times(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
         """Clicks that complete the twentieth pair, without and with a mask."""
         case = _case(given, folder)
         for kind in ("pairs", "mask"):
@@ -142,7 +142,7 @@ class Annotator:
             median, late = np.percentile(milliseconds, [50, 95]).tolist()
             yield {"with": kind, "clicks": self.clicks, "median ms": median, "p95 ms": late}
 
-    def _list(self, given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
+    def _list(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
         """The list of a folder of photos, and going from one to the next."""
         case = _case(given, folder)
         large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
@@ -187,7 +187,7 @@ class Annotator:
             "switch p95 ms": float(np.percentile(switched, 95)),
         }
 
-    def _kills(self, given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
+    def _kills(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
         """Annotators killed at random moments."""
         rounds = []
         for each in kill_at_random(_case(given, folder), rounds=self.kills, seed=given.seed):
@@ -202,7 +202,7 @@ class Annotator:
         }
 
 
-def _case(given: Given, folder: Path) -> Case:
+def _case(given: BenchmarkData, folder: Path) -> Case:
     """A photo of a chair: ShapeNet's if it is here, else the sample's."""
     root = given.keypointnet
     if root is None:
@@ -253,7 +253,7 @@ def _timed_clicks(
     return times
 
 
-def _panels(given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
+def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
     """Layout shifts and what axe-core finds, over a session through every panel."""
     root = write_sample_dataset(folder / "sample", per_category=3)
     original = make_case(root, _new(folder / "case"))
@@ -289,7 +289,7 @@ def _serious(page: Page) -> set[str]:
 # Pictures -----------------------------------------------------------------------------------------
 
 
-def _pictures(given: Given, browser: Browser, folder: Path) -> Iterator[Row]:
+def _pictures(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
     """Contact sheets of ten models on every screen, light and dark."""
     sessions = {
         name: _pictured_session(mesh, _new(folder / name))

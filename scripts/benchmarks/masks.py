@@ -1,4 +1,4 @@
-"""What masks add to keypoints: exact ones, damaged ones, those of other objects."""
+"""Masks beside keypoints: exact ones, damaged ones, masks of other objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.section import LIMIT_DRAWS, Given, Row, Table, clocked
+from benchmarks.section import LIMIT_DRAWS, BenchmarkData, RatioTable, Row, clocked
 from cadalign import Camera, Model, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError, RenderError
@@ -45,7 +45,7 @@ class Masks:
     neighbours: int = 40
     """Masks of neighbouring objects."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all kinds of masks, and those of neighbours."""
         with tempfile.TemporaryDirectory() as folder:
             sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
@@ -54,9 +54,9 @@ class Masks:
                 models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
             cases = list(_draw_cases(models, self.views, given.seed))
         rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
-        yield Table(f"masks, {len(cases)} views: medians", rows)
+        yield RatioTable(f"masks, {len(cases)} views: medians", rows)
         if self.neighbours:
-            yield Table("masks of neighbouring objects", [self._neighbours(cases, given.seed)])
+            yield RatioTable("masks of neighbouring objects", [self._neighbours(cases, given.seed)])
 
     def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
         """Medians over all views for one kind of mask."""

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.section import (
-    Given,
+    BenchmarkData,
+    RatioTable,
     Row,
-    Table,
     clocked,
     figure,
     reference_seconds,
@@ -52,7 +52,7 @@ class Retrieval:
     """Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
     200000."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all libraries."""
         real = list(Library.from_dataset(KeypointNet(given.needed("keypointnet"))))
         mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
@@ -62,7 +62,7 @@ class Retrieval:
                 _jittered(mixed, size).save(path)
                 yield self._measure(path, mixed[:size])
 
-    def _measure(self, path: Path, models: Sequence[LibraryModel]) -> Table:
+    def _measure(self, path: Path, models: Sequence[LibraryModel]) -> RatioTable:
         """Opening, and queries of three levels of noise."""
         reference = reference_seconds()
         wall, busy, library = clocked(partial(Library.open, path))
@@ -75,7 +75,7 @@ class Retrieval:
         _retrieve(library, warm_up[1], 1.0)
         for noise_px in (1.0, 3.0, 5.0):
             rows += self._queries(library, shown, noise_px)
-        return Table(f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows)
+        return RatioTable(f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows)
 
     def _queries(
         self, library: Library, models: Sequence[LibraryModel], noise_px: float
@@ -147,14 +147,14 @@ class UnseenRetrieval:
     noise_px: float = 2.0
     """Standard deviation of the keypoints, in pixels."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all categories and numbers of keypoints."""
         dataset = KeypointNet(given.needed("keypointnet"))
         for category in self.categories:
             shape = ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
             for count in self.keypoints:
                 rows = list(self._rankings(dataset, category, count, shape))
-                yield Table(f"{category}, {count or 'all'} keypoints", rows)
+                yield RatioTable(f"{category}, {count or 'all'} keypoints", rows)
 
     def _rankings(
         self, dataset: KeypointNet, category: str, count: int, shape: ShapeModel

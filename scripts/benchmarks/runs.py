@@ -17,9 +17,9 @@ from common import COMMAND
 
 import cadalign
 from benchmarks.section import (
-    Given,
+    BenchmarkData,
+    RatioTable,
     Row,
-    Table,
     clocked,
     figure,
     processor_seconds,
@@ -53,11 +53,11 @@ class Evaluation:
     count: int = 2000
     """Instances on annotations alone."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure annotations, runs and Dask."""
         root = given.needed("keypointnet")
         rows = [_on_annotations(root, self.count, method) for method in ("aepnp", "optimal")]
-        yield Table("Evaluation in one process", rows)
+        yield RatioTable("Evaluation in one process", rows)
         with tempfile.TemporaryDirectory() as folder:
             samples = write_sample_dataset(Path(folder) / "samples", per_category=12)
             on_hulls = ("--visibility=hull", "--methods=aepnp")
@@ -67,7 +67,7 @@ class Evaluation:
                 *_whole_runs("run with overlays", samples, *overlays, views=(1, 4)),
                 _dask_over_processes(root),
             ]
-        yield Table("Whole runs", rows)
+        yield RatioTable("Whole runs", rows)
 
 
 def _on_annotations(root: Path, count: int, method: str) -> Row:
@@ -158,7 +158,7 @@ class Ransac:
     outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
     """Shares of outliers among the image points."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure both models and all shares of outliers."""
         colmap, bundler = given.needed("colmap"), given.needed("bundler")
         models = {"COLMAP": list(Colmap(colmap)), "Bundler": list(Bundler(bundler))}
@@ -167,7 +167,7 @@ class Ransac:
             for name, images in models.items()
             for share in self.outliers
         ]
-        yield Table("Robust search", rows)
+        yield RatioTable("Robust search", rows)
 
     def _row(self, name: str, images: list[Correspondences], share: float) -> Row:
         rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""What the sections of `bench.py` share: what they are given, their tables, clocks and limits."""
+"""Sections of `bench.py`: the data they are given, their tables, clocks and limits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class NotGivenError(Exception):
 
 
 @dataclass(kw_only=True)
-class Given:
+class BenchmarkData:
     """Data and seed of all sections; CADALIGN_DATA names the folder of the data."""
 
     keypointnet: Path | None = _DATA and _DATA / "keypointnet"
@@ -52,7 +52,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Table:
+class RatioTable:
     """A title, and rows by column; a cell may be a median with a 90th percentile."""
 
     title: str
@@ -62,7 +62,7 @@ class Table:
 class Section(Protocol):
     """A section: a dataclass of options that measures."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure, one table after the other."""
 
 

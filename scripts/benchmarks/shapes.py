@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.section import LIMIT_DRAWS, Given, Row, Table, processor_seconds, seconds
+from benchmarks.section import (
+    LIMIT_DRAWS,
+    BenchmarkData,
+    RatioTable,
+    Row,
+    processor_seconds,
+    seconds,
+)
 from cadalign import Alignment, Box, Camera, Result, ShapeModel, View, align, align_batch, fit
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
@@ -58,10 +65,12 @@ class Align:
     workers: int = 2
     """Threads of the batch."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all categories."""
         dataset = KeypointNet(given.needed("keypointnet"))
-        yield Table("align with a learned shape", [self._row(dataset, c) for c in self.categories])
+        yield RatioTable(
+            "align with a learned shape", [self._row(dataset, c) for c in self.categories]
+        )
 
     def _row(self, dataset: KeypointNet, category: str) -> Row:
         shape = ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
@@ -123,11 +132,11 @@ class FocalShapes:
     noise_px: float = 2.0
     """Standard deviation of the unseen objects' keypoints, in pixels."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure drawn objects, and with KeypointNet unseen ones."""
         title = f"{_POINTS} keypoints, 1 px: median errors over the limit's of 7 + K unknowns"
         rng = np.random.default_rng
-        yield Table(title, [_drawn(rng(given.seed), k, 5 * self.objects) for k in (1, 3, 5)])
+        yield RatioTable(title, [_drawn(rng(given.seed), k, 5 * self.objects) for k in (1, 3, 5)])
         if given.keypointnet is None:
             return
         dataset, rows, deviations = KeypointNet(given.keypointnet), [], []
@@ -136,7 +145,7 @@ class FocalShapes:
             rows.append(row)
             deviations += found
         rows.append(dict.fromkeys(rows[0]) | {"category": "all", "f in 95 %": _held(deviations)})
-        yield Table(f"unseen objects in near views, {self.noise_px:g} px", rows)
+        yield RatioTable(f"unseen objects in near views, {self.noise_px:g} px", rows)
 
     def _unseen(self, dataset: KeypointNet, category: str, seed: int) -> tuple[Row, list[float]]:
         """Errors with the focal length known and unknown; errors of the latter in deviations."""
@@ -282,11 +291,11 @@ class Similar:
     noise_px: float = 2.0
     """Noise of the keypoints [px]."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure every category and prior."""
         dataset = KeypointNet(given.needed("keypointnet"))
         rows = [self._row(category, dataset[category]) for category in dataset.categories]
-        yield Table("Median rotation error in degrees (box IoU), by prior", rows)
+        yield RatioTable("Median rotation error in degrees (box IoU), by prior", rows)
 
     def _row(self, category: str, models: Sequence[AnnotatedModel]) -> Row:
         usable = [each for each in models if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]

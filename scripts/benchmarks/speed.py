@@ -16,9 +16,9 @@ from common import COMMAND
 
 import cadalign
 from benchmarks.section import (
-    Given,
+    BenchmarkData,
+    RatioTable,
     Row,
-    Table,
     figure,
     medians_in_turns,
     seconds,
@@ -87,7 +87,7 @@ class Cold:
     first call of a function of ten lines compiled by Numba, measured right before.
     """
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure the first calls."""
         with tempfile.TemporaryDirectory() as folder:
             _, reference = self._called(_SMALL_FUNCTION, folder, "small")
@@ -96,7 +96,7 @@ class Cold:
                 place = "all" if "doctor" in name else "fit"
                 wall, processor = self._called(code, folder, place)
                 rows.append(figure(name, wall, "s", processor / reference, "a first small call"))
-        yield Table("First calls", rows)
+        yield RatioTable("First calls", rows)
 
     def _called(self, code: str, folder: str, place: str) -> tuple[float, float]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
@@ -105,18 +105,18 @@ class Cold:
 
 @dataclass
 class Calls:
-    """What calls cost beside their solving: the warm command line, and small fits in Python."""
+    """Cost of calls beside their solving: the warm command line, and small fits in Python."""
 
     runs: int = 7
     """Runs of each command."""
     calls: int = 2000
     """Calls of each fit."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure commands and fits."""
         with tempfile.TemporaryDirectory() as folder:
-            yield Table("Commands, processor time", list(self._commands(Path(folder))))
-        yield Table("Fits", list(self._fits()))
+            yield RatioTable("Commands, processor time", list(self._commands(Path(folder))))
+        yield RatioTable("Fits", list(self._fits()))
 
     def _commands(self, folder: Path) -> Iterator[Row]:
         seen = str(_observation(folder))
@@ -181,7 +181,7 @@ def _observation(folder: Path) -> Path:
 
 
 @dataclass
-class Render:
+class Rendering:
     """Milliseconds a frame of the renderers, and of what is done once per mesh.
 
     640 x 480 px on 20,480 triangles. Medians, and the smallest beside them, since other programs
@@ -191,7 +191,7 @@ class Render:
     repetitions: int = 15
     """Timed frames per figure; the median counts."""
 
-    def run(self, given: Given) -> Iterator[Table]:
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure every renderer that is there."""
         camera = Camera.from_fov(640, 480, fov_x=50.0)
         scene = Scene(ball(5))
@@ -204,7 +204,9 @@ class Render:
             median, limit = float(np.median(times)), _LIMITS.get(name)
             rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
         share = 100 * float(cast_geometry(scene, camera, pose).mask.mean())
-        yield Table(f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows)
+        yield RatioTable(
+            f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows
+        )
 
 
 def _render_tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[], object]]:

@@ -14,8 +14,6 @@ import msgspec
 import numpy as np
 from msgspec import Raw
 
-import numpy as np
-
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.datasets.photos.poses import PoseFile

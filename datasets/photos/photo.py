@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
@@ -363,10 +364,10 @@ class Photo:
 
 
 def existing(path: Path) -> Path | None:
-    """The path if there is such a file, else None."""
-    return path if path.is_file() else None
+    """The path if there is such a file, else None; also of a name that no file can have."""
+    return path if os.path.isfile(path) else None
 
 
 def first_existing(paths: Iterable[Path]) -> Path | None:
     """The first of the paths that is a file; None where none is."""
-    return next((path for path in paths if path.is_file()), None)
+    return next((path for path in paths if existing(path)), None)

@@ -90,7 +90,7 @@ def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
 def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
     prefix = f"scannet_{scene.removeprefix('scene')}_"
     intrinsics = folder / f"{prefix}intr.txt"
-    if not intrinsics.is_file():
+    if not existing(intrinsics):
         return
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")

@@ -36,7 +36,7 @@ _FREE_BYTES = 2**26
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are read when they are asked for, errors then named as well."""
     path = Path(path)
-    with open_input(path) as (file, size), open_picture(file, size, where=str(path)) as image:
+    with open_input(path) as file, open_picture(file, file.size, where=str(path)) as image:
         yield image
 
 

@@ -83,7 +83,10 @@ def _check_pixels(image: Image, file_size: int) -> None:
 
 
 def read_photo(path: str | os.PathLike[str]) -> ByteImage:
-    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held."""
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
+
+    It is of one of the `FORMATS`, whatever its name ends in.
+    """
     from PIL import ImageOps
 
     with open_photo(path) as image:

@@ -24,6 +24,7 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    existing,
     first_existing,
 )
 from cadalign.errors import DataError, InputError

@@ -303,13 +303,18 @@ class DepthImage:
         Raises
         ------
         DataError
-            If the file cannot be read.
+            If the file cannot be read, or depths are not finite.
         """
         with open_photo(self.path) as image:
             values = np.asarray(image)
         if values.ndim != 2:
             raise DataError(f"{values.ndim} dimensions are not a depth image", where=str(self.path))
-        return np.asarray(values, dtype=np.float64) * self.scale
+        with np.errstate(over="ignore"):
+            depth = np.asarray(values, dtype=np.float64) * self.scale
+        if not np.isfinite(depth).all():
+            what = f"some depths are not finite, at a scale of {self.scale:g}"
+            raise DataError(what, where=str(self.path))
+        return depth
 
 
 @dataclass(frozen=True, eq=False)

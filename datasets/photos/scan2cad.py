@@ -34,6 +34,7 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    existing,
     first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation

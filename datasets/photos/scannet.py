@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.photo import first_existing
+from cadalign.datasets.photos.photo import existing, first_existing
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -15,6 +15,7 @@ from typing import Any
 from cadalign.errors import DataError, quote
 
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
+_MAX_PATH = 1000  # of a path that is shown whole
 MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
 # Opening a pipe would wait for its other end; Windows has none of this kind.
@@ -77,10 +78,10 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
+        raise DataError("no such file", where=printable(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DataError(f"cannot be read ({reason})", where=str(path)) from None
+        raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
 
 
 def _open_at_once(path: str, flags: int) -> int:
@@ -155,9 +156,9 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def printable(path: Path | str) -> str:
-    """A path for a message, quoted where it holds what a terminal does not show."""
+    """A path for a message, quoted where a terminal does not show it, shortened where endless."""
     text = str(path)
-    return text if text.isprintable() else quote(text)
+    return text if text.isprintable() and len(text) <= _MAX_PATH else quote(text)
 
 
 def refuse_nul(path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cadalign.export.bop import RESULT_COLUMNS, read_bop_results, read_scene_gt
 from fuzz.format import Format
 from PIL import Image
 from scipy.io import savemat
@@ -21,6 +20,7 @@ from support.photo_sets import WRITERS
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco_masks import decode_segmentation
+from cadalign.datasets.photos.bop_files import RESULT_COLUMNS, read_bop_results, read_scene_gt
 from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import read_json

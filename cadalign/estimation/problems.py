@@ -288,9 +288,9 @@ def full_covariances(of_solver: FloatArray, known_axis: str) -> FloatArray:
 def full_covariance(of_solver: FloatArray, known_axis: str) -> FloatArray:
     """The covariance of one result; takes less time than `full_covariances` of one."""
     size = len(of_solver) + 1
-    full = np.zeros(size * size)
-    full[_places(size, known_axis)] = of_solver.ravel()
-    return full.reshape(size, size)
+    full = np.zeros((size, size))
+    full.put(_places(size, known_axis), of_solver)
+    return full
 
 
 @lru_cache(maxsize=6)

@@ -9,6 +9,8 @@ from cadalign.compile import fast_sums, inlined, kernel
 
 Triple = tuple[float, float, float]
 
+_COLUMNS = 32
+
 
 @inlined
 def cross(a: Triple, b: Triple) -> Triple:
@@ -94,6 +96,33 @@ def solve_factor(factor: FloatArray, right: FloatArray) -> None:
         right[i] /= factor[i, i]
         for k in range(i):
             right[k] -= factor[i, k] * right[i]
+
+
+@fast_sums
+def solve_factor_rows(factor: FloatArray, right: FloatArray) -> None:
+    """Solve for all columns of ``right`` (n, k) in place, with the factor that `factorize` left.
+
+    Blocks of columns stay in the processor's cache; a matrix product would use threads.
+    """
+    size = factor.shape[0]
+    for start in range(0, right.shape[1], _COLUMNS):
+        block = right[:, start : start + _COLUMNS]
+        for i in range(size):
+            own = block[i]
+            for k in range(i):
+                share, other = factor[i, k], block[k]
+                for c in range(own.shape[0]):
+                    own[c] -= share * other[c]
+            for c in range(own.shape[0]):
+                own[c] /= factor[i, i]
+        for i in range(size - 1, -1, -1):
+            own = block[i]
+            for c in range(own.shape[0]):
+                own[c] /= factor[i, i]
+            for k in range(i):
+                share, other = factor[i, k], block[k]
+                for c in range(own.shape[0]):
+                    other[c] -= share * own[c]
 
 
 @fast_sums

@@ -218,13 +218,22 @@ def _settled(
         own = score_state(start.evidence, start.state)
         extra = start.score - own if np.isfinite(start.score - own) else 0.0
         evidence, state = with_displacement_modes(start.evidence, start.state)
+        # Surfaces of a learned shape follow its modes first: with the keypoints' own displacements
+        # a round takes several times as long, and modes tell the surfaces apart.
+        is_learned = len(start.evidence.shape.modes) > 0 and evidence is not start.evidence
+        given = (start.evidence, start.state) if is_learned else (evidence, state)
         tried = []
         for surface in surfaces:
-            settled = settle(evidence, keypoints, state, contours, surface, is_wide=is_wide)
+            settled = settle(given[0], keypoints, given[1], contours, surface, is_wide=is_wide)
             if settled is not None:
                 tried.append(_Candidate(start, evidence, state, extra, surface, settled))
         if tried:
-            found.append(min(tried, key=lambda each: _misfit(each.settled)))
+            best = min(tried, key=lambda each: _misfit(each.settled))
+            if is_learned:
+                _, bare = with_displacement_modes(start.evidence, best.settled.bare)
+                settled = settle(evidence, keypoints, bare, contours, best.surface)
+                best = best._replace(settled=settled or best.settled)
+            found.append(best)
     if len(found) > 1:
         reference = min(found, key=lambda each: _misfit(each.settled))
         noises = [fit.noise for fit in reference.settled.fits]

@@ -21,7 +21,7 @@ from cadalign.solvers.joint.blocks import first_scale
 from cadalign.solvers.joint.equations import JointEquations
 from cadalign.solvers.joint.evidence import Evidence, State, unstretched
 from cadalign.solvers.joint.rows import count_equations, exp_of, stretched_point
-from cadalign.solvers.linalg import cross, dot, factorize, invert_factor
+from cadalign.solvers.linalg import cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import turn, turn_back
 
 
@@ -42,9 +42,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     left = _left_of_displacements(evidence, equations)
     by_model, response = np.empty((3, total)), np.empty((modes, total))
     _write_rows(evidence, state, equations, left, by_model, response)
-    if modes > 0:
-        triangle = invert_factor(factor)
-        response = triangle.T @ (triangle @ response)
+    solve_factor_rows(factor, response)
     _add_slopes(evidence, state, equations, left, by_model, response)
     return volume
 

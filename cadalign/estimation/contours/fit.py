@@ -232,7 +232,9 @@ def _settled(
             if is_learned:
                 _, bare = with_displacement_modes(start.evidence, best.settled.bare)
                 settled = settle(evidence, keypoints, bare, contours, best.surface)
-                best = best._replace(settled=settled or best.settled)
+                if settled is None:
+                    continue
+                best = best._replace(settled=settled)
             found.append(best)
     if len(found) > 1:
         reference = min(found, key=lambda each: _misfit(each.settled))

@@ -13,7 +13,7 @@ import numpy as np
 from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.joint import result_of_minima
+from cadalign.estimation.joint import found_in_minima, result_of
 from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model
 from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
@@ -156,7 +156,7 @@ def align(
     if lacks_sigma:
         minima = widened_by_noise(problem, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = result_of_minima(model, prior, given, minima, stats)
+    result = result_of(found_in_minima(model, prior, given, minima, stats))
     if lacks_sigma:
         result = replace(result, sigma=problem.noise)
     return result if masks is None else masks.noted_in(result)

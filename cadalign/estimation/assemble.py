@@ -1,11 +1,10 @@
-"""The one place that makes results: of keypoints in one view, and of all evidence."""
+"""Results of the keypoints of an exact or stretched model in one view."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,20 +14,11 @@ from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult, quickly
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
-from cadalign.estimation.symmetry import SAME_SQUARES, carried, held_axes, is_same
-from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
-from cadalign.estimation.uncertainty.weakness import another_pose
+from cadalign.estimation.symmetry import carried, held_axes, is_same
+from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
-
-if TYPE_CHECKING:  # what a fit of keypoints alone has no use for
-    from cadalign.estimation.model import Model
-    from cadalign.estimation.prior import ShapePrior
-    from cadalign.estimation.view import View
-    from cadalign.shapes.model import ShapeModel
-    from cadalign.solvers.marginal.moments import Moments
 
 
 def result_of_solution(
@@ -170,78 +160,6 @@ def canonical_result(result: Result, symmetry: Symmetry) -> Result:
             if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
         ),
         symmetry=symmetry,
-    )
-
-
-def result_of_evidence(
-    model: Model | ShapeModel,
-    prior: ShapePrior,
-    views: Sequence[View],
-    estimates: Sequence[Alternative],
-    moments: Moments,
-    *,
-    poses: Sequence[Alignment],
-    cameras: Sequence[Camera],
-    inliers: Sequence[BoolArray],
-    covariances: Sequence[FloatArray],
-    lengths: FloatArray,
-    statements: dict[str, Any],
-    **fields: Any,
-) -> Result:
-    """The result of all evidence about an object.
-
-    Parameters
-    ----------
-    estimates : sequence of Alternative
-        The likely estimates, the best first.
-    moments : Moments
-        Second moments of them about the best, in the first view's camera.
-    poses, cameras, inliers, covariances
-        Of every view, by the best estimate.
-    lengths : (3,) float
-        Of the object's box.
-    statements, **fields
-        More of `Stated` and of `Result`.
-    """
-    best = estimates[0]
-    others = [
-        each for each, far in zip(estimates, moments.distances, strict=True) if far > SAME_SQUARES
-    ]
-    another = another_pose(
-        best.alignment,
-        [each.alignment for each in others],
-        [each.relative_likelihood for each in others],
-    )
-    statistics = Stated(
-        covariances[0],
-        points_covariance=moments.of_points[:-2],
-        points_cam_covariance=moments.of_seen[:-2],
-        degrees_of_freedom=prior.degrees_of_freedom,
-        **{**statements, "warnings": (*statements["warnings"], *another)},
-    )
-    of_views = []
-    kept = zip(views, cameras, poses, covariances, inliers, strict=True)
-    for number, (view, camera, pose, covariance, marked) in enumerate(kept):
-        rows = prior.rows_of(view.keypoint_ids, "ids")
-        observed = cast(FloatArray, view.points_2d)
-        residuals = camera.project(pose.apply(best.points_3d[rows])) - observed
-        stated = Stated(covariance) if number else statistics
-        of_views.append(
-            ViewResult(camera, pose, view.keypoint_ids, observed, residuals, marked, stated)
-        )
-    mean = prior.lengths
-    has_length = mean > 0
-    return Result(
-        views=tuple(of_views),
-        ids=prior.ids,
-        points_3d=best.points_3d,
-        method="align",
-        statistics=statistics,
-        alternatives=tuple(others),
-        model=model,
-        own_bounds=best.own_bounds,
-        own_stretch=np.where(has_length, lengths / np.where(has_length, mean, 1.0), 1.0),
-        **fields,
     )
 
 

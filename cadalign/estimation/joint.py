@@ -1,20 +1,19 @@
-"""From minima of the joint estimate to its result.
+"""From likely estimates of all evidence to their result, by whatever search they were found.
 
-All likely estimates together are a mixture of Gaussians; of those that are equal under the model's
-symmetry one stands for all.
+Together they are a mixture of Gaussians; of those that are equal under the model's symmetry one
+stands for all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.assemble import result_of_evidence
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
     pose_and_border,
@@ -22,15 +21,25 @@ from cadalign.estimation.estimates import (
     poses_of,
     with_box,
 )
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats
+from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
-from cadalign.estimation.symmetry import carried, is_same, stretched_axes, without_free_turns
+from cadalign.estimation.symmetry import (
+    SAME_SQUARES,
+    carried,
+    is_same,
+    stretched_axes,
+    without_free_turns,
+)
 from cadalign.estimation.uncertainty.contradictions import warnings_of
-from cadalign.estimation.uncertainty.evidence import Basis, summaries_of
+from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
+from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.uncertainty.summary import EvidenceSummary
+from cadalign.estimation.uncertainty.weakness import another_pose, uncertainty_of, weaknesses
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -44,14 +53,13 @@ from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.marginal.moments import Likely, Moments, moments_of
 
 _Held = tuple[bool, bool, bool]
-
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
 
 
-class _Estimate(NamedTuple):
+class Estimate(NamedTuple):
     """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
 
-    Poses and covariances (9, 9) are those in every view.
+    Poses and covariances (9, 9) are those in every view; ``likelihood`` is relative to the best.
     """
 
     points: FloatArray
@@ -64,23 +72,133 @@ class _Estimate(NamedTuple):
     likelihood: float
     cameras: tuple[Camera, ...]
 
-    @property
-    def covariance(self) -> FloatArray:
-        """In the first view."""
-        return self.covariances[0]
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the stages of an estimate have found, of which `result_of` makes the result.
+
+    Parameters
+    ----------
+    model, prior, views
+        What was given.
+    estimates : sequence of Estimate
+        The likely ones, the best first.
+    inliers : sequence of (n_v,) bool
+        Of every view, by the best estimate.
+    is_curved : bool
+        The rotations' covariances lack `curvature_of_rotations`.
+    warnings, evidence, basis
+        As of `Stated`; warnings beside those about deviations and alternatives.
+    cost, stats, component, known_axis, stretched_axes, symmetry, rig_from_model, focal, focal_prior
+        As of `cadalign.Result`.
+    """
+
+    model: Model | ShapeModel
+    prior: ShapePrior
+    views: Sequence[View]
+    estimates: Sequence[Estimate]
+    inliers: Sequence[BoolArray]
+    is_curved: bool
+    warnings: tuple[str, ...]
+    evidence: tuple[EvidenceSummary, ...]
+    basis: AnyBasis
+    cost: float
+    stats: FitStats
+    component: int
+    known_axis: str | None = None
+    stretched_axes: str = ""
+    symmetry: Symmetry | None = None
+    rig_from_model: Alignment | None = None
+    focal: str = "known"
+    focal_prior: FocalPrior | None = None
 
 
-def result_of_minima(
+def result_of(found: Found) -> Result:
+    """The result of what was found.
+
+    Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
+    the likely ones are.
+    """
+    best, prior = found.estimates[0], found.prior
+    moments = [_moments(found.estimates, view) for view in range(len(found.views))]
+    covariances = [each.covariance for each in moments]
+    if found.is_curved:
+        for covariance in covariances:
+            covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
+    others = tuple(
+        Alternative(
+            each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
+        )
+        for each, far in zip(found.estimates, moments[0].distances, strict=True)
+        if far > SAME_SQUARES
+    )
+    pose, points = best.poses[0], best.points[:-2]
+    statistics = Stated(
+        covariances[0],
+        fisher_covariance=best.covariances[0],
+        points_covariance=moments[0].of_points[:-2],
+        points_cam_covariance=moments[0].of_seen[:-2],
+        warnings=(
+            *weaknesses(pose, uncertainty_of(covariances[0])),
+            *found.warnings,
+            *another_pose(
+                pose,
+                [each.alignment for each in others],
+                [each.relative_likelihood for each in others],
+            ),
+        ),
+        evidence=found.evidence,
+        degrees_of_freedom=prior.degrees_of_freedom,
+        basis=found.basis,
+    )
+    views = []
+    for number, view in enumerate(found.views):
+        rows, observed = prior.rows_of(view.keypoint_ids, "ids"), cast(FloatArray, view.points_2d)
+        camera, alignment = best.cameras[number], best.poses[number]
+        views.append(
+            ViewResult(
+                camera,
+                alignment,
+                view.keypoint_ids,
+                observed,
+                camera.project(alignment.apply(points[rows])) - observed,
+                found.inliers[number],
+                Stated(covariances[number]) if number else statistics,
+            )
+        )
+    has_length = prior.lengths > 0
+    return Result(
+        views=tuple(views),
+        ids=prior.ids,
+        points_3d=points,
+        method="align",
+        statistics=statistics,
+        known_axis=found.known_axis,
+        stretched_axes=found.stretched_axes,
+        focal=found.focal,
+        focal_prior=found.focal_prior,
+        cost=found.cost,
+        alternatives=others,
+        stats=found.stats,
+        symmetry=found.symmetry,
+        model=found.model,
+        component=found.component,
+        rig_from_model=found.rig_from_model,
+        own_bounds=best.points[-2:],
+        own_stretch=np.where(
+            has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
+        ),
+    )
+
+
+def found_in_minima(
     model: Model | ShapeModel,
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
     stats: FitStats,
-) -> Result:
-    """The result of minima, the likeliest first.
-
-    Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
-    the likely minima are, each with the shape's deviations widened by the inflation.
+) -> Found:
+    """The likely estimates of minima, the likeliest first, with widened deviations of the shape.
 
     Raises
     ------
@@ -91,134 +209,104 @@ def result_of_minima(
     if not minima:
         what = "the evidence does not determine pose and shape"
         raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
-    likelihoods = [float(np.exp((minima[0].score - each.score) / 2)) for each in minima]
+    minimum = minima[0]
     inflation = prior.inflation
     if all(view.mask is None for view in views):  # a contour tells as much as many keypoints
-        given = len(minima[0].evidence.sightings.point)
+        given = len(minimum.evidence.sightings.point)
         inflation = inflation_with(given, inflation, prior.few_keypoints)
-    likely = [
-        _estimate(_widened(each, inflation), likelihood, prior)
-        for each, likelihood in zip(minima, likelihoods, strict=True)
-        if likelihood >= LEAST_LIKELIHOOD
-    ]
-    minimum = minima[0]
-    symmetry = model.symmetry if isinstance(model, Model) else None
+    likely = []
+    for each in minima:
+        likelihood = float(np.exp((minimum.score - each.score) / 2))
+        if likelihood >= LEAST_LIKELIHOOD:
+            evidence, state = widened(each.evidence, each.state, inflation)
+            wide = each._replace(evidence=evidence, state=state)
+            likely.append(_estimate(wide, likelihood, prior))
+    symmetry, known_axis = getattr(model, "symmetry", None), getattr(model, "known_axis", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
     likely = _one_of_equals(likely, symmetry, held)
-    best = likely[0]
-    moments = _moments(likely)
-    covariances = [moments.covariance]
-    covariances += [_moments(likely, view).covariance for view in range(1, len(best.poses))]
-    if symmetry is None and not is_exact(minimum.evidence):
-        for covariance in covariances:
-            covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    known_axis = getattr(model, "known_axis", None)
-    return result_of_evidence(
+    return Found(
         model,
         prior,
         views,
-        [
-            Alternative(
-                each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
-            )
-            for each in likely
-        ],
-        moments,
-        poses=best.poses,
-        cameras=best.cameras,
-        inliers=_inliers(prior, views, minimum),
-        covariances=covariances,
-        lengths=best.lengths,
-        statements={
-            "fisher_covariance": best.covariance,
-            "warnings": warnings_of(
-                minimum.evidence, minimum.state, minimum.cost, best.poses[0], moments.covariance
-            ),
-            "evidence": summaries_of(minimum.evidence, minimum.state, best.cameras),
-            "basis": Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
-        },
-        known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
-        stretched_axes=stretched_axes(held),
+        likely,
+        _inliers(prior, views, minimum),
+        is_curved=symmetry is None and not is_exact(minimum.evidence),
+        warnings=warnings_of(minimum.evidence, minimum.state, minimum.cost),
+        evidence=summaries_of(minimum.evidence, minimum.state, likely[0].cameras),
+        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,
         stats=stats,
-        symmetry=symmetry,
         component=minimum.component,
-        rig_from_model=_in_rig(views, minimum, best),
+        known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
+        stretched_axes=stretched_axes(held),
+        symmetry=symmetry,
+        rig_from_model=_in_rig(views, minimum, likely[0]),
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=minimum.lenses.prior,
     )
 
 
-def _widened(minimum: Minimum, factor: float) -> Minimum:
-    """The same points under a prior of wider deviations."""
-    evidence, state = widened(minimum.evidence, minimum.state, factor)
-    return minimum._replace(evidence=evidence, state=state)
-
-
-def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> _Estimate:
-    keypoints = len(prior.ids)
+def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
+    """The estimate of a minimum."""
+    keypoints, evidence, state = len(prior.ids), minimum.evidence, minimum.state
     if prior.box_margins is not None:
-        evidence, state = with_box(minimum.evidence, minimum.state, keypoints, prior.box_margins)
-        minimum = minimum._replace(evidence=evidence, state=state)
-    scale = np.exp(minimum.state.log_scales)
+        evidence, state = with_box(evidence, state, keypoints, prior.box_margins)
+    scale = np.exp(state.log_scales)
     rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
-    stretched = points_of(minimum.evidence.shape, minimum.state)[rows]
-    sighted = np.unique(minimum.evidence.sightings.point)
-    seen = stretched[sighted[sighted < keypoints]]
-    if len(minimum.evidence.shape.modes):  # a box whose corners were estimated holds what is seen
+    stretched = points_of(evidence.shape, state)[rows]
+    if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
+        sighted = np.unique(evidence.sightings.point)
+        seen = stretched[sighted[sighted < keypoints]]
         stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
         stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
-    found = joint_covariance(minimum.evidence, minimum.state)
-    return _Estimate(
+    found = joint_covariance(evidence, state)
+    return Estimate(
         stretched / scale,
         scale,
-        tuple(poses_of(minimum.evidence, minimum.state)),
+        tuple(poses_of(evidence, state)),
         stretched[-1] - stretched[-2],
         tuple(
-            pose_and_lengths(
-                minimum.evidence, minimum.state, pose_and_border(found, int(pose)), view
-            )
-            for view, pose in enumerate(minimum.evidence.rig.pose)
+            pose_and_lengths(evidence, state, pose_and_border(found, int(pose)), view)
+            for view, pose in enumerate(evidence.rig.pose)
         ),
         found.points[rows],
         found.seen[rows],
         likelihood,
-        tuple(minimum.lenses.cameras_at(minimum.state.log_focals)),
+        tuple(minimum.lenses.cameras_at(state.log_focals)),
     )
 
 
-def _in_rig(views: Sequence[View], minimum: Minimum, best: _Estimate) -> Alignment | None:
+def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
     """The alignment in the frame that the views share."""
     if views[0].cam_from_rig is None:
         return None
-    camera = minimum.evidence.rig.cam_from_rig[0]
+    camera, pose = minimum.evidence.rig.cam_from_rig[0], best.poses[0]
     rotation, shift = camera[:9].reshape(3, 3), camera[9:]
-    pose = best.poses[0]
     turned = nearest_rotation(rotation.T @ pose.rotation)
     return Alignment(turned, rotation.T @ (pose.translation - shift), best.scale)
 
 
-def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> tuple[BoolArray, ...]:
+def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> list[BoolArray]:
     """The inliers of every view, in its own order of keypoints."""
     names = np.concatenate([prior.rows_of(view.keypoint_ids, "ids") for view in views])
     kept = np.empty(len(names), dtype=bool)
     kept[np.argsort(names, kind="stable")] = minimum.inliers
     ends = np.cumsum([len(view.keypoint_ids) for view in views])
-    return tuple(np.split(kept, ends[:-1]))
+    return np.split(kept, ends[:-1])
 
 
-def _moments(estimates: Sequence[_Estimate], view: int = 0) -> Moments:
+def _moments(estimates: Sequence[Estimate], view: int) -> Moments:
     """Second moments of estimates about the first, in a view's camera; of points in the first."""
-    poses = [
-        np.concatenate([each.poses[view].rotation.ravel(), each.poses[view].translation])
-        for each in estimates
-    ]
+    poses = [each.poses[view] for each in estimates]
+    with_focal = [[each.cameras[view].fx][: len(each.covariances[view]) - 9] for each in estimates]
     return moments_of(
         Likely(
-            np.array(poses),
+            np.array([np.append(each.rotation.ravel(), each.translation) for each in poses]),
             np.array([each.points * each.scale for each in estimates]),
-            np.array([_lengths_and_focal(each, view) for each in estimates]),
+            np.array(
+                [[*each.lengths, *focal] for each, focal in zip(estimates, with_focal, strict=True)]
+            ),
             np.array([each.covariances[view] for each in estimates]),
             np.array([each.of_points for each in estimates]),
             np.array([each.of_seen for each in estimates]),
@@ -227,56 +315,44 @@ def _moments(estimates: Sequence[_Estimate], view: int = 0) -> Moments:
     )
 
 
-def _lengths_and_focal(estimate: _Estimate, view: int) -> FloatArray:
-    """Lengths (3,) of the box and, where its covariance has it, the focal length of a view."""
-    focal = [estimate.cameras[view].fx]
-    return np.append(estimate.lengths, focal[: len(estimate.covariances[view]) - 9])
-
-
 def _one_of_equals(
-    likely: Sequence[_Estimate], symmetry: Symmetry | None, held: _Held
-) -> list[_Estimate]:
+    likely: Sequence[Estimate], symmetry: Symmetry | None, held: _Held
+) -> Sequence[Estimate]:
     """Estimates in their canonical form, without those that are equal to the first.
 
     ``held`` are the axes whose scale is.
     """
     if symmetry is None or group_of(symmetry).is_trivial:
-        return list(likely)
+        return likely
     group = group_of(symmetry)
-    found = [_canonical(each, symmetry, held) for each in likely]
-    best = found[0]
-    return [best] + [
-        each
-        for each in found[1:]
-        if not is_same(group, best.poses[0], each.poses[0], best.covariance)
+    best, *others = (_canonical(each, symmetry, held) for each in likely)
+    covariance = best.covariances[0]
+    return [
+        best,
+        *(each for each in others if not is_same(group, best.poses[0], each.poses[0], covariance)),
     ]
 
 
-def _canonical(estimate: _Estimate, symmetry: Symmetry, held: _Held) -> _Estimate:
+def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
     """The canonical one of all equal estimates, without deviations that mean nothing."""
     best = group_of(symmetry).canonical(estimate.poses[0], held=held)
-    turn = best.motion[:3, :3]
-    poses = (best.alignment, *(_turned(pose, best) for pose in estimate.poses[1:]))
-    covariances = []
-    for given, pose, covariance in zip(estimate.poses, poses, estimate.covariances, strict=True):
-        equal = replace(best, alignment=pose)
+    turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
+    poses, covariances = [], []
+    for given, covariance in zip(estimate.poses, estimate.covariances, strict=True):
+        pose = Alignment(given.rotation @ turn, given.translation + given.linear @ shift, scale)
+        equal = replace(best, alignment=pose if poses else best.alignment)
+        poses.append(equal.alignment)
         covariances.append(without_free_turns(carried(covariance, given, equal), equal))
     points = best.relabelled(estimate.points)
     points[-2:] = _turned_box(estimate.points[-2:], best)
     return estimate._replace(
         points=points,
-        scale=best.alignment.scale,
-        poses=poses,
-        lengths=(points[-1] - points[-2]) * best.alignment.scale,
+        scale=scale,
+        poses=tuple(poses),
+        lengths=(points[-1] - points[-2]) * scale,
         covariances=tuple(covariances),
         of_points=turn.T @ estimate.of_points @ turn,
     )
-
-
-def _turned(pose: Alignment, best: Equal) -> Alignment:
-    """An alignment in another view after the symmetry's motion."""
-    shift = pose.translation + pose.linear @ best.motion[:3, 3]
-    return Alignment(pose.rotation @ best.motion[:3, :3], shift, best.alignment.scale)
 
 
 def _turned_box(corners: FloatArray, best: Equal) -> FloatArray:

@@ -14,26 +14,26 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.assemble import canonical_result, result_of_evidence
-from cadalign.estimation.estimates import curvature_of_rotations, with_boxes
+from cadalign.estimation.assemble import canonical_result
+from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
+from cadalign.estimation.joint import Estimate, Found, result_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats
+from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.weakness import misfits, uncertainty_of, weaknesses
+from cadalign.estimation.uncertainty.weakness import misfits
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.marginal.equations import POSE, POSE_UNKNOWNS, force_of
-from cadalign.solvers.marginal.moments import moments_of
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture, Seen
 from cadalign.solvers.marginal.search import search_view
@@ -117,50 +117,37 @@ def align_single(
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
-    boxed = mixture, minima
+    placed = mixture, minima
     if model.box_margins is not None:
-        boxed = with_boxes(mixture, seen, minima, len(likelihoods), model.box_margins)
+        placed = with_boxes(mixture, seen, minima, len(likelihoods), model.box_margins)
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
-    likely = posteriors_of(boxed[0], seen, boxed[1], likelihoods, inflation)
-    moments = moments_of(likely)
-    if covariances.any():
-        turns = moments.covariance[:3, :3]
-        turns += curvature_of_rotations(turns)
-    alignment = _alignment(likely.poses[0])
-    in_camera = alignment.apply(likely.points[0][rows])
-    warnings = weaknesses(alignment, uncertainty_of(moments.covariance))
-    if seen.loss == LINEAR:
-        warnings += misfits(float(minima.costs[0]), 2 * len(rows) - POSE_UNKNOWNS)
+    likely = posteriors_of(placed[0], seen, placed[1], likelihoods, inflation)
+    estimates = [
+        Estimate(
+            points, np.ones(3), (_alignment(pose),), lengths, (covariance,), *rest, (view.camera,)
+        )
+        for pose, points, lengths, covariance, *rest in zip(*likely, strict=True)
+    ]
+    in_camera = estimates[0].poses[0].apply(likely.points[0][rows])
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
-    component = int(minima.label[0])
+    component, cost = int(minima.label[0]), float(minima.costs[0])
     pose, force = minima.states[0, :POSE].copy(), force_of(minima.states[0])
-    return result_of_evidence(
-        model,
-        prior,
-        [view],
-        [
-            Alternative(_alignment(pose), float(likelihood), view.camera, points[:-2], points[-2:])
-            for pose, likelihood, points in zip(
-                likely.poses, likelihoods, likely.points, strict=True
-            )
-        ],
-        moments,
-        poses=[alignment],
-        cameras=[view.camera],
-        inliers=[np.ones(len(rows), dtype=bool)],
-        covariances=[moments.covariance],
-        lengths=likely.lengths[0],
-        statements={
-            "fisher_covariance": likely.covariances[0],
-            "warnings": warnings,
-            "evidence": (summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
-            "basis": SingleBasis(model, view, options, component, pose, force),
-        },
-        known_axis=None,
-        stretched_axes="",
-        cost=float(minima.costs[0]),
-        stats=stats,
-        component=component,
+    is_linear = seen.loss == LINEAR
+    return result_of(
+        Found(
+            model,
+            prior,
+            [view],
+            estimates,
+            [np.ones(len(rows), dtype=bool)],
+            is_curved=bool(covariances.any()),
+            warnings=misfits(cost, 2 * len(rows) - POSE_UNKNOWNS) if is_linear else (),
+            evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
+            basis=SingleBasis(model, view, options, component, pose, force),
+            cost=cost,
+            stats=stats,
+            component=component,
+        )
     )
 
 

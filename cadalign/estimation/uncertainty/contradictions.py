@@ -27,8 +27,7 @@ from cadalign.estimation.uncertainty.evidence import (
     without,
 )
 from cadalign.estimation.uncertainty.summary import name_of
-from cadalign.estimation.uncertainty.weakness import misfits, uncertainty_of, weaknesses
-from cadalign.geometry.alignment import Alignment
+from cadalign.estimation.uncertainty.weakness import misfits
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, packed
 from cadalign.solvers.joint.reduction import reduced
@@ -225,18 +224,10 @@ def _rank(hessian: FloatArray) -> int:
     return int((values > _LEAST_INFORMATION * len(values)).sum())
 
 
-def warnings_of(
-    evidence: Evidence,
-    state: State,
-    cost: float,
-    pose: Alignment,
-    covariance: FloatArray,
-) -> tuple[str, ...]:
-    """Warnings about rotation, lengths and distance, and about residuals beyond their sigma."""
-    warnings = [*weaknesses(pose, uncertainty_of(covariance))]
+def warnings_of(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
+    """Warnings about evidence that contradicts the rest, and residuals beyond their sigma."""
     contradicting = contradictions(evidence, state, cost)
-    warnings.extend(_wrong_units(evidence, state, contradicting))
-    warnings.extend(contradicting)
+    warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
     if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
         redundancy = count_equations(evidence) - len(evidence.shape.modes)
         redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())

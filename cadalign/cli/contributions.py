@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.estimation.uncertainty.summary import Contribution
-from cadalign.estimation.uncertainty.weakness import Uncertainty
+from cadalign.estimation.uncertainty.summary import Contribution, Uncertainty
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result

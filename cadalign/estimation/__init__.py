@@ -32,8 +32,8 @@ if TYPE_CHECKING:
         EvidenceSummary,
         MaskResiduals,
         Misfit,
+        Uncertainty,
     )
-    from cadalign.estimation.uncertainty.weakness import Uncertainty
     from cadalign.estimation.view import View
     from cadalign.io.evidence import Size
 

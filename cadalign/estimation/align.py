@@ -14,15 +14,18 @@ from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.joint import found_in_minima, result_of
-from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.model import Model
-from cadalign.estimation.noise import find_minima_and_noise, widened_by_noise
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prior import prior_of
+from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import JointProblem, find_minima
+from cadalign.estimation.search import (
+    JointProblem,
+    find_minima,
+    find_minima_and_noise,
+    widened_by_noise,
+)
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (

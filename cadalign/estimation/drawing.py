@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from cadalign.estimation.result_data import ResultData
-    from cadalign.estimation.uncertainty.weakness import Uncertainty
+    from cadalign.estimation.uncertainty.summary import Uncertainty
 
 Photo = npt.ArrayLike | str | os.PathLike[str]
 

@@ -38,8 +38,12 @@ from cadalign.estimation.symmetry import (
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
 from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.summary import EvidenceSummary
-from cadalign.estimation.uncertainty.weakness import another_pose, uncertainty_of, weaknesses
+from cadalign.estimation.uncertainty.summary import (
+    EvidenceSummary,
+    another_pose,
+    uncertainty_of,
+    weaknesses,
+)
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -214,13 +218,13 @@ def found_in_minima(
     if all(view.mask is None for view in views):  # a contour tells as much as many keypoints
         given = len(minimum.evidence.sightings.point)
         inflation = inflation_with(given, inflation, prior.few_keypoints)
-    likely = []
+    likely: Sequence[Estimate] = ()
     for each in minima:
         likelihood = float(np.exp((minimum.score - each.score) / 2))
         if likelihood >= LEAST_LIKELIHOOD:
             evidence, state = widened(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
-            likely.append(_estimate(wide, likelihood, prior))
+            likely = [*likely, _estimate(wide, likelihood, prior)]
     symmetry, known_axis = getattr(model, "symmetry", None), getattr(model, "known_axis", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
@@ -337,7 +341,8 @@ def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
     """The canonical one of all equal estimates, without deviations that mean nothing."""
     best = group_of(symmetry).canonical(estimate.poses[0], held=held)
     turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
-    poses, covariances = [], []
+    poses: list[Alignment] = []
+    covariances = []
     for given, covariance in zip(estimate.poses, estimate.covariances, strict=True):
         pose = Alignment(given.rotation @ turn, given.translation + given.linear @ shift, scale)
         equal = replace(best, alignment=pose if poses else best.alignment)

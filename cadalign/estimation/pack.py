@@ -12,9 +12,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.evidence_kinds import is_told, known_of
-from cadalign.estimation.lenses import Lenses
 from cadalign.estimation.options import LOSSES, FitOptions
-from cadalign.estimation.prior import ShapePrior, prior_of, rows_among, scale_priors
+from cadalign.estimation.prior import Lenses, ShapePrior, prior_of, rows_among, scale_priors
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera

@@ -1,7 +1,8 @@
-"""Prior knowledge of an object's shape and scales, in the form that the kernels take."""
+"""Prior knowledge of an object's shape and scales and of focal lengths, as the kernels take it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -10,15 +11,21 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
+from cadalign.estimation.focal import FocalPrior, focal_grid, log_focal_range
 from cadalign.estimation.model import Model
+from cadalign.estimation.view import View
+from cadalign.geometry.camera import Camera
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.evidence import Evidence, ScalePriors, Shape, State
+from cadalign.solvers.joint.evidence import Evidence, Focals, ScalePriors, Shape, State
 
 _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
+_Y = np.array([0.0, 1.0, 0.0])
+_SETTLED = 1e-8  # change of a log focal length
+ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +129,6 @@ def _of_category(model: ShapeModel) -> ShapePrior:
     )
 
 
-_Y = np.array([0.0, 1.0, 0.0])
-
-
 def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
     """Free the size where it is told; what was held to x is then held to the common scale."""
     if not metric:
@@ -156,3 +160,79 @@ def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, 
 def is_exact(evidence: Evidence) -> bool:
     """True if the shape is known but for its scales."""
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """Cameras of views (V,), with focal lengths that are to be estimated.
+
+    Parameters
+    ----------
+    cameras : tuple of Camera
+        The reference of each view: the estimate is a multiple of its focal length.
+    groups : tuple of int
+        Numbers the focal length of each view; -1 where it is known.
+    prior : FocalPrior, optional
+    """
+
+    cameras: tuple[Camera, ...]
+    groups: tuple[int, ...]
+    prior: FocalPrior | None = None
+
+    @classmethod
+    def of(cls, views: Sequence[View], focal: str, prior: FocalPrior | None) -> Lenses:
+        """The cameras of views, their focal lengths known or to be estimated."""
+        cameras = tuple(view.camera for view in views)
+        if focal == "known":
+            for camera in cameras:
+                camera.require_focal()
+            return cls(cameras, (-1,) * len(cameras))
+        distinct = list(dict.fromkeys(cameras))
+        reference = []
+        for camera in cameras:
+            grid = focal_grid(camera, prior)
+            known = prior.focal if prior is not None else float(grid[len(grid) // 2])
+            reference.append(camera.with_focal(known))
+        return cls(tuple(reference), tuple(distinct.index(camera) for camera in cameras), prior)
+
+    @property
+    def count(self) -> int:
+        """Number of unknown focal lengths."""
+        return max(self.groups, default=-1) + 1
+
+    @property
+    def have_distortion(self) -> bool:
+        """True if an unknown lens has distortion."""
+        return any(
+            camera.distortion and group >= 0
+            for camera, group in zip(self.cameras, self.groups, strict=True)
+        )
+
+    def focals(self) -> Focals:
+        """Bounds and priors in the form of the kernels."""
+        firsts = [self.cameras[self.groups.index(group)] for group in range(self.count)]
+        ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in firsts]
+        columns = np.ascontiguousarray(np.array(ranges).reshape(-1, 4).T)
+        return Focals(np.array(self.groups, dtype=np.int64), *columns)
+
+    def at(self, log_focals: FloatArray) -> Lenses:
+        """The lenses, their references moved to exp(log_focals) (F,) times their focals."""
+        return Lenses(tuple(self.cameras_at(log_focals)), self.groups, self.prior)
+
+    def cameras_at(self, log_focals: FloatArray) -> list[Camera]:
+        """The cameras of all views at focal lengths (F,), logarithms relative to the references."""
+        return [
+            camera if group < 0 else camera.with_focal(camera.fx * math.exp(log_focals[group]))
+            for camera, group in zip(self.cameras, self.groups, strict=True)
+        ]
+
+    def grid(self) -> list[FloatArray]:
+        """Focal lengths to start from: (F,) logarithms relative to the references, each."""
+        firsts = [self.cameras[self.groups.index(group)] for group in range(self.count)]
+        grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in firsts]
+        return list(np.array(grids).T) if grids else [np.zeros(0)]
+
+    @staticmethod
+    def is_settled(log_focals: FloatArray) -> bool:
+        """True if the references are where the estimate is."""
+        return bool(np.abs(log_focals).max(initial=0.0) < _SETTLED)

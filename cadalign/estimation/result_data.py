@@ -24,7 +24,7 @@ from cadalign.estimation.result_parts import (
 )
 from cadalign.estimation.symmetry import equal_text, held_axes
 from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
-from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of
+from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -32,11 +32,7 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.uncertainty.summary import (
-        EvidenceSummary,
-        MaskResiduals,
-        Misfit,
-    )
+    from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import NearestShape

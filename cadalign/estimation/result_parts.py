@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.uncertainty.stated import Statistics
-from cadalign.estimation.uncertainty.weakness import Uncertainty, uncertainty_of
+from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

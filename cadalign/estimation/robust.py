@@ -11,11 +11,10 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.assemble import result_of_keypoints
 from cadalign.estimation.consensus import Support, area_of, check_support, order_of_confidence
-from cadalign.estimation.degeneracy import are_in_one_plane
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.focal_search import focal_views
 from cadalign.estimation.options import MINIMAL_SOLVERS, FitOptions, RansacOptions
-from cadalign.estimation.problems import Problems, rays_of, whitening_of
+from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.geometry.alignment import Alignment

@@ -27,7 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.weakness import misfits
+from cadalign.estimation.uncertainty.summary import misfits
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
@@ -124,9 +124,17 @@ def align_single(
     likely = posteriors_of(placed[0], seen, placed[1], likelihoods, inflation)
     estimates = [
         Estimate(
-            points, np.ones(3), (_alignment(pose),), lengths, (covariance,), *rest, (view.camera,)
+            likely.points[k],
+            np.ones(3),
+            (_alignment(likely.poses[k]),),
+            likely.lengths[k],
+            (likely.covariances[k],),
+            likely.of_points[k],
+            likely.of_seen[k],
+            likelihood,
+            (view.camera,),
         )
-        for pose, points, lengths, covariance, *rest in zip(*likely, strict=True)
+        for k, likelihood in enumerate(likelihoods.tolist())
     ]
     in_camera = estimates[0].poses[0].apply(likely.points[0][rows])
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays

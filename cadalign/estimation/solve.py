@@ -11,14 +11,15 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError
-from cadalign.estimation.degeneracy import no_redundancy_error, solver_error
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import (
     Problems,
     Solutions,
     check_sigmas,
     full_covariance,
+    no_redundancy_error,
     rays_of,
+    solver_error,
     whitening_of,
 )
 from cadalign.geometry.alignment import Alignment

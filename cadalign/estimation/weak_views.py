@@ -12,10 +12,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.estimation.degeneracy import are_on_a_line
 from cadalign.estimation.evidence_kinds import is_told
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.problems import are_on_a_line
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import ViewResult
 from cadalign.estimation.uncertainty.stated import Stated

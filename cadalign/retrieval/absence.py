@@ -32,7 +32,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.problems import whitening_of
-from cadalign.estimation.uncertainty.likelihood import bent
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions

@@ -15,7 +15,7 @@ from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
-from cadalign.estimation.uncertainty.likelihood import bent
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all
 from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids

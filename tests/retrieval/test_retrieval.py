@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.uncertainty.likelihood import bent
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation

@@ -16,8 +16,7 @@ from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.estimation.evidence_kinds import SIZE, kind_names
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import has_scale_prior
-from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
-from cadalign.estimation.uncertainty.weakness import Uncertainty
+from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary, Uncertainty
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import (

@@ -19,9 +19,8 @@ from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
-from cadalign.estimation.uncertainty.likelihood import FittedKeypoints, Likelihood
-from cadalign.estimation.uncertainty.summary import Misfit
-from cadalign.estimation.uncertainty.weakness import WEAK_SCALE, percent, uncertainty_of
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.summary import WEAK_SCALE, Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective

@@ -16,9 +16,13 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
 from cadalign.estimation.symmetry import held_axes, without_free_turns
-from cadalign.estimation.uncertainty.likelihood import FittedKeypoints
-from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
-from cadalign.estimation.uncertainty.weakness import uncertainty_of, weaknesses_of_keypoints
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints
+from cadalign.estimation.uncertainty.summary import (
+    EvidenceSummary,
+    Misfit,
+    uncertainty_of,
+    weaknesses_of_keypoints,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry_group import group_of
 

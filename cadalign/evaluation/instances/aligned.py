@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.uncertainty.weakness import Uncertainty
+from cadalign.estimation.uncertainty.summary import Uncertainty
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.instance import Instance
 from cadalign.geometry.alignment import Alignment

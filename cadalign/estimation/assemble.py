@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
@@ -77,36 +77,6 @@ def result_of_keypoints(
         "options": options,
     }
     return quickly(Result, of_result)
-
-
-def with_keypoints(
-    result: Result,
-    problems: Problems,
-    options: FitOptions,
-    residuals: FloatArray,
-    inliers: BoolArray,
-    stats: FitStats,
-) -> Result:
-    """A result of some of the only problem's keypoints as that of all, with their inliers."""
-    points = problems.points_3d.copy()
-    fitted = {
-        "points_3d": points,
-        "residuals": residuals,
-        "inliers": inliers,
-        "alignment": result.alignment,
-        "camera": result.camera,
-        "options": options,
-        "sigma": result.sigma,
-        "fisher_covariance": result.fisher_covariance,
-    }
-    return result_of_keypoints(
-        problems.points_2d,
-        fitted,
-        method=f"ransac-{result.method}",
-        stats=stats,
-        cost=result.cost,
-        alternatives=tuple(replace(each, points_3d=points) for each in result.alternatives),
-    )
 
 
 def _alternatives(

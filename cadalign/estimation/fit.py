@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats, worker_count
+from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.assemble import canonical_result, result_of_solution, with_keypoints
+from cadalign.estimation.assemble import canonical_result, result_of_solution
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
-from cadalign.estimation.problems import Problems, check_sigmas, each_of, pack_many, pack_one
+from cadalign.estimation.problems import Problems, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
 from cadalign.estimation.symmetry import checked_symmetry
@@ -27,8 +27,6 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.results import Results
-
-_INLIER_ROUNDS = 5
 
 
 @np.errstate(all="ignore")  # what is not finite is refused
@@ -145,11 +143,7 @@ def fit(
     _check_ransac(ransac, confidences)
     if symmetry is not None:
         checked_symmetry(symmetry)
-    if ransac is None:
-        result = _fit_all(problems, options, start)
-    else:
-        result = _fit_robustly(problems, options, ransac, confidences, start)
-    return result if symmetry is None else canonical_result(result, symmetry)
+    return _fit_one(problems, options, ransac, confidences, symmetry, start)
 
 
 @np.errstate(all="ignore")
@@ -298,79 +292,33 @@ def _fits(
     for b in range(len(problems)):
         own = options if sigmas is None else replace(options, sigma=sigmas[b])
         trusted = None if confidences is None else confidences[b]
-        start = time.perf_counter()
-        one = problems.part(b, b + 1)
+        start, one = time.perf_counter(), problems.part(b, b + 1)
         try:
-            if ransac is None:
-                result = _fit_all(one, own, start)
-            else:
-                result = _fit_robustly(one, own, ransac, trusted, start)
-            fits.append(result if symmetry is None else canonical_result(result, symmetry))
+            fits.append(_fit_one(one, own, ransac, trusted, symmetry, start))
         except CadalignError as error:
             fits.append(error)
     return fits
 
 
-def _fit_robustly(
+def _fit_one(
     problems: Problems,
     options: FitOptions,
-    ransac: RansacOptions,
+    ransac: RansacOptions | None,
     confidences: npt.ArrayLike | None,
+    symmetry: Symmetry | None,
     start: float,
 ) -> Result:
-    """Fit the only problem to the keypoints that support its best alignment."""
-    # Only here: most programs never search for outliers, and its kernels take time to import.
-    from cadalign.estimation.robust import find_consensus, residuals_of
+    """Fit the only problem, which was begun at ``start`` [s]."""
+    if ransac is None:
+        solutions = solve_one(problems, options)
+        result = result_of_solution(problems, solutions, options, time.perf_counter() - start)
+    else:
+        # Only here: most programs never search for outliers, and its kernels take time to import.
+        from cadalign.estimation.robust import fit_robustly
 
-    if options.method != "optimal":
-        raise InputError(
-            f"the method {options.method!r} does not go with ransac",
-            where="method",
-            fix="leave it at 'optimal'; RansacOptions(minimal=...) names the minimal solver",
-        )
-    check_sigmas([options.sigma], problems.counts)
-    consensus = find_consensus(problems, options, ransac, confidences)
-    if not ransac.refine:
-        return replace(
-            consensus, stats=replace(consensus.stats, seconds=time.perf_counter() - start)
-        )
-    inliers = consensus.inliers
-    result = _fit_inliers(problems, options, inliers, start)
-    for _ in range(_INLIER_ROUNDS):
-        residuals = residuals_of(problems, result.alignment, result.camera)
-        kept = np.linalg.norm(residuals, axis=1) < ransac.max_reproj_error
-        if (kept == inliers).all() or kept.sum() < inliers.sum():
-            break
-        inliers = kept
-        result = _fit_inliers(problems, options, inliers, start)
-    residuals = residuals_of(problems, result.alignment, result.camera)
-    seconds, ratio = time.perf_counter() - start, float(inliers.mean())
-    stats = replace(consensus.stats, seconds=seconds, inlier_ratio=ratio)
-    return with_keypoints(result, problems, options, residuals, inliers, stats)
-
-
-def _fit_inliers(
-    problems: Problems, options: FitOptions, inliers: BoolArray, start: float
-) -> Result:
-    """The optimum for some of the only problem's keypoints."""
-    sigma = options.sigma
-    if sigma is not None and np.ndim(sigma) > 0:
-        shape = (len(inliers),) if np.ndim(sigma) == 1 else (len(inliers), 2, 2)
-        sigma = as_floats(sigma, name="sigma", shape=shape)[inliers]
-    some = Problems(
-        problems.points_3d[inliers],
-        problems.points_2d[inliers],
-        np.array([0, int(inliers.sum())]),
-        problems.cameras,
-    )
-    return _fit_all(some, replace(options, sigma=sigma), start)
+        result = fit_robustly(problems, options, ransac, confidences, start)
+    return result if symmetry is None else canonical_result(result, symmetry)
 
 
 # Checking options takes as long as solving a small problem linearly, and calls repeat them.
 _checked_options = lru_cache(maxsize=64, typed=True)(FitOptions)
-
-
-def _fit_all(problems: Problems, options: FitOptions, start: float) -> Result:
-    """Fit the only problem to all its keypoints."""
-    solutions = solve_one(problems, options)
-    return result_of_solution(problems, solutions, options, time.perf_counter() - start)

@@ -9,7 +9,6 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.consensus import Support, area_of, check_support
 from cadalign.estimation.joint_robust import (
     Consensus,
     robust_minima,
@@ -21,6 +20,7 @@ from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
+from cadalign.estimation.robust import Support, area_of, check_support
 from cadalign.estimation.starts import Start, Starts, starts_of
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,18 +29,17 @@ from cadalign.solvers.constants import (
     UNKNOWNS,
 )
 from cadalign.solvers.covariance import focal_covariance
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views, relative_to
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
 from cadalign.solvers.focal import FocalObjective, linear_focal, refine_focal
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
-from cadalign.solvers.unknowns import has_collapsed, orthonormalize, uncenter
+from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
+from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _MOST_STARTS = 8
 _COARSE_POINTS = 256  # that many tell the minima apart; all points then refine them
 _MOST_LIKELY = 3  # coarse minima that all points refine
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths
-_SAME_CHORD = 1e-3
-_SAME_FOCAL = 0.01
 _LENS_ROUNDS = 12
 _LENS_TOLERANCE = 1e-10
 _STEPS = 1000
@@ -57,13 +57,19 @@ class _Task:
     options: FitOptions
     noise: float
 
-    def objective(self, focal: float) -> Objective:
-        view = focal_view(self.points_2d, self.camera, focal, self.sigma)
-        loss_scale = self.options.loss_scale * self.noise
-        return Objective(
-            self.options.free,
-            Keypoints(self.points, *view, LOSSES[self.options.loss], loss_scale),
-            ScalePrior(self.options.prior_weight * self.noise**2),
+    def system(self, focal: float) -> FocalObjective:
+        """The system of 9 unknowns with a focal length [px] as its reference."""
+        rays, whitening = focal_view(self.points_2d, self.camera, focal, self.sigma)
+        loss, bend = LOSSES[self.options.loss], self.options.loss_scale * self.noise
+        prior = LogFocalPrior(*log_focal_range(self.camera, self.options.focal_prior, focal))
+        return FocalObjective(
+            Objective(
+                self.options.free,
+                Keypoints(self.points, rays, whitening, loss, bend),
+                ScalePrior(self.options.prior_weight * self.noise**2),
+            ),
+            focal_slopes(self.points_2d, self.camera.with_focal(focal), rays),
+            prior._replace(weight=prior.weight * self.noise**2),
         )
 
     def thinned(self, most: int) -> _Task:
@@ -75,25 +81,18 @@ class _Task:
         sigma = self.sigma
         if sigma is not None and np.ndim(sigma) > 0:
             sigma = np.asarray(sigma, dtype=np.float64)[chosen]
-        return replace(
-            self,
-            points=np.ascontiguousarray(self.points[chosen]),
-            points_2d=np.ascontiguousarray(self.points_2d[chosen]),
-            sigma=sigma,
-        )
-
-    @property
-    def prior(self) -> LogFocalPrior:
-        """Bounds and prior of the log focal length."""
-        prior = LogFocalPrior(*log_focal_range(self.camera, self.options.focal_prior))
-        return prior._replace(weight=prior.weight * self.noise**2)
+        points, pixels = self.points[chosen], self.points_2d[chosen]
+        return replace(self, points=points, points_2d=pixels, sigma=sigma)
 
 
-@dataclass(frozen=True, eq=False)
-class _Minimum:
-    pose: FloatArray
-    focal: float
-    cost: float
+class _Minima(NamedTuple):
+    """Minima, the best first: poses (k, 15), focal lengths (k,) [px], costs (k,); the effort."""
+
+    poses: FloatArray
+    focals: FloatArray
+    costs: FloatArray
+    iterations: int
+    hypotheses: int
 
 
 def search_focal(
@@ -126,18 +125,20 @@ def search_focal(
             statuses[b] = TOO_FEW
             continue
         try:
-            minima, iterations, hypotheses = _minima(task)
-            undetermined, covariances[b] = _covariance(task, minima[0]) if minima else (-1, 0.0)
+            minima, undetermined = _minima(task), -1
+            found = len(minima.poses)
+            if found:
+                system = task.system(float(minima.focals[0]))
+                undetermined = focal_covariance(system, minima.poses[0], covariances[b])
         except InputError as error:  # the lens model cannot be undone
             errors[b] = error
             continue
         except np.linalg.LinAlgError:
             statuses[b] = OUT_OF_RANGE
             continue
-        for k, minimum in enumerate(minima[:MAX_MINIMA]):
-            poses[b, k], costs[b, k], focals[b, k] = minimum.pose, minimum.cost, minimum.focal
-        info[b] = len(minima), iterations, hypotheses, undetermined
-        if not minima:
+        poses[b, :found], focals[b, :found], costs[b, :found] = minima[:3]
+        info[b] = found, minima.iterations, minima.hypotheses, undetermined
+        if not found:
             statuses[b] = NOT_FOUND
         elif undetermined >= 0:
             statuses[b] = DEGENERATE
@@ -146,63 +147,68 @@ def search_focal(
     return Solutions(poses, costs, covariances, statuses, info, focals=focals, errors=errors)
 
 
-def _minima(task: _Task) -> tuple[list[_Minimum], int, int]:
-    """All minima that the search finds, the best first; with iterations and hypotheses."""
+def _minima(task: _Task) -> _Minima:
+    """The minima of one problem."""
     center = task.points.mean(axis=0)
     unit = float(np.sqrt(((task.points - center) ** 2).sum(axis=1).mean()))
     if not unit > 0:
-        return [], 0, 0
+        return _Minima(np.empty((0, POSE_SIZE)), np.empty(0), np.empty(0), 0, 0)
     local = replace(task, points=(task.points - center) / unit)
     coarse = local.thinned(_COARSE_POINTS)
-    starts, iterations, hypotheses = _starts(coarse)
-    minima, used = _distinct_minima(coarse, starts, _STEPS)
-    iterations += used
-    if len(coarse.points) < len(local.points):
-        likely = _likely(minima, len(coarse.points))
-        minima, used = _distinct_minima(local, likely, _STEPS_OF_ALL_POINTS)
-        iterations += used
-    minima = [replace(minimum, pose=_uncentered(minimum.pose, center, unit)) for minimum in minima]
-    return minima, iterations, hypotheses
+    reference, starts, iterations, hypotheses = _starts(coarse)
+    minima = _below(coarse, reference, starts, _STEPS)
+    if coarse is not local:
+        iterations += int(minima.counts[1])
+        likely = minima.states[: _count_likely(minima, len(coarse.points))]
+        minima = _below(local, reference, likely, _STEPS_OF_ALL_POINTS)
+    states = minima.states[: minima.counts[0]]
+    poses = states[:, :POSE_SIZE].copy()
+    for pose in poses:
+        orthonormalize(pose)
+        uncenter(pose, center, unit)
+    focals, costs = reference * np.exp(states[:, POSE_SIZE]), minima.costs[: len(states)]
+    return _Minima(poses, focals, costs, iterations + int(minima.counts[1]), hypotheses)
 
 
-def _distinct_minima(
-    task: _Task, starts: Sequence[_Minimum], steps: int
-) -> tuple[list[_Minimum], int]:
-    """The minima below starts, the best first, and the iterations they took."""
-    minima: list[_Minimum] = []
-    iterations = 0
-    for start in starts:
-        minimum, used = _descend(task, start, steps)
-        iterations += used
-        if not minimum.cost < np.inf or has_collapsed(minimum.pose):
-            continue
-        if not any(_are_same(minimum, other) for other in minima):
-            minima.append(minimum)
-    return sorted(minima, key=lambda minimum: minimum.cost), iterations
-
-
-def _likely(minima: Sequence[_Minimum], count: int) -> list[_Minimum]:
-    """The minima for some of the points, ``count``, that all points may still prefer."""
-    if not minima:
-        return []
+def _count_likely(minima: Minima, count: int) -> int:
+    """The number of minima for some of the points, ``count``, that all points may still prefer."""
+    costs = minima.costs[: min(int(minima.counts[0]), _MOST_LIKELY)]
     # A wrong sigma should not make every other minimum look unlikely.
-    variance = max(1.0, minima[0].cost / (2.0 * count - UNKNOWNS - 1))
-    least = minima[0].cost
-    return [each for each in minima[:_MOST_LIKELY] if each.cost - least < _UNLIKELY * variance]
+    variance = max(1.0, minima.costs[0] / (2.0 * count - UNKNOWNS - 1))
+    return int((costs - minima.costs[0] < _UNLIKELY * variance).sum())
 
 
-def _uncentered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
-    """The pose of points x, from that of points (x - center) / unit."""
-    pose = pose.copy()
-    orthonormalize(pose)
-    uncenter(pose, center, unit)
-    return pose
+def _below(task: _Task, reference: float, starts: FloatArray, steps: int) -> Minima:
+    """The distinct minima below starts (S, 16); log focal lengths are relative to the reference."""
+    minima = room_for_minima(MAX_MINIMA, POSE_SIZE + 1)
+    system = task.system(reference)
+    if not task.camera.distortion:
+        search(system, starts, Effort(len(starts), steps, 0, np.inf), 0, 0.0, minima)
+        return minima
+    for start in starts:  # the lens is linear near the focal length of its rays alone
+        pose, log_ratio, cost = start[:POSE_SIZE].copy(), float(start[POSE_SIZE]), np.inf
+        for _ in range(_LENS_ROUNDS):
+            try:
+                here = task.system(reference * math.exp(log_ratio))
+            except InputError:
+                break
+            cost, moved, used = refine_focal(here, steps, pose)
+            minima.counts[1] += used
+            log_ratio += moved
+            if abs(moved) < _LENS_TOLERANCE:
+                break
+        add_minimum(system, np.append(pose, log_ratio), float(cost), 0, 0.0, minima)
+    return minima
 
 
-def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
-    """Starts: the optima at fixed focal lengths that no neighbouring one improves on."""
-    given = task.points_2d, task.camera
-    views = _with_linear_guess(task, focal_views(*given, task.options.focal_prior, task.sigma))
+def _starts(task: _Task) -> tuple[float, FloatArray, int, int]:
+    """Starts: the optima at fixed focal lengths that no neighbouring one improves on.
+
+    Returns a reference focal length [px], the states (S, 16) relative to it, the iterations and the
+    hypotheses that they took.
+    """
+    views = focal_views(task.points_2d, task.camera, task.options.focal_prior, task.sigma)
+    views = _with_linear_guess(task, views)
     focals = views.focals
     count, n = len(focals), len(task.points)
     poses, costs, _, _, info = optimal_batch(
@@ -216,9 +222,10 @@ def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
         task.options.free,
         0,
     )
-    prior = task.prior
-    costs = costs + (prior.weight * (np.log(focals) - prior.center) ** 2)[:, None]
-    starts: list[_Minimum] = []
+    *_, center, weight = log_focal_range(task.camera, task.options.focal_prior)
+    costs = costs + (weight * task.noise**2 * (np.log(focals) - center) ** 2)[:, None]
+    reference = float(focals[count // 2])
+    starts: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable").tolist():
         k, row = divmod(flat, MAX_MINIMA)
         if not costs[k, row] < np.inf or len(starts) == _MOST_STARTS:
@@ -226,8 +233,9 @@ def _starts(task: _Task) -> tuple[list[_Minimum], int, int]:
         around = [j for j in (k - 1, k + 1) if 0 <= j < count]
         turned = np.linalg.norm(poses[around, :, :9] - poses[k, row, :9], axis=-1) < _SAME_BRANCH
         if not (turned & (costs[around] < costs[k, row])).any():
-            starts.append(_Minimum(poses[k, row].copy(), float(focals[k]), float(costs[k, row])))
-    return starts, int(info[:, 1].sum()), int(info[:, 2].sum())
+            starts.append(np.append(poses[k, row], math.log(focals[k] / reference)))
+    states = np.array(starts).reshape(-1, POSE_SIZE + 1)
+    return reference, states, int(info[:, 1].sum()), int(info[:, 2].sum())
 
 
 def _with_linear_guess(task: _Task, views: Views) -> Views:
@@ -247,48 +255,6 @@ def _with_linear_guess(task: _Task, views: Views) -> Views:
         np.insert(views.rays, place, rays, axis=0),
         np.insert(views.whitening, place, whitening, axis=0),
     )
-
-
-def _descend(task: _Task, start: _Minimum, steps: int) -> tuple[_Minimum, int]:
-    """The minimum of all 9 unknowns below a start, and the iterations it took."""
-    prior = task.prior
-    pose, focal, cost = start.pose.copy(), start.focal, np.inf
-    iterations = 0
-    for _ in range(_LENS_ROUNDS if task.camera.distortion else 1):
-        try:
-            objective = task.objective(focal)
-        except InputError:
-            break
-        slopes = focal_slopes(
-            task.points_2d, task.camera.with_focal(focal), objective.keypoints.rays
-        )
-        here = relative_to(prior, math.log(focal))
-        system = FocalObjective(objective, slopes, here)
-        cost, moved, used = refine_focal(system, steps, pose)
-        iterations += used
-        focal *= float(np.exp(moved))
-        if abs(moved) < _LENS_TOLERANCE:  # slopes are valid near the focal length of their rays
-            break
-    return _Minimum(pose, focal, float(cost)), iterations
-
-
-def _are_same(first: _Minimum, second: _Minimum) -> bool:
-    turned = np.linalg.norm(first.pose[:9] - second.pose[:9])
-    stretched = np.linalg.norm(np.log(first.pose[13:] / second.pose[13:]))
-    zoomed = abs(np.log(first.focal / second.focal))
-    return bool(np.hypot(turned, stretched) < _SAME_CHORD and zoomed < _SAME_FOCAL)
-
-
-def _covariance(task: _Task, minimum: _Minimum) -> tuple[int, FloatArray]:
-    """The number of an undetermined unknown or -1, and the covariance (9, 9)."""
-    objective = task.objective(minimum.focal)
-    camera = task.camera.with_focal(minimum.focal)
-    slopes = focal_slopes(task.points_2d, camera, objective.keypoints.rays)
-    covariance = np.zeros((UNKNOWNS + 1, UNKNOWNS + 1))
-    here = relative_to(task.prior, math.log(minimum.focal))
-    system = FocalObjective(objective, slopes, here)
-    undetermined = focal_covariance(system, minimum.pose, covariance)
-    return int(undetermined), covariance
 
 
 def focal_views(

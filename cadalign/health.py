@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from cadalign.compile.files import can_write, kernel_folder
-from cadalign.compile.shipped import FOLDER as SHIPPED
-from cadalign.compile.shipped import usable_target
+from cadalign.compile.files import SHIPPED, can_write, kernel_folder, usable_target
 from cadalign.datasets import PhotoSummary, open_photos
 from cadalign.render.probe import RENDERERS, Probe, probe_renderer
 from cadalign.render.remedy import remedy

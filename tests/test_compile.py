@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from llvmlite import binding
 
-from cadalign.compile import sources
+from cadalign.compile import files
 from cadalign.compile.progress import kernels_needed
 
 pytestmark = pytest.mark.slow
@@ -123,8 +123,8 @@ def test_code_is_found_by_the_content_of_its_sources(tmp_path: Path) -> None:
 def test_a_hash_changes_with_whatever_is_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sources, "_PACKAGE", tmp_path)
-    files = {
+    monkeypatch.setattr(files, "_PACKAGE", tmp_path)
+    texts = {
         "top.py": "from cadalign.inner.middle import (\n    f,\n)\n",
         "inner/__init__.py": "",
         "inner/middle.py": "from cadalign.inner import leaf\nfrom cadalign import inner\n",
@@ -134,19 +134,19 @@ def test_a_hash_changes_with_whatever_is_imported(
     }
 
     def hashed(**changed: str) -> str:
-        for name, text in {**files, **changed}.items():
+        for name, text in {**texts, **changed}.items():
             path = tmp_path / name
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)
-        sources.source_hash.cache_clear()
-        sources._content.cache_clear()
-        return sources.source_hash(tmp_path / "top.py")
+        files.source_hash.cache_clear()
+        files._content.cache_clear()
+        return files.source_hash(tmp_path / "top.py")
 
     before = hashed()
     assert hashed() == before
     assert hashed(**{"unused.py": "1"}) == before
     for name in ("inner/__init__.py", "inner/middle.py", "inner/leaf.py", "last.py"):
-        assert hashed(**{name: files[name] + "# changed"}) != before, name
+        assert hashed(**{name: texts[name] + "# changed"}) != before, name
 
 
 @pytest.mark.long
@@ -204,8 +204,8 @@ def test_damaged_code_is_compiled_anew_and_told_in_one_line(
 
 SHIPPED = """
 import pathlib, shutil, sys
-from cadalign.compile import shipped
-shipped.FOLDER = pathlib.Path({shipped!r})
+from cadalign.compile import files
+files.SHIPPED = pathlib.Path({shipped!r})
 """
 
 

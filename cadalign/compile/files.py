@@ -6,9 +6,17 @@ going back to an older version compiles anything that was compiled before.
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
+import logging
 import os
+import pickle
+import re
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import count
 from pathlib import Path
@@ -18,15 +26,195 @@ import platformdirs
 from numba.core.caching import (
     CompileResultCacheImpl,
     FunctionCache,
+    IndexDataCacheFile,
     _CacheLocator,
 )
+from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 
-from cadalign.compile.loading import CodeFiles
-from cadalign.compile.shipped import shipped_files
-from cadalign.compile.sources import source_hash
+_PACKAGE = Path(__file__).parents[1]
+# What compiles, and what the files of code are like.
+_COMPILERS = tuple(
+    Path(__file__).parent / name for name in ("decorators.py", "libraries.py", "loading.py")
+)
 
+# Imports at the left margin: what stands further right is for type checking or imported when
+# called, and no kernel can use it. Parsing properly would take longer than reading the code.
+_IMPORT = re.compile(
+    r"^from (cadalign[\w.]*) import (\([^)]*\)|[^\n(]*)|^import (cadalign[\w.]*)", re.M
+)
+SHIPPED = Path(__file__).parent / "kernels"
+"""Compiled kernels of the installation: `scripts/build_wheel.py` puts them into a wheel.
+
+They are compiled for a level of the instruction set (x86-64-v3: what desktop and server processors
+have had since 2013 or so) in place of one processor; where the processor has less, the kernels are
+compiled on first use as they are without.
+"""
+TARGET = "target.json"
+logger = logging.getLogger("cadalign")
+_CHECKSUM_BYTES = 16
 _UNUSED_DAYS = 60
+
+
+@cache
+def source_hash(source: Path) -> str:
+    """Hash of a file and of all of cadalign that it imports, directly or not.
+
+    Numba alone recompiles a function when its own file changes, but not when a function that it
+    calls in another file does. The rest of this package has no influence on the code.
+    """
+    found: dict[Path, bytes] = {}
+    waiting = [source, *_COMPILERS]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found[path], imported = _content(path)
+            waiting.extend(imported)
+    contents = sorted(found.values())
+    return hashlib.sha256(b"".join(contents)).hexdigest()
+
+
+@cache
+def _content(path: Path) -> tuple[bytes, tuple[Path, ...]]:
+    """Hash of one file, and the files of the modules that it imports."""
+    try:
+        code = path.read_bytes()
+    except OSError:  # of code without a file, only its own name tells it apart
+        return str(path).encode(), ()
+    text = code.decode(errors="replace")
+    return hashlib.sha256(code).digest(), tuple(dict.fromkeys(_imported(text)))
+
+
+def _imported(text: str) -> Iterator[Path]:
+    for origin, names, module in _IMPORT.findall(text):
+        if module:
+            yield from _file_of(module)
+            continue
+        yield from _file_of(origin)
+        for name in re.findall(r"\w+", names):
+            yield from _file_of(f"{origin}.{name}")
+
+
+def _file_of(module: str) -> Iterator[Path]:
+    """The file of a module of cadalign; none for a function's name, or a module of this package."""
+    if module.startswith(__package__):
+        return
+    place = _PACKAGE.joinpath(*module.split(".")[1:])
+    for path in (place.with_suffix(".py"), place / "__init__.py"):
+        if path.is_file():
+            yield path
+
+
+@dataclass(frozen=True)
+class ShippedFiles:
+    """Index and code of one shipped kernel."""
+
+    file: Any
+    target: tuple[str, str, str]
+
+    def load(self, key: Any) -> Any:
+        """Code for a signature, whatever the processor."""
+        signature, _, *rest = key
+        return self.file.load((signature, self.target, *rest))
+
+
+def shipped_files(name: str, stamp: str) -> ShippedFiles | None:
+    """Files of a kernel in the installation, None if it has none for this processor."""
+    target = usable_target(SHIPPED)
+    return target and ShippedFiles(CodeFiles(str(SHIPPED), name, stamp), target)
+
+
+@cache
+def usable_target(folder: Path) -> tuple[str, str, str] | None:
+    """Target of the shipped kernels, None if this processor does not run them."""
+    path = folder / TARGET
+    if not path.is_file():
+        return None
+    from llvmlite import binding
+
+    target = json.loads(path.read_text())
+    has = binding.get_host_cpu_features()
+    same = target["triple"] == binding.get_process_triple()
+    if not same or not all(has.get(feature) for feature in target["needs"]):
+        return None
+    return target["triple"], target["cpu"], target["features"]
+
+
+class CodeFiles(IndexDataCacheFile):
+    """Index and code of one kernel; reading them imports nothing that only compiling needs."""
+
+    def _load_index(self) -> dict[Any, str]:
+        """Names of the files of code by signature and processor."""
+        content = _read_whole(self._index_path)
+        if content is None:
+            return {}
+        stream = io.BytesIO(content)
+        if pickle.load(stream) != self._version:  # what follows may be of classes of that version
+            return {}
+        stamp, names = pickle.load(stream)
+        return dict(names) if stamp == self._source_stamp else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        content = pickle.dumps(self._version) + self._dump((self._source_stamp, overloads))
+        self._write(self._index_path, content)
+
+    def _load_data(self, name: str) -> Any:
+        content = _read_whole(self._data_path(name))
+        return None if content is None else _CodeReader(io.BytesIO(content)).load()
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(self._data_path(name), self._dump(data))
+
+    def _write(self, path: str, content: bytes) -> None:
+        with self._open_for_write(path) as file:
+            file.write(_checksum(content) + content)
+
+
+def _read_whole(path: str) -> bytes | None:
+    """Content of a file of compiled code; None where there is none, or it is damaged."""
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        return None
+    checksum, content = data[:_CHECKSUM_BYTES], data[_CHECKSUM_BYTES:]
+    if checksum == _checksum(content):
+        return content
+    _tell_damaged(str(Path(path).parent))
+    return None
+
+
+def _checksum(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=_CHECKSUM_BYTES).digest()
+
+
+@cache
+def _tell_damaged(folder: str) -> None:
+    """Warn once in a process, however many files there are."""
+    logger.warning("%s: some of the compiled code is damaged; it is compiled anew", folder)
+
+
+class _CodeReader(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("numba.core.environment", "_rebuild_env"):
+            return _environment
+        return super().find_class(module, name)
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Any:
+    """Constants of a compiled function, with the variables of its module if that is imported.
+
+    Numba imports the module of every function that was compiled into the code, its own and SciPy's
+    for the most part. Only code in object mode reads these variables; kernels have none.
+    """
+    known = lookup_environment(name)
+    if known is not None:
+        return known
+    imported = sys.modules.get(module)
+    found = Environment({"__name__": module} if imported is None else vars(imported))
+    found.consts[:] = constants
+    found.env_name = name
+    Environment._memo[name] = found
+    return found
 
 
 def kernel_folder() -> Path:

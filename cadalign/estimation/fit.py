@@ -21,7 +21,6 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
-from cadalign.estimation.symmetry import checked_symmetry
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 
@@ -142,7 +141,7 @@ def fit(
     problems = pack_one(points_3d, points_2d, camera)
     _check_ransac(ransac, confidences)
     if symmetry is not None:
-        checked_symmetry(symmetry)
+        _check_symmetry(symmetry)
     return _fit_one(problems, options, ransac, confidences, symmetry, start)
 
 
@@ -231,7 +230,8 @@ def fit_batch(
     _check_ransac(ransac, confidences)
     if confidences is not None:
         confidences = each_of(confidences, "confidences", len(problems), "sets")
-    checked_symmetry(symmetry)
+    if symmetry is not None:
+        _check_symmetry(symmetry)
     bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
 
@@ -265,6 +265,12 @@ def _copied(sigma: Any) -> Any:
         return deepcopy(sigma)
     except TypeError:  # a memoryview
         return np.array(sigma)
+
+
+def _check_symmetry(symmetry: object) -> None:
+    from cadalign.estimation.symmetry import check_symmetry  # most models have none
+
+    check_symmetry(symmetry)
 
 
 def _check_ransac(ransac: object, confidences: object) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, quote
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
-from cadalign.estimation.symmetry import checked_symmetry
+from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 
@@ -95,7 +95,8 @@ class Model:
         if self.shape_sigma is not None:
             sigma = as_positive(self.shape_sigma, name="shape_sigma")
             object.__setattr__(self, "shape_sigma", sigma)
-        checked_symmetry(self.symmetry)
+        if self.symmetry is not None:
+            check_symmetry(self.symmetry)
         self.fit_options(1.0)
 
     def fit_options(self, sigma: float) -> FitOptions:

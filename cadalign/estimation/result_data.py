@@ -22,7 +22,6 @@ from cadalign.estimation.result_parts import (
     extent,
     rms_of,
 )
-from cadalign.estimation.symmetry import equal_text, held_axes
 from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
 from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
@@ -267,6 +266,10 @@ class ResultData:
         """Clause about the alignments that are equal under the model's symmetry; empty without."""
         if self.own_equal is not None:
             return self.own_equal
+        if self.symmetry is None or self.symmetry.is_trivial:
+            return ""
+        from cadalign.estimation.symmetry import equal_text, held_axes  # most models have none
+
         return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
 
     @property

@@ -25,21 +25,18 @@ _SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
 _SAME_SCALE = 1e-4
 
 
-def checked_symmetry(symmetry: object) -> Symmetry | None:
-    """A symmetry whose motions make a group, or None.
+def check_symmetry(symmetry: object) -> None:
+    """Check that a symmetry's motions make a group.
 
     Raises
     ------
     InputError
         If it is something else, or its motions make none.
     """
-    if symmetry is None:
-        return None
     if not isinstance(symmetry, Symmetry):
         what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
         raise InputError(what, where="symmetry", fix="see cadalign.Symmetry.from_dict")
     group_of(symmetry)
-    return symmetry
 
 
 def held_axes(stretched: str) -> tuple[bool, bool, bool]:
@@ -96,12 +93,8 @@ def is_same(
     return bool(step @ information @ step <= SAME_SQUARES)
 
 
-def equal_text(
-    alignment: Alignment, symmetry: Symmetry | None, *, held: tuple[bool, bool, bool]
-) -> str:
-    """A clause about the alignments that are equal to one; empty without a symmetry."""
-    if symmetry is None or symmetry.is_trivial:
-        return ""
+def equal_text(alignment: Alignment, symmetry: Symmetry, *, held: tuple[bool, bool, bool]) -> str:
+    """A clause about the alignments that are equal to one."""
     group = group_of(symmetry)
     found = group.canonical(alignment, held=held)
     if len(found.free) > 1:

@@ -13,8 +13,7 @@ from cadalign.arrays import FloatArray, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.camera_form import read_form, read_matrix, write_form
-from cadalign.geometry.distortion import distort, perspective, undistort
-from cadalign.geometry.pixels import PixelOrigin
+from cadalign.geometry.pixels import PixelOrigin, distort, perspective, undistort
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,10 +1,11 @@
-"""Places of pixels: where coordinates begin, and where a pixel goes when an image is resized."""
+"""Places of pixels, and normalised image coordinates by OpenCV's lens model with its inverse."""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
@@ -36,3 +37,67 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
     [[0.5, 19.5]]
     """
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
+
+
+def perspective(points_cam: FloatArray) -> FloatArray:
+    """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
+    return points_cam[:, :2] / points_cam[:, 2:]
+
+
+def distort(
+    normalized: FloatArray, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Distorted coordinates (n, 2) of normalised ones (n, 2), and their derivatives (n, 2, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
+    x, y = normalized[:, 0], normalized[:, 1]
+    r2 = x * x + y * y
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = numerator / denominator
+    # d radial / d r2
+    slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2)) / denominator - radial * (
+        k4 + r2 * (2 * k5 + 3 * k6 * r2)
+    ) / denominator
+    distorted = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=1,
+    )
+    mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    jacobian = np.stack(
+        [
+            np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=1),
+            np.stack([mixed, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=1),
+        ],
+        axis=1,
+    )
+    return distorted, jacobian
+
+
+def undistort(
+    distorted: FloatArray, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Invert the lens model by Newton's method, and say where that succeeded."""
+    normalized = distorted.copy()
+    active = np.arange(len(distorted))
+    for _ in range(50):
+        value, jacobian = distort(normalized[active], coefficients)
+        error = value - distorted[active]
+        (a, b), (c, d) = jacobian.transpose(1, 2, 0)
+        determinant = a * d - b * c
+        # Past the fold of the lens model the search would find a point that is not seen.
+        going = (np.abs(error).max(axis=1) >= 1e-14) & (determinant > 0)
+        going &= np.isfinite(determinant)
+        active, error = active[going], error[going]
+        if not len(active):
+            break
+        a, b, c, d, determinant = (row[going] for row in (a, b, c, d, determinant))
+        x, y = error.T
+        step = np.stack([d * x - b * y, a * y - c * x], axis=1) / determinant[:, None]
+        normalized[active] -= step
+    lost = ~np.isfinite(normalized).all(axis=1)
+    normalized[lost] = distorted[lost]
+    error = np.abs(distort(normalized, coefficients)[0] - distorted).max(axis=1, initial=0.0)
+    return normalized, np.asarray((error < 1e-9) & ~lost)

@@ -15,8 +15,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import oriented_box
-from cadalign.geometry.rotations import angles_between
-from cadalign.geometry.vectors import dots, lengths
+from cadalign.geometry.rotations import angles_between, dots, lengths
 
 _LEAST_SIDE = 1e-9  # of the longest side of a box with a volume
 

@@ -7,7 +7,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.distortion import perspective
+from cadalign.geometry.pixels import perspective
 
 __all__ = ["model_rays", "perspective", "projected_covariances"]
 

@@ -15,8 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
-from cadalign.estimation.symmetry import held_axes, without_free_turns
-from cadalign.estimation.uncertainty.posterior import FittedKeypoints
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints, posterior_covariance
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     Misfit,
@@ -24,7 +23,6 @@ from cadalign.estimation.uncertainty.summary import (
     weaknesses_of_keypoints,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.uncertainty.evidence import AnyBasis
@@ -61,11 +59,12 @@ class KeypointStatistics(FittedKeypoints):
         """See `cadalign.Result.covariance`."""
         if self.fisher_covariance is None:
             return None
-        from cadalign.estimation.uncertainty.posterior import posterior_covariance  # compiles
-
         covariance = posterior_covariance(self)
         if self.symmetry is None:
             return covariance
+        from cadalign.estimation.symmetry import held_axes, without_free_turns
+        from cadalign.geometry.symmetry_group import group_of  # most models have none
+
         held = held_axes(self.options.stretched_axes)
         best = group_of(self.symmetry).canonical(self.alignment, held=held)
         return without_free_turns(covariance, best)

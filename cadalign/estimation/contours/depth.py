@@ -14,10 +14,12 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.contour import robust_deviation
-from cadalign.estimation.contours.loop import (
+from cadalign.estimation.contours.rows import (
+    Measured,
+    count_of,
     state_with_points,
     state_without_points,
-    with_points,
+    with_measured,
 )
 from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
 from cadalign.estimation.estimates import poses_of
@@ -54,18 +56,6 @@ class _Samples(NamedTuple):
     rays: FloatArray
     depths: FloatArray
     sigma: float
-
-
-class _Rows(NamedTuple):
-    """Points of the surface, their modes, and the planes that they lie in."""
-
-    mean: FloatArray
-    modes: FloatArray
-    image: int
-    normal: FloatArray
-    ray: FloatArray
-    depth: FloatArray
-    weight: FloatArray
 
 
 def fit_depths(
@@ -134,8 +124,7 @@ def _settled(
             )
             for each in samples
         ]
-        full = _with_rows(bare, keypoints, rows)
-        total = sum(len(each.mean) for each in rows)
+        full, total = with_measured(bare, keypoints, rows), count_of(rows)
         room = state_with_points(state, keypoints, total)
         cost, room, _, _ = refine_joint(full, _ITERATIONS, room)
         if not cost < np.inf:
@@ -157,7 +146,7 @@ def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evide
 
 def _rows(
     surface: PosedSurface, pose: Alignment, samples: _Samples, *, ratio: float, is_exact: bool
-) -> _Rows:
+) -> Measured:
     """Points where the rays of samples meet the surface, and planes at their measured depths."""
     origin, model_from_ray = model_rays(pose)
     rays = samples.rays / [ratio, ratio, 1.0]
@@ -170,19 +159,21 @@ def _rows(
     steep = np.abs(along) > _GRAZING * np.linalg.norm(rays[hit], axis=1)
     hit, normals = hit[steep], normals[steep]
     points = origin + depth[hit, None] * directions[hit]
-    mean, modes = surface.rows(points, face[hit])
-    measured = samples.depths[hit]
-    sigma = samples.sigma
+    measured, sigma, count = samples.depths[hit], samples.sigma, len(hit)
     if not is_exact:
         sigma = _sigma_of_similar(depth[hit] / measured - 1, sigma)
-    return _Rows(
-        mean,
-        modes,
-        samples.image,
-        normals,
-        samples.rays[hit, :2],
-        measured,
-        1.0 / (sigma * measured),
+    return Measured(
+        surface.rows(points, face[hit]),
+        Planes(
+            hit,
+            np.full(count, samples.image),
+            normals,
+            samples.rays[hit, :2],
+            measured,
+            1.0 / (sigma * measured),
+            np.full(count, CAUCHY),
+            np.full(count, _LOSS_SCALE),
+        ),
     )
 
 
@@ -195,28 +186,3 @@ def _sigma_of_similar(relative: FloatArray, sigma: float) -> float:
     own = robust_deviation(relative - np.median(relative)) if len(relative) else 0.0
     alike = max(len(relative) / _INDEPENDENT_PARTS, 1.0)
     return float(np.hypot(sigma, own * np.sqrt(alike)))
-
-
-def _with_rows(evidence: Evidence, keypoints: int, rows: Sequence[_Rows]) -> Evidence:
-    """The evidence with points of the surface, which stand behind the keypoints."""
-    total = sum(len(each.mean) for each in rows)
-    modes = np.zeros((len(evidence.shape.modes), total, 3))
-    start = 0
-    for each in rows:
-        modes[: len(each.modes), start : start + len(each.mean)] = each.modes
-        start += len(each.mean)
-    extended = with_points(evidence, keypoints, np.concatenate([each.mean for each in rows]), modes)
-    planes = extended.planes
-    images = [np.full(len(each.mean), each.image) for each in rows]
-    return extended._replace(
-        planes=Planes(
-            np.concatenate([planes.point, keypoints + np.arange(total)]),
-            np.concatenate([planes.image, *images]),
-            np.concatenate([planes.normal, *(each.normal for each in rows)]),
-            np.concatenate([planes.ray, *(each.ray for each in rows)]),
-            np.concatenate([planes.depth, *(each.depth for each in rows)]),
-            np.concatenate([planes.weight, *(each.weight for each in rows)]),
-            np.concatenate([planes.loss, np.full(total, CAUCHY)]),
-            np.concatenate([planes.loss_scale, np.full(total, _LOSS_SCALE)]),
-        ),
-    )

@@ -1,7 +1,4 @@
-"""Minima of the other evidence, refined with masks; masks that contradict it are left out.
-
-With them, for a known true alignment, the Cramer-Rao bound of keypoints and masks together.
-"""
+"""Minima of the other evidence, refined with masks; masks that contradict it are left out."""
 
 from __future__ import annotations
 
@@ -13,38 +10,28 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import DegenerateError, InputError
+from cadalign.arrays import BoolArray
+from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.loop import (
     ContourFit,
-    Noise,
-    RimRows,
     Settled,
     ViewContour,
     contour_view,
-    count_of,
-    noise_of,
-    rim_rows,
     settle,
-    state_with_points,
-    with_displacement_modes,
-    with_rims,
 )
-from cadalign.estimation.contours.rims import extraction_bias, find_rims
-from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
-from cadalign.estimation.estimates import pose_and_border, pose_and_lengths, poses_of
+from cadalign.estimation.contours.rows import (
+    with_displacement_modes,
+)
+from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.model import Model
-from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import ShapePrior, prior_of
+from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.covariance import information_of, joint_covariance
+from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.joint.reduction import reduced
 from cadalign.solvers.joint.search import score_state
@@ -63,8 +50,6 @@ _HULL_GAIN = 0.5  # misfit of hulls, relative, below which these take the place 
 _INLIER = 3.5  # in deviations
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
-_BOUND_REACH = 8.0  # [px]
-_LEAST_COMMON_OFFSET = 0.1  # [px], that the whole contour may have in common
 
 
 class MaskFit(NamedTuple):
@@ -145,12 +130,7 @@ def fit_masks(
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
-    settle_all = partial(
-        _settled,
-        likely[:most],
-        keypoints,
-        is_wide=is_open,
-    )
+    settle_all = partial(_settled, likely[:most], keypoints, is_wide=is_open)
     best: list[_Candidate] = []
     while used:
         best = settle_all(used, choice.surfaces)
@@ -174,16 +154,12 @@ def fit_masks(
         )
         left_out.append(contour)
         used.remove(contour)
+    fits = best[0].settled.fits if used else ()
     residuals: list[MaskResiduals | None] = [None] * len(views)
-    if not used:
-        for contour in left_out:
-            residuals[contour.image] = _unused(contour)
-        return MaskFit(list(minima), tuple(residuals), tuple(warnings))
-    for contour, fit in zip(used, best[0].settled.fits, strict=True):
+    for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
         residuals[contour.image] = _residuals(contour, fit)
-    for contour in left_out:
-        residuals[contour.image] = _unused(contour)
-    return MaskFit([_minimum(each) for each in best], tuple(residuals), tuple(warnings))
+    found = [_minimum(each) for each in best] if used else list(minima)
+    return MaskFit(found, tuple(residuals), tuple(warnings))
 
 
 def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
@@ -314,31 +290,17 @@ def _minimum(candidate: _Candidate) -> Minimum:
     )
 
 
-def _residuals(contour: ViewContour, fit: ContourFit) -> MaskResiduals:
-    near = np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < _INLIER * fit.noise.sigma
-    return MaskResiduals(
-        contour.contour.points,
-        contour.contour.normals,
-        fit.residuals,
-        near,
-        fit.noise.sigma,
-        fit.noise.correlation,
-        fit.offset,
-    )
-
-
-def _unused(contour: ViewContour) -> MaskResiduals:
-    count = len(contour.contour.points)
-    return MaskResiduals(
-        contour.contour.points,
-        contour.contour.normals,
-        np.full(count, np.nan),
-        np.zeros(count, dtype=bool),
-        float("nan"),
-        1.0,
-        0.0,
-        is_used=False,
-    )
+def _residuals(contour: ViewContour, fit: ContourFit | None) -> MaskResiduals:
+    """The residuals of a mask; without a fit those of one that was left out."""
+    points, normals, _ = contour.contour
+    if fit is None:
+        lacking = np.full(len(points), np.nan)
+        unused = np.zeros(len(points), dtype=bool)
+        nothing = float("nan"), 1.0, 0.0
+        return MaskResiduals(points, normals, lacking, unused, *nothing, is_used=False)
+    sigma, correlation, _ = fit.noise
+    near = np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < _INLIER * sigma
+    return MaskResiduals(points, normals, fit.residuals, near, sigma, correlation, fit.offset)
 
 
 def _no_rim(contour: ViewContour) -> DegenerateError:
@@ -367,70 +329,3 @@ def _hull_of(inside: BoolArray) -> BoolArray:
     filled = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
     return filled > 0
-
-
-def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
-    """The least covariance of an estimate from one view's keypoints and mask.
-
-    The contour has the deviation and the correlation that its residuals show at the true alignment,
-    which has the scale 1 along the model's known axis.
-
-    Returns
-    -------
-    (9, 9) float
-        As `cadalign.Result.covariance`.
-
-    Raises
-    ------
-    InputError
-        If the view has no mask, or the model is not exact.
-    """
-    if view.mask_image is None or model.shape_sigma is not None:
-        raise InputError("expected a view with a mask, and an exact model", where="view")
-    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
-    pose = np.concatenate([gt.rotation.ravel(), gt.translation])[None]
-    still = np.zeros_like(evidence.shape.mean)
-    state = State(pose, np.zeros(0), np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
-    full, stacked = with_contours(model, [view], evidence, state)
-    unknowns = pose_and_border(joint_covariance(full, stacked), 0)
-    return pose_and_lengths(full, stacked, unknowns)
-
-
-def with_contours(
-    model: Model, views: Sequence[View], evidence: Evidence, state: State
-) -> tuple[Evidence, State]:
-    """The evidence of an exact model's views with the contours of their masks.
-
-    Their deviation and correlation are those that their residuals show at the state.
-
-    Raises
-    ------
-    InputError
-        If a mask has no contour, or the model has no mesh.
-    """
-    masked = [number for number, view in enumerate(views) if view.mask_image is not None]
-    if not masked:
-        return evidence, state
-    keypoints = len(evidence.shape.mean) - 2
-    where = f"views[{masked[0]}].mask"
-    (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
-    posed = surface.at(evidence.shape, state)
-    poses = poses_of(evidence, state)
-    rows = [
-        _contour_rows(contour_view(n, views[n], f"views[{n}].mask"), posed, poses[n])
-        for n in masked
-    ]
-    full = with_rims(evidence, keypoints, rows)
-    return full, state_with_points(state, keypoints, count_of(rows), np.zeros(len(rows)))
-
-
-def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> RimRows:
-    rims = find_rims(posed.caster, seen.camera, gt, seen.contour, _BOUND_REACH)
-    offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
-    centred = np.where(rims.found, rims.offset - offset, np.nan)
-    known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
-    bias = extraction_bias(posed.caster, seen.camera, gt, seen.mask, seen.contour, rims)
-    noise = noise_of(seen, rims, centred - bias, known, correlated=True)
-    agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
-    rows = rim_rows(seen, rims._replace(found=agreeing), noise, posed, gt, bias)
-    return rows._replace(loss=np.full(len(rows.loss), LINEAR))

@@ -16,6 +16,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
+from cadalign.estimation.contours.rows import PointRows
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
@@ -27,13 +28,6 @@ from cadalign.solvers.joint.evidence import Shape, State, points_of
 
 _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
 _MOST_MESHES = 3  # training models that are tried, the nearest ones
-
-
-class PointRows(NamedTuple):
-    """Mean (n, 3) and modes (K, n, 3) of points of the surface, as in `Shape`."""
-
-    mean: FloatArray
-    modes: FloatArray
 
 
 class PosedSurface(Protocol):

@@ -314,7 +314,7 @@ class KnownScene:
         evidence, state = self._widened(evidence, self._state(evidence))
         own = evidence
         if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
-            from cadalign.estimation.contours.fit import with_contours  # with OpenCV and embree
+            from cadalign.estimation.contours.bound import with_contours  # with OpenCV and embree
 
             evidence, state = with_contours(self.model, self.views, evidence, state)
         found = joint_covariance(evidence, state)

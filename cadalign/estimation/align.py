@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -23,7 +22,6 @@ from cadalign.estimation.results import Results
 from cadalign.estimation.search import (
     JointProblem,
     find_minima,
-    find_minima_and_noise,
     widened_by_noise,
 )
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
@@ -113,36 +111,37 @@ def align(
     _check_size(size)
     inits = _checked_inits(init, given)
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
-    lenses = Lenses.of(given, focal, focal_prior)
+    Lenses.of(given, focal, focal_prior)  # checks the cameras
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
-    if size is None and ransac is None and not lenses.count and is_single(model, given):
-        return align_single(cast(ShapeModel, model), given[0], options=options, init=inits[0])
+    return _align_all(model, given, inits, size, options, ransac, start)
+
+
+def _align_all(
+    model: Model | ShapeModel,
+    views: Sequence[View],
+    inits: Sequence[Alignment | None],
+    size: Size | None,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+    start: float,
+) -> Result:
+    """All stages of an estimate of what was checked, which was begun at ``start`` [s]."""
+    lenses = Lenses.of(views, options.focal, options.focal_prior)
+    if size is None and ransac is None and not lenses.count and is_single(model, views):
+        return align_single(cast(ShapeModel, model), views[0], options=options, init=inits[0])
     prior = prior_of(model)
-    left_out = views_without_pose(prior, given, inits)
+    left_out = views_without_pose(prior, views, inits)
     if left_out:
         check_first(left_out)
-        others = [view for number, view in enumerate(given) if number not in left_out]
-        with numbered_without(left_out, len(given)):
-            found_by_used = align(
-                model,
-                others,
-                size=size,
-                init=[each for number, each in enumerate(inits) if number not in left_out],
-                loss=loss,
-                loss_scale=loss_scale,
-                ransac=ransac,
-                focal=focal,
-                focal_prior=focal_prior,
-            )
-        return with_views_left_out(found_by_used, prior, given, left_out)
-    problem = JointProblem(prior, given, size, options, lenses)
-    lacks_sigma = any(view.sigma is None and len(view.keypoint_ids) for view in given)
-    if lacks_sigma:
-        problem, minima, iterations, hypotheses = find_minima_and_noise(problem, inits, ransac)
-    else:
-        minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+        used = [number for number in range(len(views)) if number not in left_out]
+        others, known = [views[number] for number in used], [inits[number] for number in used]
+        with numbered_without(left_out, len(views)):
+            found_by_used = _align_all(model, others, known, size, options, ransac, start)
+        return with_views_left_out(found_by_used, prior, views, left_out)
+    problem = JointProblem(prior, views, size, options, lenses)
+    problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
@@ -150,19 +149,15 @@ def align(
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
     masks = None
-    if any(view.mask is not None for view in given):
+    if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.depth import fit_depths
         from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
 
-        masks = fit_masks(model, prior, given, fit_depths(model, prior, given, minima))
+        masks = fit_masks(model, prior, views, fit_depths(model, prior, views, minima))
         minima = masks.minima
-    if lacks_sigma:
-        minima = widened_by_noise(problem, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    result = result_of(found_in_minima(model, prior, given, minima, stats))
-    if lacks_sigma:
-        result = replace(result, sigma=problem.noise)
-    return result if masks is None else masks.noted_in(result)
+    found = found_in_minima(model, problem, widened_by_noise(problem, minima), stats)
+    return result_of(found) if masks is None else masks.noted_in(result_of(found))
 
 
 def align_batch(
@@ -217,21 +212,18 @@ def align_batch(
     sizes = _one_each(size, len(objects), "size", Size)
     starts = _one_each(init, len(objects), "init", Alignment)
 
+    options: dict[str, Any] = {
+        "loss": loss,
+        "loss_scale": loss_scale,
+        "ransac": ransac,
+        "focal": focal,
+    }
+
     def one(
         views: View | Sequence[View], size: Size | None, init: Alignment | None
     ) -> Result | CadalignError:
         try:
-            return align(
-                model,
-                views,
-                size=size,
-                init=init,
-                loss=loss,
-                loss_scale=loss_scale,
-                ransac=ransac,
-                focal=focal,
-                focal_prior=focal_prior,
-            )
+            return align(model, views, size=size, init=init, **options)
         except CadalignError as error:
             return error
 

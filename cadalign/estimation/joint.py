@@ -26,7 +26,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.search import Minimum
+from cadalign.estimation.search import JointProblem, Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
     SAME_SQUARES,
@@ -93,7 +93,7 @@ class Found:
         The rotations' covariances lack `curvature_of_rotations`.
     warnings, evidence, basis
         As of `Stated`; warnings beside those about deviations and alternatives.
-    cost, stats, component, known_axis, stretched_axes, symmetry, rig_from_model, focal, focal_prior
+    cost, ...
         As of `cadalign.Result`.
     """
 
@@ -109,6 +109,7 @@ class Found:
     cost: float
     stats: FitStats
     component: int
+    sigma: float | None = None
     known_axis: str | None = None
     stretched_axes: str = ""
     symmetry: Symmetry | None = None
@@ -181,6 +182,7 @@ def result_of(found: Found) -> Result:
         stretched_axes=found.stretched_axes,
         focal=found.focal,
         focal_prior=found.focal_prior,
+        sigma=found.sigma,
         cost=found.cost,
         alternatives=others,
         stats=found.stats,
@@ -196,11 +198,7 @@ def result_of(found: Found) -> Result:
 
 
 def found_in_minima(
-    model: Model | ShapeModel,
-    prior: ShapePrior,
-    views: Sequence[View],
-    minima: Sequence[Minimum],
-    stats: FitStats,
+    model: Model | ShapeModel, problem: JointProblem, minima: Sequence[Minimum], stats: FitStats
 ) -> Found:
     """The likely estimates of minima, the likeliest first, with widened deviations of the shape.
 
@@ -209,6 +207,7 @@ def found_in_minima(
     DegenerateError
         If the evidence determines none of them.
     """
+    prior, views = problem.prior, problem.views
     minima = [each for each in minima if np.isfinite(each.score)]
     if not minima:
         what = "the evidence does not determine pose and shape"
@@ -242,6 +241,7 @@ def found_in_minima(
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
+        sigma=problem.noise if problem.lacks_sigma else None,
         known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
         stretched_axes=stretched_axes(held),
         symmetry=symmetry,

@@ -27,14 +27,28 @@ _LEAST_SCALE = 1e-6
 
 
 class _Rows(NamedTuple):
-    """Equations in X: ``normals`` (N, 3) in the camera, ``right`` (N,), inverse deviations."""
+    """Equations in points of the rig: ``normals`` (N, 3), ``right`` (N,), inverse deviations.
+
+    They are of the model's ``points`` (N, 3), seen from a camera with ``turns`` and ``shifts``;
+    ``is_ray`` (N,) is 1 where the deviation is that of a ray: it grows with the depth.
+    """
 
     points: FloatArray
-    cameras: FloatArray
+    turns: FloatArray
+    shifts: FloatArray
     normals: FloatArray
     right: FloatArray
     weights: FloatArray
-    is_ray: FloatArray  # 1 where the deviation is that of a ray: it grows with the depth
+    is_ray: FloatArray
+
+    def depths(self, matrix: FloatArray, translation: FloatArray) -> FloatArray:
+        """Depths (N,) in the cameras of points at a pose."""
+        in_rig = self.points @ matrix.T + translation
+        return np.asarray((np.einsum("nij,nj->ni", self.turns, in_rig) + self.shifts)[:, 2])
+
+    def weights_at(self, depths: FloatArray) -> FloatArray:
+        """Weights (N,) of the equations at depths."""
+        return np.asarray(self.weights / np.where(self.is_ray > 0, np.maximum(depths, 1e-3), 1.0))
 
 
 def metric_starts(evidence: Evidence, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,39 +90,38 @@ def _rows_of(evidence: Evidence) -> _Rows:
     point = np.concatenate([np.tile(sightings.point, 3), planes.point])
     image = np.concatenate([np.tile(sightings.image, 3), planes.image])
     is_ray = np.concatenate([np.ones(2 * len(u)), np.zeros(len(u) + len(planes.point))])
-    every = _Rows(
-        shape.mean[point],
-        evidence.rig.cam_from_rig[image],
-        np.concatenate(normals),
-        np.concatenate(right),
-        np.concatenate(weights),
-        is_ray,
+    weight, normal = np.concatenate(weights), np.concatenate(normals)
+    kept = weight > 0
+    cameras, normal = evidence.rig.cam_from_rig[image[kept]], normal[kept]
+    turns, shifts = cameras[:, :9].reshape(-1, 3, 3), cameras[:, 9:]
+    return _Rows(
+        shape.mean[point[kept]],
+        turns,
+        shifts,
+        np.einsum("ni,nij->nj", normal, turns),
+        np.concatenate(right)[kept] - (normal * shifts).sum(axis=1),
+        weight[kept],
+        is_ray[kept],
     )
-    kept = every.weights > 0
-    return _Rows(*(column[kept] for column in every))
 
 
 def _linear_rotation(rows: _Rows) -> FloatArray | None:
     """The rotation nearest to the linear solution; None where it is not determined."""
     if len(rows.right) < _LEAST_EQUATIONS:
         return None
-    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
-    in_rig = np.einsum("ni,nij->nj", rows.normals, turns)
-    left = np.concatenate([(in_rig[:, :, None] * rows.points[:, None]).reshape(-1, 9), in_rig], 1)
-    right = rows.right - (rows.normals * shifts).sum(axis=1)
-    weights = rows.weights
+    by_matrix = (rows.normals[:, :, None] * rows.points[:, None]).reshape(-1, 9)
+    left, weights = np.concatenate([by_matrix, rows.normals], axis=1), rows.weights
     found = np.zeros(12)
     for _ in range(_ROUNDS):
         weighted = left * weights[:, None]
         sizes = np.linalg.norm(weighted, axis=0)
         if not (sizes > 0).all():
             return None
-        solved, _, _, singular = np.linalg.lstsq(weighted / sizes, right * weights, rcond=None)
+        solved, _, _, singular = np.linalg.lstsq(weighted / sizes, rows.right * weights, rcond=None)
         if singular[-1] < _CONDITION * singular[0]:
             return None
         found = solved / sizes
-        in_camera = _seen(rows, found[:9].reshape(3, 3), found[9:])
-        weights = rows.weights / np.where(rows.is_ray > 0, np.maximum(in_camera[:, 2], 1e-3), 1.0)
+        weights = rows.weights_at(rows.depths(found[:9].reshape(3, 3), found[9:]))
     matrix = found[:9].reshape(3, 3)
     lengths = np.linalg.norm(matrix, axis=0)
     if np.linalg.det(matrix) <= 0 or not (lengths > 0).all():
@@ -121,13 +134,6 @@ def _linear_rotation(rows: _Rows) -> FloatArray | None:
     return np.asarray(rotation) if np.linalg.det(rotation) > 0 else None
 
 
-def _seen(rows: _Rows, matrix: FloatArray, translation: FloatArray) -> FloatArray:
-    """Points (N, 3) in their cameras."""
-    in_rig = rows.points @ matrix.T + translation
-    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
-    return np.asarray(np.einsum("nij,nj->ni", turns, in_rig) + shifts)
-
-
 class _Placed(NamedTuple):
     rotation: FloatArray
     translation: FloatArray
@@ -138,17 +144,14 @@ class _Placed(NamedTuple):
 def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _Placed | None:
     """Translation and scales from the equations that are linear once the rotation is given."""
     basis = _scale_basis(evidence)
-    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
-    in_rig = np.einsum("ni,nij->nj", rows.normals, turns)
-    by_scale = (in_rig @ rotation) * rows.points
-    left = np.concatenate([in_rig, by_scale @ basis], axis=1)
-    right = rows.right - (rows.normals * shifts).sum(axis=1)
+    by_scale = (rows.normals @ rotation) * rows.points
+    left = np.concatenate([rows.normals, by_scale @ basis], axis=1)
     extra_left, extra_right = _other_rows(evidence, rotation, basis)
     weights, cost = rows.weights, np.inf
     found = np.zeros(left.shape[1])
     for _ in range(_ROUNDS_GIVEN_ROTATION):
         weighted = np.concatenate([left * weights[:, None], extra_left])
-        target = np.concatenate([right * weights, extra_right])
+        target = np.concatenate([rows.right * weights, extra_right])
         sizes = np.linalg.norm(weighted, axis=0)
         if not (sizes > 0).all():
             return None
@@ -160,8 +163,8 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
         error = weighted @ found - target
         cost = float(error @ error)
         scales = basis @ found[3:]
-        depths = _seen(rows, rotation * scales, found[:3])[:, 2]
-        weights = rows.weights / np.where(rows.is_ray > 0, np.maximum(depths, 1e-3), 1.0)
+        depths = rows.depths(rotation * scales, found[:3])
+        weights = rows.weights_at(depths)
     if not (scales > _LEAST_SCALE).all() or not (depths > 0).all() or not np.isfinite(cost):
         return None
     return _Placed(rotation, found[:3], np.log(scales), cost + _cost_of_up(evidence, rotation))
@@ -170,12 +173,10 @@ def _given_rotation(evidence: Evidence, rows: _Rows, rotation: FloatArray) -> _P
 def _screened(evidence: Evidence, rows: _Rows, rotations: FloatArray) -> FloatArray:
     """The rotations (S, 3, 3) with the least algebraic error, unweighted by depth."""
     basis = _scale_basis(evidence)
-    turns, shifts = rows.cameras[:, :9].reshape(-1, 3, 3), rows.cameras[:, 9:]
-    in_rig = np.einsum("ni,nij->nj", rows.normals, turns)
-    by_scale = (in_rig @ rotations) * rows.points
-    same = np.broadcast_to(in_rig, by_scale.shape)
+    by_scale = (rows.normals @ rotations) * rows.points
+    same = np.broadcast_to(rows.normals, by_scale.shape)
     left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
-    right = (rows.right - (rows.normals * shifts).sum(axis=1)) * rows.weights
+    right = rows.right * rows.weights
     normal = left.swapaxes(1, 2) @ left
     ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
     normal = normal + ridge * np.eye(left.shape[2])

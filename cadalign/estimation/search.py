@@ -56,6 +56,11 @@ class JointProblem(NamedTuple):
     lenses: Lenses
     noise: float = 1.0  # [px], where it is not given
 
+    @property
+    def lacks_sigma(self) -> bool:
+        """True if the keypoints' noise is to be estimated."""
+        return any(view.sigma is None and len(view.keypoint_ids) for view in self.views)
+
     def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
         """The evidence about one component of the shape, with rays of ``lenses``."""
         everything = evidence_of(
@@ -85,16 +90,10 @@ class Minimum(NamedTuple):
     lenses: Lenses
 
 
-def find_minima(
+def _find_minima(
     problem: JointProblem, init: Inits, ransac: RansacOptions | None
 ) -> tuple[list[Minimum], int, int]:
-    """Minima, the likeliest first, and the numbers of iterations and of starts.
-
-    Raises
-    ------
-    NoConsensusError
-        With ``ransac``: if the likeliest has no more support by keypoints than chance gives.
-    """
+    """Minima, the likeliest first, and the numbers of iterations and of starts, at one noise."""
     minima: list[Minimum] = []
     iterations = hypotheses = 0
     for number, shape in enumerate(problem.prior.components):
@@ -231,23 +230,27 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
     return Start(poses, np.log(scale))
 
 
-def find_minima_and_noise(
+def find_minima(
     problem: JointProblem, inits: Inits, ransac: RansacOptions | None
 ) -> tuple[JointProblem, list[Minimum], int, int]:
-    """Minima with the likeliest standard deviation of the keypoints that have none.
+    """Minima, with the likeliest standard deviation of the keypoints where these have none.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the estimate
     is free of the bias that fitted unknowns cause.
 
     Returns
     -------
-    The problem with that noise, and what `find_minima` returns.
+    The problem with that noise, minima, the likeliest first, numbers of iterations and of starts.
 
     Raises
     ------
     DegenerateError
-        If the keypoints fit exactly whatever they are.
+        If noise is to be estimated, and the keypoints fit exactly whatever they are.
+    NoConsensusError
+        With ``ransac``: if the likeliest has no more support by keypoints than chance gives.
     """
+    if not problem.lacks_sigma:
+        return problem, *_find_minima(problem, inits, ransac)
     counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
     poses = 1 if problem.views[0].cam_from_rig is not None else len(problem.views)
     if 2 * sum(counts) <= 6 * poses:
@@ -255,7 +258,7 @@ def find_minima_and_noise(
     effort = np.zeros(2, dtype=int)
     minima: list[Minimum] = []
     for _ in range(_NOISE_ROUNDS):
-        minima, *spent = find_minima(problem, inits, ransac)
+        minima, *spent = _find_minima(problem, inits, ransac)
         effort += spent
         if not minima:
             break
@@ -265,13 +268,15 @@ def find_minima_and_noise(
         if change < _NOISE_TOLERANCE:
             break
     if minima:
-        minima, *spent = find_minima(problem, inits, ransac)
+        minima, *spent = _find_minima(problem, inits, ransac)
         effort += spent
     return problem, minima, int(effort[0]), int(effort[1])
 
 
-def widened_by_noise(problem: JointProblem, minima: Sequence[Minimum]) -> list[Minimum]:
-    """The minima with less information, as the noise itself is uncertain."""
+def widened_by_noise(problem: JointProblem, minima: Sequence[Minimum]) -> Sequence[Minimum]:
+    """The minima with less information, where the noise itself is uncertain."""
+    if not problem.lacks_sigma:
+        return minima
     unknown = _without_sigma(problem.views, minima[0])
     unknowns = 6 * len(minima[0].state.poses) + int(minima[0].evidence.scales.free.sum())
     redundancy = max(2 * int(unknown.sum()) - unknowns, 1)

@@ -129,7 +129,9 @@ def rank_evidence(
     given = (views,) if isinstance(views, View) else tuple(views)
     scene = scene_of(model, given, estimate, size)
     found = [each for name in candidates for each in _keypoints(scene, name)]
-    found.append(_best(_view(scene, turn) for turn in _turns(scene)))
+    # Beside several views, a further one stands on the side that tells more.
+    turns = (TURN_DEG,) if len(given) == 1 else (TURN_DEG, -TURN_DEG)
+    found.append(_best(_advice("view", "", scene.with_view(_turned(scene, t))) for t in turns))
     found.extend(_lengths(scene))
     if mask is not None and given[0].mask is None:
         first = replace(_without_scale(given[0]), mask=mask, mask_sigma=_MASK_SIGMA)
@@ -138,17 +140,8 @@ def rank_evidence(
     return tuple(sorted(found, key=lambda each: each.worst))
 
 
-def _turns(scene: KnownScene) -> tuple[float, ...]:
-    """Angles of a further view; beside several views, to the side that tells more."""
-    return (TURN_DEG,) if len(scene.views) == 1 else (TURN_DEG, -TURN_DEG)
-
-
 def _best(advice: Iterable[Advice]) -> Advice:
     return min(advice, key=lambda each: each.worst)
-
-
-def _view(scene: KnownScene, turn_deg: float) -> Advice:
-    return _advice("view", "", scene.with_view(_turned(scene, turn_deg)))
 
 
 def _turned(scene: KnownScene, turn_deg: float) -> tuple[View, Alignment]:
@@ -173,7 +166,8 @@ def _lengths(scene: KnownScene) -> Iterator[Advice]:
     """The unknown one of the width and another length, or both, that leaves the least open."""
     lengths = np.ptp(scene.bounds, axis=0) * scene.poses[0].scale
     known = np.full(3, np.nan) if scene.size is None else scene.size.lengths
-    sigma = np.where(np.isfinite(known), _relative(scene.size), LENGTH_SIGMA)
+    stated = LENGTH_SIGMA if scene.size is None else scene.size.relative
+    sigma = np.where(np.isfinite(known), stated, LENGTH_SIGMA)
     rows = [(0, 1), (0, 2)] if np.isnan(known[0]) else [(1,), (2,)]
     found = []
     for axes in rows:
@@ -188,12 +182,6 @@ def _lengths(scene: KnownScene) -> Iterator[Advice]:
         found.append(_advice("lengths", detail, replace(scene, size=size)))
     if found:
         yield _best(found)
-
-
-def _relative(size: Size | None) -> FloatArray:
-    """Relative deviations (3,) of known lengths."""
-    given = LENGTH_SIGMA if size is None else size.relative
-    return np.broadcast_to(np.asarray(given, dtype=np.float64), (3,))
 
 
 def _keypoints(scene: KnownScene, name: Hashable) -> Iterator[Advice]:
@@ -243,12 +231,11 @@ def _without_scale(view: View) -> View:
 
 
 def _advice(kind: str, detail: Hashable, scene: KnownScene) -> Advice:
-    """The effect of evidence that agrees with the estimate."""
-    return _summary(kind, detail, scene.covariance(), scene.poses[0])
+    """The effect of evidence that agrees with the estimate.
 
-
-def _summary(kind: str, detail: Hashable, covariance: FloatArray, alignment: Alignment) -> Advice:
-    """Deviations up to scale, which is known or not according to the evidence."""
+    Deviations are those up to scale, which is known or not according to the evidence.
+    """
+    covariance, alignment = scene.covariance(), scene.poses[0]
     distance = float(np.linalg.norm(alignment.translation))
     # Translation over the distance, and lengths, relative to the length along x.
     terms = np.zeros((9, 9))
@@ -311,8 +298,10 @@ class KnownScene:
     def covariance(self) -> FloatArray:
         """Covariance (9, 9) of an estimate, as `cadalign.Result.covariance`, linearised."""
         evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
-        evidence, state = self._widened(evidence, self._state(evidence))
-        own = evidence
+        evidence, state = widened(evidence, self._state(evidence), self.prior.inflation)
+        margins, known = self.prior.box_margins, is_exact(evidence)
+        if margins is not None:  # the box that results state of a learned shape
+            evidence, state = with_box(evidence, state, len(self.points_3d), margins)
         if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
             from cadalign.estimation.contours.bound import with_contours  # with OpenCV and embree
 
@@ -321,31 +310,20 @@ class KnownScene:
         unknowns = pose_and_border(found, int(evidence.rig.pose[0]))
         covariance = pose_and_lengths(evidence, state, unknowns)
         symmetry = self.model.symmetry if isinstance(self.model, Model) else None
-        if symmetry is None and not is_exact(own):
+        if symmetry is None and not known:
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
         return covariance
 
-    def _widened(self, evidence: Evidence, state: State) -> tuple[Evidence, State]:
-        """With the deviations and the box that results state of a learned shape."""
-        evidence, state = widened(evidence, state, self.prior.inflation)
-        if self.prior.box_margins is None:
-            return evidence, state
-        return with_box(evidence, state, len(self.points_3d), self.prior.box_margins)
-
     def _state(self, evidence: Evidence) -> State:
-        poses = [np.append(each.rotation.ravel(), each.translation) for each in self._free_poses()]
-        log_scales = np.log(self.poses[0].scale)
+        poses, first = self.poses, self.poses[0]
+        if self.views[0].cam_from_rig is not None:  # one pose in the frame that the views share
+            camera = cast(FloatArray, self.views[0].cam_from_rig)
+            turn, shift = camera[:3, :3].T, first.translation - camera[:3, 3]
+            poses = (Alignment(turn @ first.rotation, turn @ shift, first.scale),)
+        packed = [np.append(each.rotation.ravel(), each.translation) for each in poses]
         points = np.concatenate([self.points_3d, self.bounds])
         coefficients, rest = _explained(evidence.shape, points)
-        return State(np.array(poses), np.zeros(0), log_scales, coefficients, rest)
-
-    def _free_poses(self) -> tuple[Alignment, ...]:
-        """One for every view, or one in the frame that the views share."""
-        if self.views[0].cam_from_rig is None:
-            return self.poses
-        camera, pose = cast(FloatArray, self.views[0].cam_from_rig), self.poses[0]
-        turn, shift = camera[:3, :3].T, pose.translation - camera[:3, 3]
-        return (Alignment(turn @ pose.rotation, turn @ shift, pose.scale),)
+        return State(np.array(packed), np.zeros(0), np.log(first.scale), coefficients, rest)
 
 
 def scene_of(

@@ -17,7 +17,7 @@ from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
-from cadalign.estimation.uncertainty.summary import EvidenceSummary, Misfit
+from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -103,6 +103,25 @@ class _Misfit(ForeignDocument):
     outliers: list[_Outlier]
 
 
+class _Mask(ForeignDocument):
+    """The fields of `MaskResiduals`; null for a number that is not known."""
+
+    points: list[tuple[Finite, Finite]]
+    normals: list[tuple[Finite, Finite]]
+    residuals: list[Finite | None]
+    inliers: list[bool]
+    sigma: NotNegative | None
+    correlation: Positive
+    offset: Finite
+    is_used: bool
+
+    def __post_init__(self) -> None:
+        for name in ("normals", "residuals", "inliers"):
+            if len(getattr(self, name)) != len(self.points):
+                what = f"{len(getattr(self, name))} entries for {len(self.points)} points"
+                raise InputError(what, where=name)
+
+
 class _Result(ForeignDocument):
     """The fields of `cadalign.Result`; ``rms``, ``std`` and ``box`` follow from them."""
 
@@ -133,10 +152,14 @@ class _Result(ForeignDocument):
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
     equal_under_symmetry: str = ""
     rig_from_model: Any = None
+    mask_residuals: tuple[_Mask | None, ...] = ()  # older files lack them
 
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("there are none", where="views")
+        if self.mask_residuals and len(self.mask_residuals) != len(self.views):
+            what = f"{len(self.mask_residuals)} entries for {len(self.views)} views"
+            raise InputError(what, where="mask_residuals")
         for name in ("ids", "points_covariance", "points_cam_covariance"):
             entries = getattr(self, name)
             if entries is not None and len(entries) != len(self.points_3d):
@@ -188,6 +211,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "symmetry": None if result.symmetry is None else result.symmetry.to_dict(),
         "equal_under_symmetry": result.equal_under_symmetry,
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
+        "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
         "stats": asdict(result.stats),
     }
 
@@ -204,12 +228,18 @@ def _written_view(view: ViewResult) -> dict[str, Any]:
     }
 
 
+def _written_mask(mask: MaskResiduals) -> dict[str, Any]:
+    plain = {name: _plain(value) for name, value in vars(mask).items()}
+    residuals = [each if math.isfinite(each) else None for each in plain["residuals"]]
+    return {**plain, "residuals": residuals, "sigma": mask.sigma if mask.is_used else None}
+
+
 def _finite_rows(rows: FloatArray) -> list[list[float] | None]:
     return [row if math.isfinite(row[0] + row[1]) else None for row in rows.tolist()]
 
 
-def _plain(array: FloatArray | None) -> Any:
-    return None if array is None else array.tolist()
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _plain_options(options: FitOptions) -> dict[str, Any]:
@@ -250,7 +280,7 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         points_covariance=_of_points(read.points_covariance, "points_covariance"),
         points_cam_covariance=_of_points(read.points_cam_covariance, "points_cam_covariance"),
         warnings=tuple(read.warnings),
-        misfit=None if read.misfit is None else _misfit(read.misfit),
+        misfit=_misfit(read.misfit),
         evidence=tuple(EvidenceSummary(**msgspec.structs.asdict(each)) for each in read.evidence),
         degrees_of_freedom=read.degrees_of_freedom,
     )
@@ -277,6 +307,7 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
         component=read.component,
         rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
+        mask_residuals=tuple(map(_mask, read.mask_residuals)),
         own_bounds=_bounds(read.bounds),
         own_stretch=None if read.stretch is None else np.array(read.stretch),
         own_equal=read.equal_under_symmetry,
@@ -292,6 +323,29 @@ def _view(read: _View, unknowns: int) -> ViewResult:
         np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
         np.array(read.inliers, dtype=bool),
         Stated(_array(read.covariance, "covariance", unknowns)),
+    )
+
+
+def _misfit(read: _Misfit | None) -> Misfit | None:
+    if read is None:
+        return None
+    outliers = {each.row: each.distance_px for each in read.outliers}
+    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers)
+
+
+def _mask(read: _Mask | None) -> MaskResiduals | None:
+    if read is None:
+        return None
+    residuals = [math.nan if each is None else each for each in read.residuals]
+    return MaskResiduals(
+        np.array(read.points).reshape(-1, 2),
+        np.array(read.normals).reshape(-1, 2),
+        np.array(residuals, dtype=np.float64),
+        np.array(read.inliers, dtype=bool),
+        math.nan if read.sigma is None else read.sigma,
+        read.correlation,
+        read.offset,
+        read.is_used,
     )
 
 
@@ -325,11 +379,6 @@ def _options(read: _Options, count: int) -> FitOptions:
         if sigma is not None:
             pixel_information(sigma, count)  # checks it
         return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
-
-
-def _misfit(read: _Misfit) -> Misfit:
-    outliers = {each.row: each.distance_px for each in read.outliers}
-    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers)
 
 
 def _alternative(entry: _Alternative, where: str) -> Alternative:

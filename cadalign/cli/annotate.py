@@ -14,8 +14,7 @@ import tyro
 from rich.console import Console
 
 from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
-from cadalign.cli.options import UsageError, flag_of
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import UsageError, flag_of, make_folder, new_console
 from cadalign.io.files import write_json, writing
 
 if TYPE_CHECKING:

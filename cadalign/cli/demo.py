@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.cli.evaluate import RunCommand, command_of
-from cadalign.cli.output import new_console
+from cadalign.cli.options import new_console
 from cadalign.cli.runs import NOTHING_WORKED, SUCCESS, conclude
 from cadalign.evaluation.demo.options import DemoOptions
 

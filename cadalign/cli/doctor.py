@@ -9,8 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cadalign.cli.options import JsonOption
-from cadalign.cli.output import new_console
+from cadalign.cli.options import JsonOption, new_console
 
 if TYPE_CHECKING:
     from cadalign.datasets import PhotoSummary

@@ -14,8 +14,7 @@ import tyro
 
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.fit_options import EstimateOptions
-from cadalign.cli.options import UsageError, named_as_flags
-from cadalign.cli.output import make_folder, say, waiting
+from cadalign.cli.options import UsageError, make_folder, named_as_flags, say, waiting
 from cadalign.errors import InputError
 from cadalign.io.documents import in_file, read_json
 

@@ -14,7 +14,7 @@ from typing import Any
 from rich.progress import track
 
 from cadalign.cli.fit import FittedFile
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import make_folder, new_console
 from cadalign.cli.runs import NOTHING_WORKED, SOME_FAILED, SUCCESS, print_json, print_table
 from cadalign.errors import CadalignError, DataError
 from cadalign.io.documents import read_json

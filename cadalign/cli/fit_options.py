@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import tyro
 
-from cadalign.cli.options import ObservationCommand, OptionError, flag_of, named_as_flags
-from cadalign.cli.output import say
+from cadalign.cli.options import ObservationCommand, OptionError, flag_of, named_as_flags, say
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import make_folder, new_console
 
 if TYPE_CHECKING:
     from cadalign.retrieval import Library

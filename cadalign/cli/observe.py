@@ -13,8 +13,7 @@ import numpy as np
 import tyro
 
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
-from cadalign.cli.options import named_as_flags
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import make_folder, named_as_flags, new_console
 from cadalign.datasets import (
     ImageKeypoints,
     ModelKeypoints,

@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import named_as_flags
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import make_folder, named_as_flags, new_console
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cadalign.cli.evaluate import command_of
-from cadalign.cli.output import new_console
+from cadalign.cli.options import new_console
 from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
 from cadalign.evaluation.estimates.options import EstimatesOptions

@@ -9,8 +9,13 @@ from typing import Annotated
 
 import tyro
 
-from cadalign.cli.options import ObservationCommand, OptionError, named_as_flags
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import (
+    ObservationCommand,
+    OptionError,
+    make_folder,
+    named_as_flags,
+    new_console,
+)
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior

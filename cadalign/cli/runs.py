@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from cadalign.cli.output import new_console
+from cadalign.cli.options import new_console
 
 if TYPE_CHECKING:
     from collections.abc import Callable

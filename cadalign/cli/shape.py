@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from cadalign.cli.options import JsonOption
-from cadalign.cli.output import make_folder, new_console
+from cadalign.cli.options import JsonOption, make_folder, new_console
 from cadalign.datasets import KeypointNet
 from cadalign.render.drawing.shape_picture import draw_shape
 from cadalign.shapes.model import ShapeModel

@@ -39,7 +39,9 @@ def plot_result(
         what = f"{view} is not one of the {len(result.views)} views"
         raise InputError(what, where="view", fix="views count from 0")
     seen = result.views[view]
-    axes = plot_photo(seen.camera, _pixels(image), axes=axes)
+    if isinstance(image, str | os.PathLike):
+        image = read_photo(Path(image))
+    axes = plot_photo(seen.camera, image, axes=axes)
     known = result.known_mesh(mesh)
     if known is not None:
         plot_mesh(axes, seen.camera, seen.alignment, known)
@@ -59,8 +61,9 @@ def result_html(result: ResultData) -> str:
     if result.focal == "estimate":
         rows.append(("focal length", f"{result.camera.fx:.4g} px"))
     aspect = result.camera.height / result.camera.width
+    note = f"Warning: {'; '.join(result.warnings)}" if result.warnings else ""
     picture = draw_picture(lambda axes: plot_result(result, axes=axes), aspect=aspect)
-    return card(f"Result ({result.method})", rows, picture=picture, note=_note(result.warnings))
+    return card(f"Result ({result.method})", rows, picture=picture, note=note)
 
 
 def _pose_rows(
@@ -81,13 +84,3 @@ def _pose_rows(
         ("translation", f"({shift}) ± ({known_to})"),
         ("stretch", ", ".join(scales)),
     ]
-
-
-def _note(warnings: tuple[str, ...]) -> str:
-    return "" if not warnings else "Warning: " + "; ".join(warnings)
-
-
-def _pixels(image: Photo | None) -> npt.ArrayLike | None:
-    if isinstance(image, str | os.PathLike):
-        return read_photo(Path(image))
-    return image

@@ -60,10 +60,12 @@ def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArra
         per_pose[rig.pose[view]].extend(moved)
     is_metric = bool(evidence.scales.free.all())
     if init is not None:
+        unknowns = 6 * poses + int(evidence.scales.free.sum())
+        is_open = count_equations(evidence) - len(evidence.shape.modes) < unknowns
         for given, found_of_pose in zip(init.poses, per_pose, strict=True):
             if given is None:
                 continue
-            if _is_underdetermined(evidence):  # what the keypoints alone suggest is arbitrary
+            if is_open:  # what the keypoints alone suggest is arbitrary
                 found_of_pose.clear()
             found_of_pose.insert(0, (given, init.log_scales))
     elif is_metric and poses == 1:
@@ -101,12 +103,6 @@ class Start(NamedTuple):
     log_scales: FloatArray
 
 
-def _is_underdetermined(evidence: Evidence) -> bool:
-    """True if there are fewer equations than poses and scales have unknowns."""
-    unknowns = 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-    return count_equations(evidence) - len(evidence.shape.modes) < unknowns
-
-
 def _with_rig(
     evidence: Evidence, per_pose: list[list[tuple[FloatArray, FloatArray]]]
 ) -> tuple[FloatArray, FloatArray]:
@@ -120,18 +116,14 @@ def _with_rig(
             start = []
             for p, found in enumerate(per_pose):
                 pose, scales = found[min(rank, len(found) - 1)]
-                centre = _centre(evidence.rig.cam_from_rig[evidence.rig.pose == p][0])
+                camera = evidence.rig.cam_from_rig[evidence.rig.pose == p][0]
+                centre = -camera[:9].reshape(3, 3).T @ camera[9:]
                 enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
                 start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
             starts.append((np.array(start), logs))
     kept = starts[:_MOST_STARTS]
     poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
     return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
-
-
-def _centre(camera: FloatArray) -> FloatArray:
-    """A camera's place (3,) in the rig's frame."""
-    return np.asarray(-camera[:9].reshape(3, 3).T @ camera[9:])
 
 
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:

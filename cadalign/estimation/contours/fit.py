@@ -92,6 +92,17 @@ class _Candidate(NamedTuple):
     surface: Surface
     settled: Settled
 
+    @property
+    def minimum(self) -> Minimum:
+        """The minimum that the rounds led to."""
+        settled = self.settled
+        return self.start._replace(
+            evidence=settled.evidence,
+            state=settled.state,
+            cost=settled.cost,
+            score=settled.score + self.prior_score,
+        )
+
 
 def fit_masks(
     model: Model | ShapeModel,
@@ -138,7 +149,10 @@ def fit_masks(
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
             by_hulls = settle_all(known, choice.hulls)
-            if by_hulls and (not best or _is_better(by_hulls[0], best[0])):
+            # Hulls that agree so much better: the rest of the outline is another object's.
+            if by_hulls and (
+                not best or _misfit(by_hulls[0].settled) < _HULL_GAIN * _misfit(best[0].settled)
+            ):
                 best, used = by_hulls, known
         wrong = _contradicting(best, used)
         if wrong is None:
@@ -146,7 +160,11 @@ def fit_masks(
         contour, reason = wrong
         if len(used) == 1 and is_open:
             if not best:
-                raise _no_rim(contour)
+                raise DegenerateError(
+                    "no part of the model's outline comes near its contour",
+                    where=f"views[{contour.image}].mask",
+                    fix="give an init that shows the model near the mask, or keypoints",
+                )
             warnings.append(f"views[{contour.image}].mask: {reason}")
             break
         warnings.append(
@@ -158,13 +176,8 @@ def fit_masks(
     residuals: list[MaskResiduals | None] = [None] * len(views)
     for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
         residuals[contour.image] = _residuals(contour, fit)
-    found = [_minimum(each) for each in best] if used else list(minima)
+    found = [each.minimum for each in best] if used else list(minima)
     return MaskFit(found, tuple(residuals), tuple(warnings))
-
-
-def _is_better(by_hulls: _Candidate, other: _Candidate) -> bool:
-    """True if hulls agree so much better that the rest of the outline is another object's."""
-    return _misfit(by_hulls.settled) < _HULL_GAIN * _misfit(other.settled)
 
 
 def _is_determined(minimum: Minimum) -> bool:
@@ -280,16 +293,6 @@ def _cost(evidence: Evidence, state: State) -> float:
     return information_of(*reduced(evidence, state))[0]
 
 
-def _minimum(candidate: _Candidate) -> Minimum:
-    settled = candidate.settled
-    return candidate.start._replace(
-        evidence=settled.evidence,
-        state=settled.state,
-        cost=settled.cost,
-        score=settled.score + candidate.prior_score,
-    )
-
-
 def _residuals(contour: ViewContour, fit: ContourFit | None) -> MaskResiduals:
     """The residuals of a mask; without a fit those of one that was left out."""
     points, normals, _ = contour.contour
@@ -301,14 +304,6 @@ def _residuals(contour: ViewContour, fit: ContourFit | None) -> MaskResiduals:
     sigma, correlation, _ = fit.noise
     near = np.abs(np.nan_to_num(fit.residuals, nan=np.inf)) < _INLIER * sigma
     return MaskResiduals(points, normals, fit.residuals, near, sigma, correlation, fit.offset)
-
-
-def _no_rim(contour: ViewContour) -> DegenerateError:
-    return DegenerateError(
-        "no part of the model's outline comes near its contour",
-        where=f"views[{contour.image}].mask",
-        fix="give an init that shows the model near the mask, or keypoints",
-    )
 
 
 def hull_contour(contour: ViewContour, view: View) -> ViewContour | None:

@@ -147,8 +147,8 @@ def settle(
     says that the start may be far off.
     """
     offsets = np.zeros(len(views))
-    first_reach = max(_first_reach(view, is_wide=is_wide) for view in views)
-    reach = first_reach
+    share = _WIDE_REACH if is_wide else _RELATIVE_REACH
+    reach = max(_FIRST_REACH, *(share * view.contour.size for view in views))
     if noises is not None:
         reach = min(reach, _reach_of(max(noise.sigma for noise in noises)))
     current = noises or [_first_noise(view, reach, is_exact=surface.is_exact) for view in views]
@@ -224,12 +224,6 @@ def settle(
 
 def _reach_of(sigma: float) -> float:
     return max(_REACH * sigma, _LEAST_REACH)
-
-
-def _first_reach(view: ViewContour, *, is_wide: bool) -> float:
-    """Largest distance [px] between rim and contour at the start."""
-    share = _WIDE_REACH if is_wide else _RELATIVE_REACH
-    return max(_FIRST_REACH, share * view.contour.size)
 
 
 def _cauchy(residual: float, noise: Noise) -> float:

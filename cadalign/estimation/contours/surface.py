@@ -216,13 +216,14 @@ def _nearest_with_mesh(
     sums = np.where(known, squares, 0.0).sum(axis=1)
     distances = np.where(known.any(axis=1), sums / np.maximum(known.sum(axis=1), 1), np.inf)
     order = np.argsort(distances, kind="stable")[:_MOST_MESHES]
-    return [_only(training, rows[k]) for k in order]
-
-
-def _only(training: TrainingShapes, row: int) -> TrainingShapes:
-    return TrainingShapes(
-        (training.model_ids[row],), training.points_3d[row : row + 1], (training.mesh_paths[row],)
-    )
+    return [
+        TrainingShapes(
+            (training.model_ids[row],),
+            training.points_3d[row : row + 1],
+            (training.mesh_paths[row],),
+        )
+        for row in (rows[k] for k in order)
+    ]
 
 
 def _of_training(alone: TrainingShapes) -> tuple[Mesh, FloatArray, IntArray]:

@@ -36,6 +36,8 @@ Matrix = list[list[Finite]]
 Kind = TypeVar("Kind", bound=ResultData)
 _BEHIND = (math.inf, math.inf)
 _UNKNOWN = (math.nan, math.nan)
+_PLAIN = ("method", "component", "sigma", "cost", "known_axis", "stretched_axes", "focal")
+"""Fields of a result that are numbers and words, in its JSON form as they are."""
 
 
 class _Alternative(ForeignDocument):
@@ -172,7 +174,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
     std, misfit, statistics = result.std, result.misfit, result.statistics
     return {
         "version": VERSION,
-        "method": result.method,
+        **{name: getattr(result, name) for name in _PLAIN},
         "alignment": result.alignment.to_dict(),
         "camera": result.camera.to_dict(),
         "rms": result.rms,
@@ -188,12 +190,6 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "points_covariance": _plain(statistics.points_covariance),
         "points_cam_covariance": _plain(statistics.points_cam_covariance),
         "degrees_of_freedom": result.degrees_of_freedom,
-        "component": result.component,
-        "sigma": result.sigma,
-        "cost": result.cost,
-        "known_axis": result.known_axis,
-        "stretched_axes": result.stretched_axes,
-        "focal": result.focal,
         "focal_prior": None if result.focal_prior is None else asdict(result.focal_prior),
         "alternatives": [
             {
@@ -274,11 +270,12 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
     for row, view in enumerate(read.views):
         with within(f"views[{row}]"):
             views.append(_view(view, unknowns))
+    in_camera = read.points_cam_covariance
     statistics = Stated(
         views[0].covariance,
-        fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns),
-        points_covariance=_of_points(read.points_covariance, "points_covariance"),
-        points_cam_covariance=_of_points(read.points_cam_covariance, "points_cam_covariance"),
+        fisher_covariance=_array(read.fisher_covariance, "fisher_covariance", unknowns, unknowns),
+        points_covariance=_array(read.points_covariance, "points_covariance", None, 3, 3),
+        points_cam_covariance=_array(in_camera, "points_cam_covariance", None, 3, 3),
         warnings=tuple(read.warnings),
         misfit=_misfit(read.misfit),
         evidence=tuple(EvidenceSummary(**msgspec.structs.asdict(each)) for each in read.evidence),
@@ -290,14 +287,9 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         views=tuple(views),
         ids=tuple(read.ids),
         points_3d=np.array(read.points_3d).reshape(-1, 3),
-        method=read.method,
         statistics=statistics,
-        known_axis=read.known_axis,
-        stretched_axes=read.stretched_axes,
-        focal=read.focal,
         focal_prior=read.focal_prior,
-        sigma=read.sigma,
-        cost=read.cost,
+        **{name: getattr(read, name) for name in _PLAIN},
         alternatives=tuple(
             _alternative(entry, f"alternatives[{row}]")
             for row, entry in enumerate(read.alternatives)
@@ -305,10 +297,9 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         stats=read.stats,
         options=None if read.options is None else _options(read.options, count),
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
-        component=read.component,
         rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
         mask_residuals=tuple(map(_mask, read.mask_residuals)),
-        own_bounds=_bounds(read.bounds),
+        own_bounds=_array(read.bounds, "bounds", 2, 3),
         own_stretch=None if read.stretch is None else np.array(read.stretch),
         own_equal=read.equal_under_symmetry,
     )
@@ -322,7 +313,7 @@ def _view(read: _View, unknowns: int) -> ViewResult:
         np.array([row or _UNKNOWN for row in read.points_2d]).reshape(-1, 2),
         np.array([row or _BEHIND for row in read.residuals]).reshape(-1, 2),
         np.array(read.inliers, dtype=bool),
-        Stated(_array(read.covariance, "covariance", unknowns)),
+        Stated(_array(read.covariance, "covariance", unknowns, unknowns)),
     )
 
 
@@ -349,21 +340,13 @@ def _mask(read: _Mask | None) -> MaskResiduals | None:
     )
 
 
-def _array(value: Matrix | None, name: str, size: int) -> FloatArray | None:
-    """A covariance (size, size), if there is one."""
-    return None if value is None else as_floats(value, name=name, shape=(size, size))
-
-
-def _bounds(value: Matrix | None) -> FloatArray | None:
-    """A box (2, 3), if there is one."""
-    return None if value is None else as_floats(value, name="bounds", shape=(2, 3))
-
-
-def _of_points(value: list[Matrix] | None, name: str) -> FloatArray | None:
-    """Covariances (m, 3, 3) of keypoints, if there are any."""
-    if value is None or not value:
-        return None if value is None else np.empty((0, 3, 3))
-    return as_floats(value, name=name, shape=(None, 3, 3))
+def _array(value: list[Any] | None, name: str, *shape: int | None) -> FloatArray | None:
+    """An array of a shape, if there is one."""
+    if value is None:
+        return None
+    if not value and shape[0] is None:
+        return np.empty((0, 3, 3))  # of no keypoints
+    return as_floats(value, name=name, shape=shape)
 
 
 def _options(read: _Options, count: int) -> FitOptions:
@@ -388,5 +371,5 @@ def _alternative(entry: _Alternative, where: str) -> Alternative:
             entry.relative_likelihood,
             Camera.from_dict(entry.camera),
             np.array(entry.points_3d).reshape(-1, 3),
-            _bounds(entry.bounds),
+            _array(entry.bounds, "bounds", 2, 3),
         )

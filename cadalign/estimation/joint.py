@@ -93,7 +93,7 @@ class Found:
         The rotations' covariances lack `curvature_of_rotations`.
     warnings, evidence, basis
         As of `Stated`; warnings beside those about deviations and alternatives.
-    cost, ...
+    cost, stats, component and so on
         As of `cadalign.Result`.
     """
 

@@ -25,7 +25,7 @@ _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
 _Y = np.array([0.0, 1.0, 0.0])
 _SETTLED = 1e-8  # change of a log focal length
-ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
+LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from cadalign.estimation.joint_robust import (
 )
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import ROUNDS, Lenses, ShapePrior
+from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.robust import Support, area_of, check_support
 from cadalign.estimation.starts import Start, Starts, starts_of
@@ -159,7 +159,7 @@ def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
 def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
     score = minimum.score - score_state(minimum.evidence, minimum.state)
-    for _ in range(ROUNDS):
+    for _ in range(LENS_ROUNDS):
         log_focals = minimum.state.log_focals
         if Lenses.is_settled(log_focals):
             break

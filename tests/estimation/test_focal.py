@@ -576,7 +576,7 @@ def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The lens model may fail at the focal length found, where it did not at those tried."""
-    covariance = focal_search._covariance
+    covariance = focal_search.focal_covariance
     seen = []
 
     def fails_once(*arguments: Any) -> Any:
@@ -585,7 +585,7 @@ def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
             raise InputError("the lens distortion cannot be undone", where="points_2d")
         return covariance(*arguments)
 
-    monkeypatch.setattr(focal_search, "_covariance", fails_once)
+    monkeypatch.setattr(focal_search, "focal_covariance", fails_once)
     problem = problem_of(3, points=8, noise_px=0.0)
     given = [problem.points_3d] * 2, [problem.points_2d] * 2
     batch = fit_batch(*given, problem.camera, focal="estimate")

@@ -341,7 +341,6 @@ def _mask(read: _Mask | None) -> MaskResiduals | None:
 
 
 def _array(value: list[Any] | None, name: str, *shape: int | None) -> FloatArray | None:
-    """An array of a shape, if there is one."""
     if value is None:
         return None
     if not value and shape[0] is None:
@@ -350,7 +349,6 @@ def _array(value: list[Any] | None, name: str, *shape: int | None) -> FloatArray
 
 
 def _options(read: _Options, count: int) -> FitOptions:
-    """The options of a fit of so many keypoints."""
     with within("options"):
         sigma: Any = read.sigma
         if isinstance(sigma, list):

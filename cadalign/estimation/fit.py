@@ -212,17 +212,9 @@ def fit_batch(
     from cadalign.estimation.results import Results, SolvedTable  # only here: one fit has no table
 
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
-    options = FitOptions(
-        method=method,
-        sigma=1.0 if per_problem else sigma,  # type: ignore[arg-type]
-        loss=loss,
-        loss_scale=loss_scale,
-        stretch=stretch,
-        scale_prior_sigma=scale_prior_sigma,
-        known_axis=known_axis,
-        focal=focal,
-        focal_prior=focal_prior,
-    )
+    given: Any = 1.0 if per_problem else sigma
+    shape = (stretch, scale_prior_sigma, known_axis)
+    options = FitOptions(method, given, loss, loss_scale, *shape, focal, focal_prior)
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
     if per_problem:

@@ -148,7 +148,6 @@ def search_focal(
 
 
 def _minima(task: _Task) -> _Minima:
-    """The minima of one problem."""
     center = task.points.mean(axis=0)
     unit = float(np.sqrt(((task.points - center) ** 2).sum(axis=1).mean()))
     if not unit > 0:

@@ -252,7 +252,6 @@ def found_in_minima(
 
 
 def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
-    """The estimate of a minimum."""
     keypoints, evidence, state = len(prior.ids), minimum.evidence, minimum.state
     if prior.box_margins is not None:
         evidence, state = with_box(evidence, state, keypoints, prior.box_margins)

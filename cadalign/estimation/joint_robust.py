@@ -97,7 +97,6 @@ def robust_minima(
 def _settle(
     evidence: Evidence, state: State, threshold: FloatArray, rounds: int
 ) -> Consensus | None:
-    """Refine on the inliers until these don't change."""
     best: Consensus | None = None
     inliers = whitened_lengths(evidence, state) < threshold
     for _ in range(rounds):

@@ -382,7 +382,6 @@ def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
 
 
 def _single(parts: Sequence[Results], firsts: IntArray, k: int) -> Result:
-    """The result of problem k of parts that begin with the problems ``firsts``."""
     number = int(np.searchsorted(firsts, k, side="right")) - 1
     return parts[number].single(k - int(firsts[number]))
 

@@ -124,7 +124,6 @@ def _refined(
 def _fit_inliers(
     problems: Problems, options: FitOptions, inliers: BoolArray, start: float
 ) -> Result:
-    """The optimum for some of the only problem's keypoints."""
     sigma = options.sigma
     if sigma is not None and np.ndim(sigma) > 0:
         sigma = np.asarray(sigma, dtype=np.float64)[inliers]

@@ -146,7 +146,6 @@ def _starts(
 
 
 def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
-    """Minima of all sightings together, and the iterations they took."""
     minima, iterations = search_joint(evidence, *starts)
     all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
     found = [

@@ -284,7 +284,6 @@ def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
 
 
 def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
-    """Solve with a baseline, which is not compiled."""
     if options.method == "epnp":
         from cadalign.solvers.opencv import epnp as solver  # takes longer to import than the rest
     else:

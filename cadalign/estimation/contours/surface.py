@@ -227,7 +227,6 @@ def _nearest_with_mesh(
 
 
 def _of_training(alone: TrainingShapes) -> tuple[Mesh, FloatArray, IntArray]:
-    """The mesh of a training model, its keypoints, and their numbers in the shape."""
     source = alone.points_3d[0].astype(np.float64)
     known = np.flatnonzero(np.isfinite(source).all(axis=1))
     return load_mesh(cast(Path, alone.mesh_paths[0])), source[known], known

@@ -265,7 +265,6 @@ def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
 
 
 def _best_of(evidence: Evidence) -> tuple[State, float] | None:
-    """The best estimate of the evidence, and its cost."""
     starts = starts_of(evidence)
     if not len(starts.poses):
         return None

@@ -23,7 +23,7 @@ from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihoo
 from cadalign.estimation.uncertainty.summary import WEAK_SCALE, Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.pixels import perspective
 from cadalign.solvers.projection import ray_derivatives
 
 _FALSE_ALARMS = 0.004

@@ -124,7 +124,6 @@ def _weak_rotation(std: Uncertainty) -> list[str]:
 
 
 def _distance(alignment: Alignment, std: Uncertainty) -> tuple[float, float]:
-    """The distance, and the standard deviation of the translation along all axes together."""
     return float(np.linalg.norm(alignment.translation)), float(np.linalg.norm(std.translation))
 
 

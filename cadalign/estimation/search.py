@@ -26,7 +26,7 @@ from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
-from cadalign.solvers.joint.evidence import Evidence, Shape, State
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
@@ -88,6 +88,17 @@ class Minimum(NamedTuple):
     cost: float
     score: float
     lenses: Lenses
+
+    @property
+    def prior_score(self) -> float:
+        """The part of the score that its component's weight is; 0 where the score is infinite."""
+        own = self.score - score_state(self.evidence, self.state)
+        return own if np.isfinite(own) else 0.0
+
+    @property
+    def points(self) -> FloatArray:
+        """The shape's points (m, 3) before the stretch."""
+        return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
 def _find_minima(
@@ -157,7 +168,7 @@ def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
 
 def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
-    score = minimum.score - score_state(minimum.evidence, minimum.state)
+    prior_score = minimum.prior_score
     for _ in range(LENS_ROUNDS):
         log_focals = minimum.state.log_focals
         if Lenses.is_settled(log_focals):
@@ -170,7 +181,7 @@ def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
         if not cost < np.inf:
             break
         minimum = minimum._replace(evidence=evidence, state=state, cost=cost, lenses=lenses)
-    return minimum._replace(score=score_state(minimum.evidence, minimum.state) + score)
+    return minimum._replace(score=score_state(minimum.evidence, minimum.state) + prior_score)
 
 
 def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float) -> None:

@@ -33,7 +33,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, log_focals_of, points_of
+from cadalign.solvers.joint.evidence import Evidence, Planes, log_focals_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border
@@ -74,9 +74,8 @@ def fit_depths(
     if not samples:
         return list(minima)
     keypoints, first = len(prior.ids), minima[0]
-    points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
     where = f"views[{samples[0].image}].depth"
-    surface = surfaces_of(model, points[:keypoints], where).surfaces[0]
+    surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
     likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
     found = [_settled(each, keypoints, samples, surface) for each in likely[:_MOST_STARTS]]
     found.sort(key=lambda minimum: minimum.score)
@@ -109,8 +108,7 @@ def _settled(
     """Rounds from one minimum until the cost changes little."""
     state, last = start.state, np.inf
     result, bare = start, _without_keypoints(start.evidence, samples)
-    own = score_state(start.evidence, start.state)
-    extra = start.score - own if np.isfinite(start.score - own) else 0.0
+    prior_score = start.prior_score
     for _ in range(_ROUNDS):
         posed = surface.at(start.evidence.shape, state)
         poses, ratios = poses_of(bare, state), np.exp(log_focals_of(bare, state))
@@ -130,7 +128,7 @@ def _settled(
         if not cost < np.inf:
             return start
         score = score_state(full, room)
-        result = start._replace(evidence=full, state=room, cost=cost, score=score + extra)
+        result = start._replace(evidence=full, state=room, cost=cost, score=score + prior_score)
         state, _ = state_without_points(room, keypoints, total)
         if abs(last - cost) < _SETTLED:
             break

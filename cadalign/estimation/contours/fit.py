@@ -32,9 +32,8 @@ from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResidua
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import score_state
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
@@ -82,15 +81,19 @@ class _Candidate(NamedTuple):
     """A start, a surface, and where the rounds led.
 
     ``evidence`` and ``state`` are those of the start, with displacements as modes: the surface
-    follows them. ``prior_score`` is that of the component.
+    follows them.
     """
 
     start: Minimum
     evidence: Evidence
     state: State
-    prior_score: float
     surface: Surface
     settled: Settled
+
+    @property
+    def score(self) -> float:
+        """-2 log of its probability."""
+        return self.settled.score + self.start.prior_score
 
     @property
     def minimum(self) -> Minimum:
@@ -100,7 +103,7 @@ class _Candidate(NamedTuple):
             evidence=settled.evidence,
             state=settled.state,
             cost=settled.cost,
-            score=settled.score + self.prior_score,
+            score=self.score,
         )
 
 
@@ -135,8 +138,7 @@ def fit_masks(
         return MaskFit(list(minima), (), ())
     keypoints = len(prior.ids)
     first = minima[0]
-    points = points_of(first.evidence.shape, first.state) / np.exp(first.state.log_scales)
-    choice = surfaces_of(model, points[:keypoints], f"views[{contours[0].image}].mask")
+    choice = surfaces_of(model, first.points[:keypoints], f"views[{contours[0].image}].mask")
     is_open = not _is_determined(first)
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
@@ -204,8 +206,6 @@ def _settled(
     """
     found = []
     for start in starts:
-        own = score_state(start.evidence, start.state)
-        extra = start.score - own if np.isfinite(start.score - own) else 0.0
         evidence, state = with_displacement_modes(start.evidence, start.state)
         # Surfaces of a learned shape follow its modes first: with the keypoints' own displacements
         # a round takes several times as long, and modes tell the surfaces apart.
@@ -215,7 +215,7 @@ def _settled(
         for surface in surfaces:
             settled = settle(given[0], keypoints, given[1], contours, surface, is_wide=is_wide)
             if settled is not None:
-                tried.append(_Candidate(start, evidence, state, extra, surface, settled))
+                tried.append(_Candidate(start, evidence, state, surface, settled))
         if tried:
             best = min(tried, key=lambda each: _misfit(each.settled))
             if is_learned:
@@ -236,7 +236,7 @@ def _settled(
             if settled is not None:
                 again.append(each._replace(settled=settled))
         found = again
-    found.sort(key=lambda each: each.settled.score + each.prior_score)
+    found.sort(key=lambda each: each.score)
     return found
 
 

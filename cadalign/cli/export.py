@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.cli.options import OptionError, named_as_flags, new_console
+from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
 
 

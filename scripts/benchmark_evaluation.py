@@ -21,7 +21,8 @@ import tyro
 from common import COMMAND, figure, processor_seconds, reference_seconds, write_figures
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.benchmark import Benchmark
+from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 
@@ -40,7 +41,7 @@ class EvaluationArguments:
     """File for the figures, as `compare_ratios.py` reads them."""
 
 
-def evaluate_all(experiment: KeypointNetExperiment, tasks: KeypointTasks, count: int) -> None:
+def evaluate_all(experiment: Benchmark, tasks: KeypointTasks, count: int) -> None:
     """Evaluate the first tasks, chunk by chunk."""
     for start in range(0, count, CHUNK):
         experiment.evaluate(tasks[start : min(start + CHUNK, count)])
@@ -50,7 +51,7 @@ def on_annotations(root: Path, count: int, method: str) -> dict[str, Any]:
     """Rate of instances whose meshes are not looked at."""
     options = KeypointNetOptions(root, visibility="hull", methods=(method,))
     tasks = KeypointTasks(KeypointNet(root), options)
-    experiment = KeypointNetExperiment(options, None)
+    experiment = keypointnet_benchmark(options)
     experiment.warm_up()
     count = min(count, len(tasks))
     reference = reference_seconds()

@@ -1,1 +1,13 @@
-"""Evaluation: instances with a known answer, their errors, and tables of these."""
+"""Evaluation of methods on data sets: instances x methods x metrics."""
+
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.api import evaluate, simulate
+    from cadalign.evaluation.methods.registry import register_method
+
+__all__ = ["evaluate", "register_method", "simulate"]
+
+__getattr__ = lazy_names(__name__)

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cadalign.evaluation.methods.registry import names_of
 from cadalign.evaluation.options import ExperimentOptions, tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
@@ -49,7 +50,8 @@ def evaluate(
         ``--noise-px 2``. Those of ``keypointnet`` are the fields of
         `cadalign.evaluation.keypointnet.options.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
-        ``shape``, ``visibility``, ``render``, ``seed``.
+        ``shape``, ``visibility``, ``render``, ``seed``. Among ``methods`` may be functions of one's
+        own, and names that they were registered by; see `cadalign.evaluation.register_method`.
 
     Returns
     -------
@@ -71,6 +73,8 @@ def evaluate(
     >>> table = evaluate("colmap_model", "correspondences", draws=5)  # doctest: +SKIP
     """
     source = () if root is None else (Path(root),)
+    if not isinstance(options.get("methods"), str | None):
+        options["methods"] = names_of(options["methods"])
     chosen = spec_named(experiment).options(*source, **tuples(options))
     with ExitStack() as stack:
         if out is None:

@@ -7,9 +7,10 @@ the text below it. These modules load quickly: `cadalign --help` imports them.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from cadalign.errors import InputError
 
@@ -22,6 +23,8 @@ class ExperimentOptions:
     """Name of the experiment, as the run's configuration has it."""
     command: ClassVar[str] = "evaluate"
     """Command that runs it."""
+    runs_functions: ClassVar[bool] = False
+    """It runs registered functions among its methods."""
 
     seed: int = 0
     """Seed of everything random."""
@@ -43,6 +46,22 @@ class ExperimentOptions:
     def threads(self) -> int:
         """Number of threads of a run without workers."""
         return 1
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods, those of plugins.
+
+        Raises
+        ------
+        InputError
+            If the other methods are not given.
+        """
+        methods: tuple[str, ...] = getattr(self, "methods", ())
+        if not methods:
+            fix = "give --methods, too: the functions, and methods to compare them with"
+            raise InputError("the other methods are not given", where="plugin", fix=fix)
+        found = copy(self)
+        object.__setattr__(found, "methods", tuple(dict.fromkeys((*methods, *names))))
+        return found
 
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
@@ -106,6 +125,16 @@ class RunOptions:
     """Processes; -1 for one for each core (the default; for running times it is 1), 0 for none."""
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginOption:
+    """Methods of one's own on the command line."""
+
+    plugin: tuple[str, ...] = ()
+    """Functions to run beside the methods, module:function or name=module:function; the module may
+    be a file, such as mine.py:solve. They take points_3d, points_2d and a camera, or a model and
+    its views, and return an alignment. A module alone registers its methods itself."""
 
 
 def tuples(options: dict[str, Any]) -> dict[str, Any]:

@@ -25,6 +25,10 @@ SKIPPED = "skipped"
 """Of an instance that no view shows enough keypoints of: no method was run, and none failed."""
 
 
+class LeftOutError(CadalignError):
+    """An instance, or a method on it, lacks what is asked for; that is no failure."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Result of one method on one task.
@@ -45,12 +49,6 @@ class Outcome:
     def failure(cls, reason: str, names: Row, **values: Any) -> Outcome:
         """A failed task; ``values`` are the columns that are known of it all the same."""
         return cls(names, values, FAILED, reason)
-
-    @classmethod
-    def without_instance(cls, error: Exception, names: Row, **values: Any) -> Outcome:
-        """A task whose instance could not be made: skipped where too few keypoints are visible."""
-        status = SKIPPED if isinstance(error, TooFewVisibleError) else FAILED
-        return cls(names, values, status, reason_of(error))
 
     @property
     def is_ok(self) -> bool:
@@ -91,6 +89,13 @@ def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
         return box_iou_up_to_scale(est=est, gt=gt)
     except InputError:
         return None
+
+
+def status_of(error: Exception) -> str:
+    """The status of a row without metrics, by the reason that there are none."""
+    if isinstance(error, TooFewVisibleError):
+        return SKIPPED
+    return LEFT_OUT if isinstance(error, LeftOutError) else FAILED
 
 
 def reason_of(error: Exception) -> str:

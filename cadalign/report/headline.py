@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from cadalign.evaluation.accuracy.methods import LIMIT
+from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.registry import spec_of

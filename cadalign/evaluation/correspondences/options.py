@@ -27,6 +27,7 @@ class CorrespondenceOptions(ExperimentOptions):
     """
 
     experiment = "correspondences"
+    runs_functions = True
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder of a COLMAP or Bundler model, or of a blind-PnP data set's split."""
@@ -55,10 +56,11 @@ class CorrespondenceOptions(ExperimentOptions):
     """Largest number of images, the first ones."""
 
     def __post_init__(self) -> None:
-        from cadalign.evaluation.accuracy.methods import LIMIT, check_methods
+        from cadalign.evaluation.methods.fitted import LIMIT
+        from cadalign.evaluation.methods.registry import checked_names
 
         super().__post_init__()
-        object.__setattr__(self, "methods", check_methods(self.methods))
+        object.__setattr__(self, "methods", checked_names(self.methods))
         if LIMIT in self.methods:
             raise InputError(
                 "the Cramer-Rao bound needs the noise of the image points, unknown in real images",

@@ -8,9 +8,10 @@ from functools import partial
 from cadalign.datasets import open_correspondences
 from cadalign.evaluation import metrics
 from cadalign.evaluation.correspondences import summary
-from cadalign.evaluation.correspondences.experiment import COLUMNS, CorrespondenceExperiment
+from cadalign.evaluation.correspondences.experiment import COLUMNS, correspondence_benchmark
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -31,7 +32,8 @@ def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[Corresponden
         "correspondences": tasks.fingerprint(),
     }
     del config["format"]  # the loader says it
-    return Plan(CorrespondenceExperiment(options), tasks, config, _CHUNK)
+    benchmark = correspondence_benchmark(options)
+    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
 
 
 def _describe(run: Run) -> str:

@@ -29,10 +29,10 @@ class CorrespondenceTask:
     seen: Correspondences | None
     problem: str = ""
 
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method."""
-        labels = {"image": self.image, "draw": self.draw, "outliers": self.outliers}
-        return {**labels, "method": method}
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
 
 
 class CorrespondenceTasks(Sequence[CorrespondenceTask]):

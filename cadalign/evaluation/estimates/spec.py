@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from cadalign.evaluation import metrics
-from cadalign.evaluation.estimates.experiment import EstimatesExperiment
+from cadalign.evaluation.estimates.experiment import estimates_benchmark
 from cadalign.evaluation.estimates.files import method_names, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.photos.experiment import COLUMNS
@@ -54,8 +54,8 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         "strays": strays,
         "annotations": tasks.fingerprint(),
     }
-    experiment = EstimatesExperiment(options, methods, folder.made_for_pictures())
-    return Plan(experiment, tasks, config, _CHUNK)
+    benchmark = estimates_benchmark(options, methods, folder.made_for_pictures())
+    return Plan(benchmark, tasks, config, _CHUNK)
 
 
 def _fingerprint(path: Path) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.align import align
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
@@ -19,17 +21,21 @@ from cadalign.evaluation.evidence.options import (
     GRAVITY,
     LENGTH,
     MASK,
+    METHODS,
     VIEWS_FREE,
     VIEWS_KNOWN,
     EvidenceRunOptions,
 )
 from cadalign.evaluation.evidence.scene import ObjectScene, Shot
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.methods.method import Method
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 
+EVERYTHING = "all"
+"""The method that gives evidence of each kind."""
 _LEAST_FREE = 3  # keypoints of a view that moved in an unknown way
 
 
@@ -42,8 +48,40 @@ class Given:
     size: Size | None
 
 
-def evidence_for(method: str, scene: ObjectScene, options: EvidenceRunOptions) -> Given:
+@dataclass(frozen=True, eq=False)
+class EvidenceInstance:
+    """A scene, and the accuracy of its evidence."""
+
+    scene: ObjectScene
+    options: EvidenceRunOptions
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceEstimate:
+    """An estimate, and what it was made from, unless a registered function made it."""
+
+    answer: Alignment | Result
+    given: Given | None
+
+    @property
+    def alignment(self) -> Alignment:
+        """The estimated alignment."""
+        return self.answer if isinstance(self.answer, Alignment) else self.answer.alignment
+
+
+def align_with(method: str, instance: EvidenceInstance) -> EvidenceEstimate:
+    """Align the scene's model with the evidence that a method gives."""
+    given = evidence_for(method, instance)
+    return EvidenceEstimate(align(instance.scene.model, given.views, size=given.size), given)
+
+
+OWN_METHODS = {name: Method(name, partial(align_with, name)) for name in METHODS}
+"""The experiment's methods by name: each is `align` with some evidence."""
+
+
+def evidence_for(method: str, instance: EvidenceInstance) -> Given:
     """The views and the size that a method gives."""
+    scene, options = instance.scene, instance.options
     kinds = COMBINED.get(method, (method,))
     count = next((VIEWS_KNOWN[kind] for kind in kinds if kind in VIEWS_KNOWN), 1)
     shots = scene.shots[:count]

@@ -43,6 +43,7 @@ class EvidenceRunOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "evidence"
+    runs_functions = True
     visibility: ClassVar[str] = "rays"
 
     root: Annotated[Path, tyro.conf.Positional]
@@ -76,11 +77,9 @@ class EvidenceRunOptions(ModelOptions, NoiseOption):
             value = getattr(self, name)
             if not 0 < value < 90:
                 raise InputError(f"{value} is not between 0 and 90", where=name)
-        object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
-        unknown = [name for name in self.methods if name not in METHODS]
-        if unknown or not self.methods:
-            what = f"unknown method {unknown[0]!r}" if unknown else "none is given"
-            raise InputError(what, where="methods", fix=f"known are {', '.join(METHODS)}")
+        from cadalign.evaluation.methods.registry import checked_names
+
+        object.__setattr__(self, "methods", checked_names(self.methods, METHODS))
 
 
 OPTIONS = EvidenceRunOptions

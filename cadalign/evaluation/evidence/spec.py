@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.evidence.experiment import COLUMNS, EvidenceExperiment
+from cadalign.evaluation.evidence.experiment import COLUMNS, evidence_benchmark
 from cadalign.evaluation.evidence.figures import plots
 from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.evidence.summary import HEADLINE, console_table, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -30,7 +31,8 @@ def plan(options: EvidenceRunOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),
     }
-    return Plan(EvidenceExperiment(options), tasks, config, _CHUNK)
+    benchmark = evidence_benchmark(options)
+    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
 
 
 def _describe(run: Run) -> str:

@@ -22,6 +22,7 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "keypointnet"
+    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout."""
@@ -46,10 +47,10 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     """Draw the first method's result for every model with a mesh, or nothing."""
 
     def __post_init__(self) -> None:
-        from cadalign.evaluation.accuracy.methods import check_methods
+        from cadalign.evaluation.methods.registry import checked_names
 
         super().__post_init__()
-        check_methods(self.methods)
+        object.__setattr__(self, "methods", checked_names(self.methods))
         self.check_least(min_visible=1, views_per_model=1)
         self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
 

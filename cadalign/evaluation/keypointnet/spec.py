@@ -8,12 +8,13 @@ from typing import Any
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
-from cadalign.evaluation.keypointnet.experiment import REQUIRED_COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import REQUIRED_COLUMNS, keypointnet_benchmark
 from cadalign.evaluation.keypointnet.figures import draw_figures
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.metrics import INSTANCE_METRICS, UP_TO_SCALE
 from cadalign.evaluation.paper.table import PERCENT_NOTE, paper_lines
 from cadalign.evaluation.runs.folder import RunFolder
@@ -41,7 +42,7 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         shapes = ShapeFiles.find(options.shape, dataset.categories)
         of_shapes = {"shape": str(options.shape.absolute()), "shapes": shapes.fingerprint()}
     pictures = folder.made_for_pictures() if drawn else None
-    experiment = KeypointNetExperiment(options, pictures, shapes)
+    benchmark = keypointnet_benchmark(options, pictures, shapes)
     given = {name: value for name, value in options.as_config().items() if name != "shape"}
     config = {
         **given,
@@ -49,9 +50,10 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),
+        **fingerprints(benchmark.methods),
     }
     large = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return Plan(experiment, tasks, config, _CHUNK_DRAWN if drawn else large)
+    return Plan(benchmark, tasks, config, _CHUNK_DRAWN if drawn else large)
 
 
 def _check_drawable(dataset: KeypointNet, options: KeypointNetOptions) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.evaluation import metrics
-from cadalign.evaluation.accuracy.methods import LIMIT
+from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (

@@ -36,7 +36,7 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
     keypoints, ``thumbs`` the part around the object with the boxes, ``pictures`` the photo alone,
     ``sketches`` the preview. Files appear whole or not at all.
     """
-    names = sighting.target.names("")
+    names = sighting.target.names
     stem = record_stem(names["category"], names["model_id"])
     photo, camera = _photo(sighting)
     scale = camera.width / sighting.camera.width

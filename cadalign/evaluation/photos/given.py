@@ -87,7 +87,7 @@ def _targets(dataset: PhotoDataset, root: str) -> Iterator[PhotoTarget]:
 def _outcome(
     target: PhotoTarget, protocol: Protocol, est: Alignment | None, method: str
 ) -> Outcome:
-    names, facts = target.names(method), {"source": ""}
+    names, facts = {**target.names, "method": method}, {"source": ""}
     if est is None:
         return Outcome.failure("there is no estimate", names, **facts)
     try:

@@ -27,6 +27,7 @@ class PhotosOptions(ExperimentOptions):
     """
 
     experiment = "photos"
+    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder of the data set, in any of the known formats."""
@@ -72,8 +73,11 @@ class PhotosOptions(ExperimentOptions):
         if not math.isfinite(self.min_score):
             raise InputError(f"{self.min_score} is not a score", where="min_score")
         object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
+        from cadalign.evaluation.methods.registry import is_registered
+
         for name in self.methods:
-            check_method(name)
+            if not is_registered(name):
+                check_method(name)
 
 
 OPTIONS = PhotosOptions

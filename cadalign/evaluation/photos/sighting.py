@@ -9,9 +9,9 @@ from scipy import ndimage
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.photos.photo import NamedPoints, Photo, PhotoObject
-from cadalign.errors import CadalignError
 from cadalign.estimation.fit import fit
 from cadalign.evaluation.instances.aligned import box_alignment
+from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.photos.cad import Cad
 from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import Protocol
@@ -26,10 +26,6 @@ ANNOTATED, DETECTED, SIMULATED = "annotated", "detected", "simulated"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
-
-
-class LeftOutError(CadalignError):
-    """An object, or a method on it, lacks what is asked for; that is no failure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +92,12 @@ class PhotoTarget:
         middle = (left + right) / 2, (top + bottom) / 2
         return Camera(camera.width, camera.height, annotated.fx, annotated.fy, *middle)
 
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method."""
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
         found = self.found
         model_id = f"{self.photo.name}/{found.object_id}"
-        return {"category": found.category, "model_id": model_id, "view": 0, "method": method}
+        return {"category": found.category, "model_id": model_id, "view": 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +224,7 @@ def _simulated(
         seen = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
     else:
         raise LeftOutError("there are neither keypoints nor a mesh to simulate them on")
-    name = target.names("")["model_id"]
+    name = target.names["model_id"]
     noise = instance_rng(options.seed, name, "keypoints").standard_normal((len(model), 2))
     pixels = camera.project_where_ahead(gt.apply(model.xyz)) + options.simulated_noise_px * noise
     return model, tuple(np.array(model.names)[seen].tolist()), pixels[seen]

@@ -11,8 +11,9 @@ import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.outcome import FAILED, LEFT_OUT
-from cadalign.evaluation.photos.experiment import COLUMNS, PhotosExperiment
+from cadalign.evaluation.photos.experiment import COLUMNS, photos_benchmark
 from cadalign.evaluation.photos.figures import plots
 from cadalign.evaluation.photos.names import DEPTH, GRAVITY, MASK, RIGID, default_methods
 from cadalign.evaluation.photos.options import PhotosOptions
@@ -57,7 +58,8 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     }
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return Plan(PhotosExperiment(options, shapes, pictures), tasks, config, chunk)
+    benchmark = photos_benchmark(options, shapes, pictures)
+    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), chunk)
 
 
 def _evidence(dataset: PhotoDataset) -> set[str]:

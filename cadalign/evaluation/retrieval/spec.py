@@ -6,7 +6,7 @@ from functools import partial
 
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.metrics import QUERIES
-from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, RetrievalExperiment
+from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, retrieval_benchmark
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.summary import HEADLINE, console_table, lines, plots, summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, retrieval_tasks
@@ -37,7 +37,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         "root": str(options.root.absolute()),
         "library": name,
     }
-    return Plan(RetrievalExperiment(str(file.absolute()), options), tasks, config, _CHUNK)
+    return Plan(retrieval_benchmark(str(file.absolute()), options), tasks, config, _CHUNK)
 
 
 def _library_of(options: RetrievalRunOptions) -> Library:

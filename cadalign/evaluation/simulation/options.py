@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tyro
 
@@ -73,6 +73,7 @@ class SweepOptions(ExperimentOptions):
 
     experiment = "simulate"
     command = "simulate"
+    runs_functions = True
 
     sweep: Annotated[str, tyro.conf.Suppress]
     """The quantity that is varied: noise, points, outliers or runtime."""
@@ -98,12 +99,16 @@ class SweepOptions(ExperimentOptions):
                 fix=f"known are {', '.join(SWEEPS)}",
             )
         if self.methods is not None:
-            from cadalign.evaluation.accuracy.methods import check_methods
+            from cadalign.evaluation.methods.registry import checked_names
 
-            object.__setattr__(self, "methods", check_methods(self.methods))
+            object.__setattr__(self, "methods", checked_names(self.methods))
         if self.values is not None:
             object.__setattr__(self, "values", tuple(float(value) for value in self.values))
         _check_values(self.kind)
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods beside the sweep's own."""
+        return replace(self, methods=(*self.kind.methods, *names))
 
     @property
     def kind(self) -> SweepKind:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from cadalign.evaluation import metrics
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -19,12 +20,15 @@ _CHUNK, _CHUNK_TIMED = 64, 20
 def plan(options: SweepOptions, folder: RunFolder) -> Plan[experiment.SweepTask]:
     """Plan a sweep."""
     kind = options.kind
-    return Plan(
-        experiment.SweepExperiment(kind, options.seed),
-        experiment.sweep_tasks(kind),
-        {"experiment": options.experiment, "seed": options.seed, "sweep": asdict(kind)},
-        _CHUNK_TIMED if kind.is_timed else _CHUNK,
-    )
+    benchmark = experiment.sweep_benchmark(kind, options.seed)
+    config = {
+        "experiment": options.experiment,
+        "seed": options.seed,
+        "sweep": asdict(kind),
+        **fingerprints(benchmark.methods),
+    }
+    chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
+    return Plan(benchmark, experiment.sweep_tasks(kind), config, chunk)
 
 
 def _describe(run: Run) -> str:

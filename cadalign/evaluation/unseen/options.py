@@ -33,6 +33,7 @@ class UnseenOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "unseen"
+    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout, with splits."""
@@ -62,11 +63,9 @@ class UnseenOptions(ModelOptions, NoiseOption):
         self.check_least(keypoints=1, views_per_model=1)
         if not 0 <= self.outliers < 1:
             raise InputError(f"{self.outliers} is not a share below 1", where="outliers")
-        object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
-        unknown = [name for name in self.methods if name not in METHODS]
-        if unknown or not self.methods:
-            what = f"unknown method {unknown[0]!r}" if unknown else "none is given"
-            raise InputError(what, where="methods", fix=f"known are {', '.join(METHODS)}")
+        from cadalign.evaluation.methods.registry import checked_names
+
+        object.__setattr__(self, "methods", checked_names(self.methods, METHODS))
         if self.split == self.train:
             what, fix = f"both are {self.split!r}", "objects must not be among the models"
             raise InputError(what, where="split, train", fix=fix)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from functools import partial
 
 from cadalign.datasets import KeypointNet
+from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec, on_datasets
-from cadalign.evaluation.unseen.experiment import COLUMNS, UnseenExperiment
+from cadalign.evaluation.unseen.experiment import COLUMNS, unseen_benchmark
 from cadalign.evaluation.unseen.figures import plots
 from cadalign.evaluation.unseen.learned import learn
 from cadalign.evaluation.unseen.options import UnseenOptions
@@ -31,8 +32,8 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[UnseenTask]:
         "annotations": tasks.fingerprint(),
         "learned": learned.fingerprint(),
     }
-    previews = folder if options.meshes else None
-    return Plan(UnseenExperiment(learned, options, previews), tasks, config, _CHUNK)
+    benchmark = unseen_benchmark(learned, options, folder if options.meshes else None)
+    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
 
 
 def _describe(run: Run) -> str:

@@ -15,7 +15,7 @@ from rich.console import Console
 import cadalign
 from cadalign import Camera, RansacOptions
 from cadalign.errors import CadalignError
-from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, simulate_problem
 
 UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)

@@ -23,7 +23,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
-from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import HIGH, Metric
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.runs.opened import Run

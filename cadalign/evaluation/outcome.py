@@ -5,17 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from cadalign.errors import CadalignError, InputError, TooFewVisibleError
+from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.runs.tables import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
-from cadalign.geometry.metrics import (
-    box_iou,
-    box_iou_up_to_scale,
-    rotation_error,
-    scale_error,
-    translation_error,
-)
 
 OK = "ok"
 FAILED = "failed"
@@ -62,33 +53,6 @@ class Outcome:
     def timing(self) -> Row:
         """The row of the table of timings."""
         return {**self.names, "seconds": self.seconds}
-
-
-def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
-    """Errors of pose and stretch by column, the translation's over a length [model units]."""
-    _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
-    return {
-        "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "translation_error": translation_error(est=est, gt=gt) / length,
-        "scale_y_error": scale_y,
-        "scale_z_error": scale_z,
-    }
-
-
-def overlap(*, est: Box, gt: Box) -> float | None:
-    """Intersection over union of two boxes; None where one has no volume."""
-    try:
-        return box_iou(est=est, gt=gt)
-    except InputError:
-        return None
-
-
-def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
-    """Like `overlap`, after the estimate was scaled about the camera centre."""
-    try:
-        return box_iou_up_to_scale(est=est, gt=gt)
-    except InputError:
-        return None
 
 
 def status_of(error: Exception) -> str:

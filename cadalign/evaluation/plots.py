@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.summary import Quartiles
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.metrics import CATEGORY, Metric, told
+from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots

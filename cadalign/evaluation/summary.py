@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics import CATEGORY, INSTANCES, Metric
+from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Row

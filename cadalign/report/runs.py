@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cadalign.errors import InputError
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.registry import spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

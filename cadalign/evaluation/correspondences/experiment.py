@@ -44,7 +44,8 @@ from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
-from cadalign.evaluation.outcome import Outcome, alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment

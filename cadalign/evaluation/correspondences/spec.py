@@ -6,12 +6,12 @@ from dataclasses import asdict
 from functools import partial
 
 from cadalign.datasets import open_correspondences
-from cadalign.evaluation import metrics
 from cadalign.evaluation.correspondences import summary
 from cadalign.evaluation.correspondences.experiment import COLUMNS, correspondence_benchmark
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
 from cadalign.evaluation.methods.registry import fingerprints
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan

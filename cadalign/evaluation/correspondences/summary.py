@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.runs.opened import Cells, Run

@@ -8,13 +8,13 @@ from typing import Any
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError
-from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
 from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
 from cadalign.evaluation.keypointnet.summary import TABLE
 from cadalign.evaluation.keypointnet.tasks import AUTO, KeypointTask
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan

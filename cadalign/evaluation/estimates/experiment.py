@@ -17,13 +17,14 @@ from cadalign.evaluation.estimates.matching import match_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LeftOutError, Outcome
 from cadalign.evaluation.photos.experiment import COLUMNS, draw, targets_of
 from cadalign.evaluation.photos.methods import PhotoEstimate
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
-from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import PhotoTarget, Sighting
+from cadalign.evaluation.photos.sighting import Sighting
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -115,7 +116,7 @@ class PosesOfFiles:
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by the metrics of the data set."""
         return [
-            attempt(score_alignment, each.target, each.protocol, found.alignment, found.box)
+            attempt(score_alignment, each.target, each.protocol.metrics, found.alignment, found.box)
             for each, found in pairs
         ]
 

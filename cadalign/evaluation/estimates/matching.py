@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from cadalign.errors import CadalignError
-from cadalign.evaluation.photos.metrics.bop import mssd
-from cadalign.evaluation.photos.sighting import PhotoTarget
+from cadalign.evaluation.metrics.bop import mssd
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.alignment import Alignment
 

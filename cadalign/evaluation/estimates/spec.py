@@ -9,10 +9,10 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from cadalign.evaluation import metrics
 from cadalign.evaluation.estimates.experiment import estimates_benchmark
 from cadalign.evaluation.estimates.files import method_names, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.photos.experiment import COLUMNS
 from cadalign.evaluation.photos.figures import plots
 from cadalign.evaluation.photos.options import PhotosOptions

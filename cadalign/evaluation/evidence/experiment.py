@@ -53,7 +53,8 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
-from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap
+from cadalign.evaluation.metrics.errors import alignment_errors, overlap
+from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

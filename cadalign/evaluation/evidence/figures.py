@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.evaluation import metrics
 from cadalign.evaluation.curves import cumulative
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.plots import Plot
 from cadalign.evaluation.runs.opened import Run
 

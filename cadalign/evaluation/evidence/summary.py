@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (

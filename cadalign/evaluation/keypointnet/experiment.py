@@ -48,7 +48,6 @@ from cadalign.errors import DataError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import Benchmark, Case, Pair
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
-from cadalign.evaluation.instances.errors import POSE_ERRORS, estimate_errors
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
@@ -64,8 +63,9 @@ from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.methods.fitted import SHAPE
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
-from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
-from cadalign.evaluation.outcome import FAILED, Outcome, overlap_up_to_scale, reason_of
+from cadalign.evaluation.metrics.errors import POSE_ERRORS, estimate_errors, overlap_up_to_scale
+from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
+from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError

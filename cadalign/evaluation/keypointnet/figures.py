@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation import metrics
 from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math
 from cadalign.evaluation.runs.opened import Run

@@ -15,7 +15,7 @@ from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
 from cadalign.evaluation.methods.registry import fingerprints
-from cadalign.evaluation.metrics import INSTANCE_METRICS, UP_TO_SCALE
+from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE
 from cadalign.evaluation.paper.table import PERCENT_NOTE, paper_lines
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cadalign.evaluation import metrics
 from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (

@@ -15,12 +15,12 @@ box_iou, box_iou_up_to_scale
     camera centre.
 scan2cad_translation_m, scan2cad_scale, scan2cad_aligned, scan2cad_aligned_axes
     Scan2CAD's errors, 1 where all are within their thresholds, and 1 where the scale of each axis
-    is too; see `cadalign.evaluation.photos.metrics.scan2cad`.
+    is too; see `cadalign.evaluation.metrics.scan2cad`.
 yaw_error_deg, depth_error, depth_error_relative, iou_3d, iou_bev
-    KITTI's; see `cadalign.evaluation.photos.metrics.kitti`.
+    KITTI's; see `cadalign.evaluation.metrics.kitti`.
 mssd, mspd_px, mssd_recall, mspd_recall, vsd_recall
     BOP's: the first in diameters, the last three averaged over the thresholds; see
-    `cadalign.evaluation.photos.metrics.bop`.
+    `cadalign.evaluation.metrics.bop`.
 
 Metrics of other data sets are empty, as are those of rows that are not ok, and of objects whose
 truth is not known.
@@ -44,6 +44,7 @@ from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, is_registered
+from cadalign.evaluation.metrics.sets import score_alignment, score_columns
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
@@ -54,10 +55,10 @@ from cadalign.evaluation.photos.methods import (
 )
 from cadalign.evaluation.photos.names import TRUTH
 from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import protocol_of
+from cadalign.evaluation.photos.protocols import SETS, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
-from cadalign.evaluation.photos.scores import SCORE_COLUMNS, score_alignment
-from cadalign.evaluation.photos.sighting import PhotoTarget, Sighting, sight
+from cadalign.evaluation.photos.sighting import Sighting, sight
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -69,7 +70,7 @@ from cadalign.shapes.model import ShapeModel
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
     *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
-    *(("rms_px", float), *SCORE_COLUMNS),
+    *(("rms_px", float), *score_columns(SETS)),
 )
 
 
@@ -201,7 +202,7 @@ def draw(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) 
 
 def _row(instance: PhotoInstance, found: PhotoEstimate) -> Row:
     sighting = instance.sighting
-    scores = score_alignment(sighting.target, instance.protocol, found.alignment, found.box)
+    scores = score_alignment(sighting.target, instance.protocol.metrics, found.alignment, found.box)
     return {"rms_px": _rms(found, sighting)} | scores
 
 

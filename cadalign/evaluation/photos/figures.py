@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from cadalign.evaluation.curves import cumulative
-from cadalign.evaluation.metrics import BOX_IOU
-from cadalign.evaluation.photos.summary import DEPTH, IOU_3D, ROTATION
+from cadalign.evaluation.metrics.kitti import DEPTH, IOU_3D
+from cadalign.evaluation.metrics.pascal3d import ROTATION
+from cadalign.evaluation.metrics.table import BOX_IOU
 from cadalign.evaluation.plots import Plot
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import known

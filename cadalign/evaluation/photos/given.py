@@ -8,12 +8,12 @@ import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import CadalignError, InputError, quote
+from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
 from cadalign.evaluation.photos.experiment import COLUMNS
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import PhotoTarget
 from cadalign.evaluation.photos.summary import summarize_cells
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Alignment
@@ -94,7 +94,7 @@ def _outcome(
         bounds = target.bounds
         if bounds is None:
             return Outcome(names, facts, LEFT_OUT, "the size of the model is not known")
-        scores = score_alignment(target, protocol, est, Box.from_model(bounds, est))
+        scores = score_alignment(target, protocol.metrics, est, Box.from_model(bounds, est))
     except CadalignError as error:
         return Outcome.failure(reason_of(error), names, **facts)
     return Outcome(names, facts | scores)

@@ -47,7 +47,8 @@ from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
-from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.evaluation.runs.tables import Columns, Row

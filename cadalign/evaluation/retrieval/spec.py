@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.metrics import QUERIES
+from cadalign.evaluation.metrics.table import QUERIES
 from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, retrieval_benchmark
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.retrieval.summary import HEADLINE, console_table, lines, plots, summarize

@@ -19,8 +19,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.retrieval.experiment import NO_VIEW

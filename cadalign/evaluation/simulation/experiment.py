@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from cadalign.estimation.result import Result
-from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Pair
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
-from cadalign.evaluation.outcome import Outcome, alignment_errors
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from cadalign.evaluation import metrics
 from cadalign.evaluation.methods.registry import fingerprints
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from cadalign.evaluation import metrics
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.runs.opened import Run

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (

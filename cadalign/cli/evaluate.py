@@ -14,7 +14,12 @@ import tyro
 from cadalign.cli.options import JsonOption, named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
-from cadalign.evaluation.options import ExperimentOptions, PluginOption, RunOptions
+from cadalign.evaluation.options import (
+    ExperimentOptions,
+    FunctionOptions,
+    PluginOption,
+    RunOptions,
+)
 from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
@@ -137,7 +142,7 @@ def _commands() -> Any:
     commands = {
         options.experiment: command_of(
             options,
-            MethodsCommand if options.runs_functions else RunCommand,
+            MethodsCommand if issubclass(options, FunctionOptions) else RunCommand,
             about=f"{getdoc(options)}\n\n{_EXIT_CODES}",
         )
         for options in known_options()

@@ -14,6 +14,8 @@ from typing import Any, Protocol, TypeVar
 
 from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import fingerprints
+from cadalign.evaluation.metrics.registry import Compared, RegisteredMetric, metrics_config
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of, status_of
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError, Rows
@@ -83,6 +85,9 @@ class Setting(Protocol):
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Cells of the result table for each estimate, or why there are none."""
 
+    def compared(self, instance: Any, estimate: Any) -> Compared:
+        """The estimated and the true alignment, for registered metrics."""
+
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
@@ -101,17 +106,25 @@ class Benchmark:
         Methods that are given all instances of a chunk at once, and share the time among them.
     repeats : int
         Calls of a method on one instance, of which the quickest is timed.
+    metrics : tuple of RegisteredMetric
+        Further columns of the result table.
     """
 
     setting: Setting
     methods: tuple[Method, ...]
     batched: frozenset[str] = frozenset()
     repeats: int = 1
+    metrics: tuple[RegisteredMetric, ...] = ()
 
     @property
     def columns(self) -> Columns:
         """The columns of the result table."""
-        return self.setting.columns
+        return (*self.setting.columns, *((each.metric.key, float) for each in self.metrics))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What a run's configuration has of users' functions; empty without any."""
+        return fingerprints(self.methods) | metrics_config(self.metrics)
 
     @property
     def timing_columns(self) -> Columns:
@@ -191,10 +204,28 @@ class Benchmark:
             return []
         found = attempt(self.setting.measure, method, pairs)
         if not isinstance(found, Exception):
-            return found
+            if not self.metrics:
+                return found
+            return [self._further(*each) for each in zip(pairs, found, strict=True)]
         if len(pairs) == 1:
             return [found]
         return [row for pair in pairs for row in self._measured(method, [pair])]
+
+    def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
+        """The cells of an estimate with those of registered metrics."""
+        if isinstance(row, Exception):
+            return row
+        instance, estimate = pair
+        found = attempt(self.setting.compared, instance, estimate)
+        if isinstance(found, Exception):
+            return found
+        given = self.setting.given(instance)
+        for each in self.metrics:
+            value = attempt(each.measure, found, given)
+            if isinstance(value, Exception):
+                return value
+            row[each.metric.key] = value
+        return row
 
     def _solved(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
         """A method's estimate of every instance, or why there is none, and its seconds."""

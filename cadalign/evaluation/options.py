@@ -23,8 +23,6 @@ class ExperimentOptions:
     """Name of the experiment, as the run's configuration has it."""
     command: ClassVar[str] = "evaluate"
     """Command that runs it."""
-    runs_functions: ClassVar[bool] = False
-    """It runs registered functions among its methods."""
 
     seed: int = 0
     """Seed of everything random."""
@@ -47,21 +45,13 @@ class ExperimentOptions:
         """Number of threads of a run without workers."""
         return 1
 
-    def with_methods(self, names: tuple[str, ...]) -> Self:
-        """The options with further methods, those of plugins.
+    def as_config(self) -> dict[str, Any]:
+        """The options in a run's configuration."""
+        return asdict(self)
 
-        Raises
-        ------
-        InputError
-            If the other methods are not given.
-        """
-        methods: tuple[str, ...] = getattr(self, "methods", ())
-        if not methods:
-            fix = "give --methods, too: the functions, and methods to compare them with"
-            raise InputError("the other methods are not given", where="plugin", fix=fix)
-        found = copy(self)
-        object.__setattr__(found, "methods", tuple(dict.fromkeys((*methods, *names))))
-        return found
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods, for experiments that run functions."""
+        raise InputError(f"{self.experiment} runs no functions", where="plugin")
 
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
@@ -81,6 +71,36 @@ class ExperimentOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FunctionOptions(ExperimentOptions):
+    """Options of experiments that take functions of one's own, as methods and as metrics."""
+
+    metrics: tuple[str, ...] = ()
+    """Metrics of one's own, beside the experiment's: names that a plugin registers."""
+
+    def as_config(self) -> dict[str, Any]:
+        """The options in a run's configuration, which has metrics where there are any."""
+        config = super().as_config()
+        del config["metrics"]
+        return config
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods, those of plugins.
+
+        Raises
+        ------
+        InputError
+            If the other methods are not given.
+        """
+        methods: tuple[str, ...] = getattr(self, "methods", ())
+        if not methods:
+            fix = "give --methods, too: the functions, and methods to compare them with"
+            raise InputError("the other methods are not given", where="plugin", fix=fix)
+        found = copy(self)
+        object.__setattr__(found, "methods", tuple(dict.fromkeys((*methods, *names))))
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
 class ModelOptions(ExperimentOptions):
     """Choice of the models of a dataset."""
 
@@ -97,7 +117,7 @@ class ModelOptions(ExperimentOptions):
 
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration: ``shapenet`` only where it is given."""
-        config = asdict(self)
+        config = super().as_config()
         shapenet = config.pop("shapenet")
         return config if shapenet is None else {**config, "shapenet": str(shapenet.absolute())}
 

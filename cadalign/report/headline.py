@@ -82,7 +82,7 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
     spec, group = spec_of(runs[0]), spec_of(runs[0]).group(runs[0])
     lines = [_all_first(spec.lines(spec.summarize(run))) for run in runs]
-    columns = spec.shown_columns([line for found in lines for line in found])
+    columns = spec.shown_columns([line for found in lines for line in found], runs)
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
         rows += _with_best([HeadlineRow.of(index, line, columns) for line in lines[index]], columns)

@@ -45,6 +45,7 @@ from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
@@ -128,6 +129,12 @@ class SpoiledImages:
         """The answer as it is."""
         return answer
 
+    def compared(self, image: SpoiledImage, estimate: Alignment | Result) -> Compared:
+        """The estimated and the true alignment."""
+        if isinstance(estimate, Alignment):
+            return Compared(estimate, image.truth.alignment)
+        return Compared(estimate.alignment, image.truth.alignment, estimate)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by column."""
         return [errors_of(estimate, image.truth, method=method) for image, estimate in pairs]
@@ -141,7 +148,8 @@ class SpoiledImages:
 
 def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
     """The methods of the options on spoiled images."""
-    return Benchmark(SpoiledImages(options), choose_methods(options.methods))
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(SpoiledImages(options), choose_methods(options.methods), metrics=metrics)
 
 
 def errors_of(found: Alignment | Result, truth: Problem, *, method: Method) -> Row:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import FunctionOptions
 
 if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
 
 
 @dataclass(frozen=True)
-class CorrespondenceOptions(ExperimentOptions):
+class CorrespondenceOptions(FunctionOptions):
     """Evaluate methods on real correspondences with outliers.
 
     For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
@@ -27,7 +27,6 @@ class CorrespondenceOptions(ExperimentOptions):
     """
 
     experiment = "correspondences"
-    runs_functions = True
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder of a COLMAP or Bundler model, or of a blind-PnP data set's split."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 
 from cadalign.datasets import open_correspondences
@@ -10,7 +9,6 @@ from cadalign.evaluation.correspondences import summary
 from cadalign.evaluation.correspondences.experiment import COLUMNS, correspondence_benchmark
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -25,7 +23,7 @@ def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[Corresponden
     images = open_correspondences(options.path, format=options.format)
     tasks = CorrespondenceTasks(images, options)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "path": str(options.path.absolute()),
         "loader": type(images).__name__,
@@ -33,7 +31,7 @@ def plan(options: CorrespondenceOptions, folder: RunFolder) -> Plan[Corresponden
     }
     del config["format"]  # the loader says it
     benchmark = correspondence_benchmark(options)
-    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
+    return Plan(benchmark, tasks, config | benchmark.config, _CHUNK)
 
 
 def _describe(run: Run) -> str:

@@ -28,6 +28,8 @@ from cadalign.evaluation.summary import (
     Summary,
     group_name,
     median_of,
+    where,
+    with_medians,
 )
 
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_OF_DISTANCE, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -42,7 +44,11 @@ def summarize(run: Run) -> list[Summary]:
     """A summary for every share of outliers and method, in the order of the run."""
     cells = run.cells
     return [
-        _summarize(share, method, cells)
+        with_medians(
+            _summarize(share, method, cells),
+            where(cells, cells["outliers"] == share),
+            run.metrics,
+        )
         for share in np.unique(cells["outliers"]).tolist()
         for method in run.methods
     ]
@@ -55,7 +61,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     return ConsoleTable(
         title="Lower quartile, median and upper quartile per share of outliers and method",
         labels=(metrics.OUTLIERS.symbol, "method"),
-        heads=(*(metric.symbol for metric in shown), metrics.MILLISECONDS.symbol),
+        heads=tuple(each.symbol for each in (*shown, metrics.MILLISECONDS, *run.metrics)),
         rows=[
             (
                 f"{100 * s['outliers']:g} %",
@@ -65,6 +71,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
                 *(_three(s[metric.key], metric) for metric in ERRORS),
                 _number(100 * s["inlier_recall"], digits=1),
                 _number(s["milliseconds"].median, digits=1),
+                *(metric.text(s[metric.key]) for metric in run.metrics),
             )
             for s in summaries
         ],

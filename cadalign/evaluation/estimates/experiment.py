@@ -17,6 +17,7 @@ from cadalign.evaluation.estimates.matching import match_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LeftOutError, Outcome
 from cadalign.evaluation.photos.experiment import COLUMNS, draw, targets_of
@@ -112,6 +113,10 @@ class PosesOfFiles:
     def answered(self, method: Method, instance: GivenPoses, answer: object) -> object:
         """See `given`."""
         return answer
+
+    def compared(self, instance: GivenPoses, estimate: PhotoEstimate) -> Compared:
+        """The estimated and the true alignment of the data set's model."""
+        return Compared(estimate.alignment, instance.target.gt)
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by the metrics of the data set."""

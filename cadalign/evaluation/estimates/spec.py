@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -43,7 +42,7 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         for problem in file.problems[:_LOGGED]:
             logger.warning("%s: left out: %s", name, problem)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "kind": dataset.kind,

@@ -54,6 +54,7 @@ from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.geometry.alignment import Alignment
@@ -127,6 +128,11 @@ class EvidenceScenes:
         """The answer beside the first view, whose bound is not known."""
         return EvidenceEstimate(answer, None)
 
+    def compared(self, instance: EvidenceInstance, estimate: EvidenceEstimate) -> Compared:
+        """The estimated and the true alignment."""
+        result = estimate.answer if isinstance(estimate.answer, Result) else None
+        return Compared(estimate.alignment, instance.scene.gt, result)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors, and their bounds, by column."""
         return [attempt(self._row, instance.scene, estimate) for instance, estimate in pairs]
@@ -162,7 +168,9 @@ class EvidenceScenes:
 
 def evidence_benchmark(options: EvidenceRunOptions) -> Benchmark:
     """The kinds of evidence of the options on views of models."""
-    return Benchmark(EvidenceScenes(options), choose_methods(options.methods, OWN_METHODS))
+    methods = choose_methods(options.methods, OWN_METHODS)
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(EvidenceScenes(options), methods, metrics=metrics)
 
 
 def _errors(est: Alignment, scene: ObjectScene) -> Row:

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 KEYPOINTS = "keypoints"
 MASK, DEPTH, GRAVITY, LENGTH = "mask", "depth", "gravity", "length"
@@ -32,7 +32,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mas
 
 
 @dataclass(frozen=True)
-class EvidenceRunOptions(ModelOptions, NoiseOption):
+class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -43,7 +43,6 @@ class EvidenceRunOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "evidence"
-    runs_functions = True
     visibility: ClassVar[str] = "rays"
 
     root: Annotated[Path, tyro.conf.Positional]

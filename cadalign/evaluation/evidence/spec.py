@@ -10,7 +10,6 @@ from cadalign.evaluation.evidence.figures import plots
 from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.evidence.summary import HEADLINE, console_table, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -32,7 +31,7 @@ def plan(options: EvidenceRunOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "annotations": tasks.fingerprint(),
     }
     benchmark = evidence_benchmark(options)
-    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
+    return Plan(benchmark, tasks, config | benchmark.config, _CHUNK)
 
 
 def _describe(run: Run) -> str:

@@ -55,6 +55,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         *(replace(metrics.TRANSLATION, digits=4), metrics.SCALE_Y, metrics.SCALE_Z),
         *(metrics.BOX_IOU, ROTATION_BOUND, replace(metrics.OVER_BOUND, symbol="R/bound")),
         metrics.QUERY_MILLISECONDS,
+        *run.metrics,
     )
     return ConsoleTable(
         title="Medians per category and evidence",

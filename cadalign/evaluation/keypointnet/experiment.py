@@ -64,6 +64,7 @@ from cadalign.evaluation.methods.fitted import SHAPE
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import POSE_ERRORS, estimate_errors, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
@@ -184,6 +185,11 @@ class KeypointViews:
         """The answer as it is."""
         return answer
 
+    def compared(self, view: KeypointView, estimate: Alignment | Result | AlignedShape) -> Compared:
+        """The estimated and the true alignment."""
+        result = estimate if isinstance(estimate, Result) else None
+        return Compared(pose_of(estimate), view.instance.gt, result)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Metrics by column of each estimate."""
         rows: list[Row | Exception] = [
@@ -226,7 +232,9 @@ def keypointnet_benchmark(
     batched = frozenset(each.name for each in methods if not each.has_statistics)
     if shapes.paths:
         methods = (*methods, Method(SHAPE, _aligned))
-    return Benchmark(KeypointViews(options, drawn_in, shapes), methods, batched)
+    setting = KeypointViews(options, drawn_in, shapes)
+    metrics = choose_metrics(options.metrics, setting.columns)
+    return Benchmark(setting, methods, batched, metrics=metrics)
 
 
 def _aligned(view: KeypointView) -> AlignedShape:

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 
 @dataclass(frozen=True)
-class KeypointNetOptions(ModelOptions, NoiseOption):
+class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate methods on views of KeypointNet's models.
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
@@ -22,7 +22,6 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "keypointnet"
-    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout."""

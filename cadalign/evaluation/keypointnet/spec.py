@@ -14,7 +14,6 @@ from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.summary import HEADLINE, console_table, lines, summarize
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE
 from cadalign.evaluation.paper.table import PERCENT_NOTE, paper_lines
 from cadalign.evaluation.runs.folder import RunFolder
@@ -50,7 +49,7 @@ def plan(options: KeypointNetOptions, folder: RunFolder) -> Plan[KeypointTask]:
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "annotations": tasks.fingerprint(),
-        **fingerprints(benchmark.methods),
+        **benchmark.config,
     }
     large = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
     return Plan(benchmark, tasks, config, _CHUNK_DRAWN if drawn else large)

@@ -17,6 +17,7 @@ import numpy as np
 
 from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.summary import (
@@ -27,6 +28,7 @@ from cadalign.evaluation.summary import (
     median_of,
     text_rows,
     where,
+    with_medians,
 )
 
 MEDIANS = (
@@ -52,19 +54,26 @@ def summarize(run: Run) -> list[Summary]:
     summaries = [
         summary
         for name in categories
-        for summary in summarize_cells(name, where(cells, cells["category"] == name))
+        for summary in summarize_cells(
+            name, where(cells, cells["category"] == name), further=run.metrics
+        )
     ]
-    return [*summaries, *summarize_cells(ALL, cells)]
+    return [*summaries, *summarize_cells(ALL, cells, further=run.metrics)]
 
 
-def summarize_cells(category: str, cells: Cells) -> list[Summary]:
+def summarize_cells(
+    category: str, cells: Cells, *, further: Sequence[Metric] = ()
+) -> list[Summary]:
     """A summary of rows for every method, in the order in which they come."""
     methods = list(dict.fromkeys(cells["method"].tolist()))
     bound = np.nan
     if LIMIT in methods:
         solved = (cells["method"] == LIMIT) & (cells["status"] == OK)
         bound = median_of(cells["rotation_error_deg"][solved])
-    return [_summarize_method(category, method, cells, bound) for method in methods]
+    return [
+        with_medians(_summarize_method(category, method, cells, bound), cells, further)
+        for method in methods
+    ]
 
 
 def lines(summaries: Sequence[Summary]) -> list[Summary]:
@@ -85,7 +94,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         rest = metrics.UP_TO_SCALE
     counts = (metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED)
     told = [each for each in counts if metrics.told(each, [s[each.key] for s in summaries])]
-    shown = (*told, *TABLE, *rest)
+    shown = (*told, *TABLE, *rest, *run.metrics)
     return ConsoleTable(
         title="Medians per category and method; success over all instances",
         labels=("category", "method"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.evaluation.methods.portable import Portable
+from cadalign.evaluation.portable import Portable
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

@@ -15,7 +15,6 @@ its functions by entry points of the group ``cadalign.methods``.
 from __future__ import annotations
 
 import difflib
-import hashlib
 import inspect
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -29,7 +28,7 @@ from typing import Any, Literal
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods.fitted import fit_methods
 from cadalign.evaluation.methods.method import POINTS, VIEWS, Method, RegisteredFunction
-from cadalign.evaluation.methods.portable import Portable, module_of, name_of
+from cadalign.evaluation.portable import Portable, code_hash, module_of, name_of
 
 ENTRY_POINTS = "cadalign.methods"
 """Group of entry points whose functions are methods by the entry points' names."""
@@ -283,8 +282,7 @@ def _said(error: Exception) -> str:
 def fingerprints(methods: Iterable[Method]) -> dict[str, Any]:
     """Hashes of the code of users' functions, for a run's configuration; empty without any.
 
-    A run must not go on with other functions. The code is the module's, or the function's own in
-    notebooks and scripts, in which other things change.
+    A run must not go on with other functions; see `code_hash`.
     """
     found = {}
     for method in methods:
@@ -292,16 +290,6 @@ def fingerprints(methods: Iterable[Method]) -> dict[str, Any]:
             continue
         function = method.solve.function.function
         module = module_of(function)
-        if module is not None and module.__name__ == _EXAMPLES:
-            continue
-        is_script = module is None or module.__name__ == "__main__"
-        found[method.name] = _hash(function if is_script else module)
+        if module is None or module.__name__ != _EXAMPLES:
+            found[method.name] = code_hash(function)
     return {"functions": found} if found else {}
-
-
-def _hash(code: Any) -> str:
-    try:
-        text = inspect.getsource(code)
-    except (OSError, TypeError):
-        text = repr(getattr(getattr(code, "__code__", None), "co_code", name_of(code)))
-    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()[:16]

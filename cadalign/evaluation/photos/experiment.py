@@ -44,6 +44,7 @@ from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, is_registered
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.metrics.sets import score_alignment, score_columns
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
@@ -142,6 +143,10 @@ class PhotoObjects:
         """The estimate of the data set's model."""
         return estimate_of_answer(answer, instance.sighting)
 
+    def compared(self, instance: PhotoInstance, estimate: PhotoEstimate) -> Compared:
+        """The estimated and the true alignment of the data set's model."""
+        return Compared(estimate.alignment, instance.sighting.target.gt, estimate.result)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by the metrics of the data set."""
         return [attempt(_row, instance, estimate) for instance, estimate in pairs]
@@ -168,7 +173,8 @@ def photos_benchmark(
     """The methods of the options on objects in photos."""
     own = {name: photo_method(name) for name in options.methods if not is_registered(name)}
     methods = choose_methods(options.methods, own)
-    return Benchmark(PhotoObjects(options, shapes, drawn_in), methods)
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(PhotoObjects(options, shapes, drawn_in), methods, metrics=metrics)
 
 
 def targets_of(task: PhotoTask, root: Path) -> list[PhotoTarget | Case]:

@@ -10,12 +10,12 @@ from typing import Annotated
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.photos.names import check_method
 
 
 @dataclass(frozen=True)
-class PhotosOptions(ExperimentOptions):
+class PhotosOptions(FunctionOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
@@ -27,7 +27,6 @@ class PhotosOptions(ExperimentOptions):
     """
 
     experiment = "photos"
-    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder of the data set, in any of the known formats."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.outcome import FAILED, LEFT_OUT
 from cadalign.evaluation.photos.experiment import COLUMNS, photos_benchmark
 from cadalign.evaluation.photos.figures import plots
@@ -48,7 +47,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
         options = replace(options, methods=methods)
     tasks = PhotoTasks(dataset, options.max_photos)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "kind": dataset.kind,
@@ -59,7 +58,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
     benchmark = photos_benchmark(options, shapes, pictures)
-    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), chunk)
+    return Plan(benchmark, tasks, config | benchmark.config, chunk)
 
 
 def _evidence(dataset: PhotoDataset) -> set[str]:

@@ -28,6 +28,7 @@ from cadalign.evaluation.metrics.nine_dof import NINE_DOF
 from cadalign.evaluation.metrics.pascal3d import VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import medians_of, shares_of
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK
 from cadalign.evaluation.photos.protocols import SETS, protocol_of
 from cadalign.evaluation.photos.sighting import SIMULATED
@@ -63,12 +64,15 @@ HEADLINE = (
 
 def summarize(run: Run) -> list[Summary]:
     """A summary for every category and method, for all together, and the mean of categories."""
-    return summarize_cells(run.cells, run.methods)
+    return summarize_cells(run.cells, run.methods, further=run.metrics)
 
 
-def summarize_cells(cells: Cells, methods: Sequence[str]) -> list[Summary]:
+def summarize_cells(
+    cells: Cells, methods: Sequence[str], *, further: Sequence[Metric] = ()
+) -> list[Summary]:
     """Summaries of the columns of a result table; see `summarize`."""
-    found = summaries_of({**cells, "category": _categories(cells)}, methods, _summarize)
+    marked = {**cells, "category": _categories(cells)}
+    found = summaries_of(marked, methods, _summarize, further=further)
     names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
     if len(names) < 2:
         return found
@@ -95,6 +99,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
         *(column for each in sets for column in each.console),
         *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
+        *run.metrics,
     )
     shown = [column for column in columns if any(_is_known(each[column.key]) for each in summaries)]
     return ConsoleTable(

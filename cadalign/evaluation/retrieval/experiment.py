@@ -48,6 +48,7 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
@@ -160,6 +161,10 @@ class RetrievalQueries:
     def answered(self, method: Method, instance: RetrievalInstance, answer: object) -> object:
         """See `given`."""
         return answer
+
+    def compared(self, instance: RetrievalInstance, matches: Sequence[Match]) -> Compared:
+        """The alignments of the best match and of the true model."""
+        return Compared(matches[0].alignment, instance.query.gt)
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Compare matches with the truth; see `match_values`."""

@@ -16,6 +16,7 @@ from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.options import SweepKind
@@ -88,6 +89,10 @@ class SweepProblems:
         """The alignment."""
         return answer if isinstance(answer, Alignment) else answer.alignment
 
+    def compared(self, instance: tuple[Problem, float], estimate: Alignment) -> Compared:
+        """The estimated and the true alignment."""
+        return Compared(estimate, instance[0].alignment)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors of pose and stretch."""
         return [alignment_errors(est=est, gt=problem.alignment) for (problem, _), est in pairs]
@@ -116,10 +121,11 @@ class SweepProblems:
         return {**self._setting(task), "run": task.run}
 
 
-def sweep_benchmark(kind: SweepKind, seed: int) -> Benchmark:
+def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
     """The methods of a sweep on its problems: in batches, or timed alone and several times."""
     methods = choose_methods(kind.methods)
-    setting = SweepProblems(kind, seed)
+    setting, further = SweepProblems(kind, seed), choose_metrics(metrics, COLUMNS)
     if kind.is_timed:
-        return Benchmark(setting, methods, repeats=_REPEATS)
-    return Benchmark(setting, methods, batched=frozenset(each.name for each in methods))
+        return Benchmark(setting, methods, repeats=_REPEATS, metrics=further)
+    batched = frozenset(each.name for each in methods)
+    return Benchmark(setting, methods, batched, metrics=further)

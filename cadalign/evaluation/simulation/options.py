@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import FunctionOptions
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,11 @@ SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS, _RUNTIME)}
 
 
 @dataclass(frozen=True)
-class SweepOptions(ExperimentOptions):
+class SweepOptions(FunctionOptions):
     """Repeat the AEPnP paper's simulation: a table, a page, and figures as PNG and PDF."""
 
     experiment = "simulate"
     command = "simulate"
-    runs_functions = True
 
     sweep: Annotated[str, tyro.conf.Suppress]
     """The quantity that is varied: noise, points, outliers or runtime."""

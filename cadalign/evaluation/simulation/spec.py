@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -20,12 +19,12 @@ _CHUNK, _CHUNK_TIMED = 64, 20
 def plan(options: SweepOptions, folder: RunFolder) -> Plan[experiment.SweepTask]:
     """Plan a sweep."""
     kind = options.kind
-    benchmark = experiment.sweep_benchmark(kind, options.seed)
+    benchmark = experiment.sweep_benchmark(kind, options.seed, options.metrics)
     config = {
         "experiment": options.experiment,
         "seed": options.seed,
         "sweep": asdict(kind),
-        **fingerprints(benchmark.methods),
+        **benchmark.config,
     }
     chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
     return Plan(benchmark, experiment.sweep_tasks(kind), config, chunk)

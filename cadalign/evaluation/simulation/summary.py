@@ -45,7 +45,7 @@ def summarize(run: Run) -> list[Summary]:
     if kind.is_timed:
         cells = {**cells, metrics.MICROSECONDS.key: 1e6 * cells["seconds"]}
     summaries = []
-    for metric in _metrics(kind):
+    for metric in _metrics(kind, run):
         for method in kind.methods:
             for value in kind.values:
                 chosen = (cells["method"] == method) & (cells[kind.column] == value)
@@ -114,7 +114,7 @@ def plots(runs: Sequence[Run]) -> list[Plot]:
             caption=f"{_held(kind)}{count} problems each; {QUARTILES_NOTE}",
             figure=f"{kind.name}_{metric.key}",
         )
-        for metric in _metrics(kind)
+        for metric in _metrics(kind, runs[0])
     ]
 
 
@@ -127,8 +127,9 @@ def _trace(run: int, method: str, metric: Metric, x: Metric, summaries: Sequence
     )
 
 
-def _metrics(kind: SweepKind) -> tuple[Metric, ...]:
-    return (metrics.MICROSECONDS, *ERRORS) if kind.is_timed else ERRORS
+def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
+    times = (metrics.MICROSECONDS,) if kind.is_timed else ()
+    return (*times, *ERRORS, *run.metrics)
 
 
 def _held(kind: SweepKind) -> str:

@@ -53,6 +53,7 @@ from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -152,6 +153,10 @@ class UnseenObjects:
         found = answer if isinstance(answer, Alignment) else answer.alignment
         return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
 
+    def compared(self, instance: UnseenInstance, estimate: ShapeEstimate) -> Compared:
+        """The estimated alignment of the method's model, and the true one of the object."""
+        return Compared(estimate.alignment, instance.sighting.gt, estimate.result)
+
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors and coverage by column."""
         return [attempt(_errors, estimate, instance.sighting) for instance, estimate in pairs]
@@ -172,7 +177,8 @@ def unseen_benchmark(
 ) -> Benchmark:
     """The methods of the options on unseen objects."""
     methods = choose_methods(options.methods, OWN_METHODS)
-    return Benchmark(UnseenObjects(learned, options, previews), methods)
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(UnseenObjects(learned, options, previews), methods, metrics=metrics)
 
 
 def _errors(found: ShapeEstimate, sighting: UnseenSighting) -> Row:

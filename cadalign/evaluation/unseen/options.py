@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 RANDOM_RIGID, RANDOM_STRETCHED = "random-rigid", "random-stretched"
 NEAREST = "nearest"
@@ -22,7 +22,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class UnseenOptions(ModelOptions, NoiseOption):
+class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
     Objects of one split of KeypointNet are aligned with what the other split tells of their
@@ -33,7 +33,6 @@ class UnseenOptions(ModelOptions, NoiseOption):
     """
 
     experiment = "unseen"
-    runs_functions = True
 
     root: Annotated[Path, tyro.conf.Positional]
     """Folder in KeypointNet's layout, with splits."""

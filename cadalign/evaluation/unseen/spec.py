@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.methods.registry import fingerprints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -33,7 +32,7 @@ def plan(options: UnseenOptions, folder: RunFolder) -> Plan[UnseenTask]:
         "learned": learned.fingerprint(),
     }
     benchmark = unseen_benchmark(learned, options, folder if options.meshes else None)
-    return Plan(benchmark, tasks, config | fingerprints(benchmark.methods), _CHUNK)
+    return Plan(benchmark, tasks, config | benchmark.config, _CHUNK)
 
 
 def _describe(run: Run) -> str:

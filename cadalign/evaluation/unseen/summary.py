@@ -61,6 +61,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         *(replace(metrics.ROTATION, digits=2), replace(metrics.ROTATION_90, digits=1)),
         *(replace(metrics.TRANSLATION_UP_TO_SCALE, digits=3), metrics.BOX_IOU_UP_TO_SCALE),
         *(replace(metrics.KEYPOINT_ERROR, digits=3), *_COVERAGE, metrics.QUERY_MILLISECONDS),
+        *run.metrics,
     )
     return ConsoleTable(
         title="Medians per category and method, and truths within stated regions",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import pickle
 import sysconfig
@@ -70,7 +71,6 @@ def _pickled(function: Callable[..., Any]) -> bytes:
         reason = f"{type(error).__name__}: {error}"[:200]
         raise InputError(
             f"{quote(name_of(function))} cannot be sent to worker processes ({reason})",
-            where="methods",
             fix="let the function make what it needs, or do without processes (workers=0)",
         ) from None
 
@@ -102,3 +102,18 @@ def _innermost(function: Any) -> Any:
     while isinstance(function, partial):
         function = function.func
     return function
+
+
+def code_hash(function: Callable[..., Any]) -> str:
+    """Hash of the code of the module that a function is of.
+
+    In notebooks and scripts, in which other things change, it is that of the function alone.
+    """
+    module = module_of(function)
+    is_script = module is None or module.__name__ == "__main__"
+    code: Any = _innermost(function) if is_script else module
+    try:
+        text = inspect.getsource(code)
+    except (OSError, TypeError):
+        text = repr(getattr(getattr(function, "__code__", None), "co_code", name_of(function)))
+    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()[:16]

@@ -10,8 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
+from cadalign.errors import InputError
 from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import fingerprints
@@ -53,7 +54,13 @@ class Case:
 
 
 class Setting(Protocol):
-    """Instances and metrics of a benchmark; picklable."""
+    """Instances and metrics of a benchmark; picklable.
+
+    Methods with a body are defaults.
+    """
+
+    record_columns: ClassVar[Columns | None] = None
+    """The columns of the table of instance records; None of a setting without."""
 
     @property
     def names(self) -> Columns:
@@ -62,10 +69,6 @@ class Setting(Protocol):
     @property
     def columns(self) -> Columns:
         """All columns of the result table."""
-
-    @property
-    def record_columns(self) -> Columns | None:
-        """The columns of the table of instance records; None of a setting without."""
 
     def warm_up(self) -> Sequence[Any]:
         """Compile what all workers need; returns tasks whose evaluation compiles the rest."""
@@ -77,21 +80,25 @@ class Setting(Protocol):
         """The cases, without instances, of a task that could not be evaluated."""
 
     def given(self, instance: Any) -> MethodInput:
-        """What general methods are given of an instance."""
+        """What general methods are given of an instance; an error of settings without them."""
+        raise InputError("there are no general methods", where="methods")
 
     def answered(self, method: Method, instance: Any, answer: Any) -> Any:
         """The estimate that `measure` takes, of a general method's alignment or result."""
+        return answer
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Cells of the result table for each estimate, or why there are none."""
 
     def compared(self, instance: Any, estimate: Any) -> Compared:
         """The estimated and the true alignment, for registered metrics."""
+        raise InputError("there are no registered metrics", where="metrics")
 
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
         """The outcomes of an instance and its record, once all methods were run; pictures."""
+        return outcomes, None
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.keypointnet.experiment import COLUMNS, keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.spec import SPEC
-from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
+from cadalign.evaluation.keypointnet.spec import SPEC, summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 from cadalign.evaluation.outcome import FAILED, OK, SKIPPED
 from cadalign.evaluation.runs.folder import RunFolder

@@ -13,10 +13,16 @@ from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
 from cadalign.evaluation.evidence.experiment import BOUNDS, evidence_benchmark
-from cadalign.evaluation.evidence.methods import EvidenceInstance, bound_of, evidence_for, truth_in
 from cadalign.evaluation.evidence.options import METHODS, EvidenceRunOptions
-from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
-from cadalign.evaluation.evidence.summary import summarize
+from cadalign.evaluation.evidence.scene import (
+    EvidenceInstance,
+    ObjectScene,
+    bound_of,
+    evidence_for,
+    make_scene,
+    truth_in,
+)
+from cadalign.evaluation.evidence.spec import summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.opened import Run
 

@@ -21,8 +21,7 @@ from cadalign.evaluation.api import run
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.retrieval.experiment import retrieval_benchmark, same_shapes
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
-from cadalign.evaluation.retrieval.spec import SPEC
-from cadalign.evaluation.retrieval.summary import summarize
+from cadalign.evaluation.retrieval.spec import SPEC, summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, retrieval_tasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

@@ -27,31 +27,107 @@ inlier_recall
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets import Correspondences
+from cadalign.datasets import Correspondences, CorrespondenceSet
 from cadalign.errors import DataError
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.metrics.registry import Compared, choose_metrics
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng
+
+
+@dataclass(frozen=True, eq=False)
+class CorrespondenceTask:
+    """One draw of scales for one image, with a share of its points to be moved.
+
+    ``seen`` is None where the image cannot be read, for the reason ``problem``.
+    """
+
+    image: str
+    outliers: float
+    draw: int
+    seen: Correspondences | None
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
+
+
+class CorrespondenceTasks(Sequence[CorrespondenceTask]):
+    """All draws, image by image and share by share, made when asked for."""
+
+    def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
+        self._images = images
+        self._outliers = options.outliers
+        self._draws = options.draws
+        self._ids = images.ids[: options.max_images]
+        if not self._ids:
+            raise DataError("there are no images", where=str(images.source))
+        problems = images.problems
+        self._problems = {name: problems[name] for name in self._ids if name in problems}
+        if len(self._problems) == len(self._ids):
+            first = self._problems[self._ids[0]]
+            raise DataError(
+                f"none of {len(self._ids)} images can be read; the first: {first}",
+                where=str(images.source),
+            )
+        self._read = lru_cache(maxsize=2)(self._read_image)
+
+    def __len__(self) -> int:
+        return len(self._ids) * len(self._outliers) * self._draws
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        rest, draw = divmod(range(len(self))[index], self._draws)
+        place, share = divmod(rest, len(self._outliers))
+        name = self._ids[place]
+        problem = self._problems.get(name)
+        return CorrespondenceTask(
+            image=name,
+            outliers=self._outliers[share],
+            draw=draw,
+            seen=self._read(name) if problem is None else None,
+            problem="" if problem is None else str(problem),
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of all that is read: a run must not go on with other data."""
+        digest = hashlib.sha256()
+        for name in self._ids:
+            digest.update(f"{name}\0".encode())
+            if name in self._problems:
+                digest.update(str(self._problems[name]).encode())
+                continue
+            seen = self._read(name)
+            pose = seen.cam_from_world
+            for values in (seen.points_3d, seen.points_2d, pose.rotation, pose.translation):
+                digest.update(np.ascontiguousarray(values).tobytes())
+            digest.update(repr(seen.camera).encode())
+        return digest.hexdigest()[:16]
+
+    def _read_image(self, name: str) -> Correspondences:
+        return self._images[name]
+
 
 SUCCESS_DEG = 0.5
 """A success has less than this rotation error [degrees] ..."""
@@ -78,12 +154,11 @@ class SpoiledImage:
 
 
 @dataclass(frozen=True)
-class SpoiledImages:
+class SpoiledImages(Setting):
     """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
 
     names = _NAMES
     columns = COLUMNS
-    record_columns = None
 
     options: CorrespondenceOptions
 
@@ -123,12 +198,6 @@ class SpoiledImages:
         truth = image.truth
         return MethodInput(truth.points_3d, truth.points_2d, truth.camera, 1.0, ransac=image.ransac)
 
-    def answered(
-        self, method: Method, image: SpoiledImage, answer: Alignment | Result
-    ) -> Alignment | Result:
-        """The answer as it is."""
-        return answer
-
     def compared(self, image: SpoiledImage, estimate: Alignment | Result) -> Compared:
         """The estimated and the true alignment."""
         if isinstance(estimate, Alignment):
@@ -138,12 +207,6 @@ class SpoiledImages:
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by column."""
         return [errors_of(estimate, image.truth, method=method) for image, estimate in pairs]
-
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], None]:
-        """The outcomes as they are."""
-        return outcomes, None
 
 
 def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:

@@ -11,8 +11,7 @@ from cadalign.errors import DataError
 from cadalign.evaluation.demo.options import DemoOptions
 from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
-from cadalign.evaluation.keypointnet.summary import TABLE
+from cadalign.evaluation.keypointnet.spec import ON_INSTANCES, TABLE
 from cadalign.evaluation.keypointnet.tasks import AUTO, KeypointTask
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder

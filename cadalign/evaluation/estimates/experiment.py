@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.datasets.photos.photo import NamedPoints
-from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
-from cadalign.evaluation.estimates.files import opened_estimates
-from cadalign.evaluation.estimates.matching import match_estimates
+from cadalign.errors import CadalignError, DegenerateError
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.estimates.files import match_estimates, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
-from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.metrics.registry import Compared
+from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LeftOutError, Outcome
 from cadalign.evaluation.photos.experiment import COLUMNS, draw, targets_of
@@ -47,7 +45,7 @@ class GivenPoses:
 
 
 @dataclass(frozen=True)
-class PosesOfFiles:
+class PosesOfFiles(Setting):
     """Estimates of files on the objects of photos: the setting of the experiment.
 
     Parameters
@@ -105,18 +103,6 @@ class PosesOfFiles:
             return match_estimates(targets, file.poses_in(targets[0].photo))
         except CadalignError as error:
             return error
-
-    def given(self, instance: GivenPoses) -> MethodInput:
-        """Nothing: all methods are files."""
-        raise InputError("files of estimates are the only methods", where="methods")
-
-    def answered(self, method: Method, instance: GivenPoses, answer: object) -> object:
-        """See `given`."""
-        return answer
-
-    def compared(self, instance: GivenPoses, estimate: PhotoEstimate) -> Compared:
-        """The estimated and the true alignment of the data set's model."""
-        return Compared(estimate.alignment, instance.target.gt)
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors by the metrics of the data set."""

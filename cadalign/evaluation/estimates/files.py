@@ -1,4 +1,4 @@
-"""Files of estimates, as the poses of the models in each photo of a data set."""
+"""Files of estimates: the poses of the models in each photo, and the objects that they are of."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from cadalign.datasets.photos.bop import Bop
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.scan2cad import Scan2CAD
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.evaluation.metrics.bop import mssd
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.export.bop import read_bop_results, read_scene_gt
 from cadalign.export.estimates import Estimates, PoseEstimate
+from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import read_json
 
 
@@ -141,3 +146,43 @@ def method_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 opened_estimates = lru_cache(maxsize=8)(open_estimates)
 """A file of estimates, read once in every process."""
+
+
+_STEP = 0.1  # of rotations about an axis of symmetry, coarse: it only decides which object is meant
+
+
+def match_estimates(
+    targets: Sequence[PhotoTarget], poses: Sequence[PoseEstimate]
+) -> dict[str, PoseEstimate]:
+    """The estimate of each object, by the object's id.
+
+    As in BOP's localisation task, a photo's n objects of one model are matched with the n estimates
+    of the highest scores; the others are not counted. The best estimate takes the object that it is
+    nearest to, by the symmetry-aware distance of surfaces, and so on.
+    """
+    of_model: dict[str, list[PhotoTarget]] = defaultdict(list)
+    for target in targets:
+        if target.found.model is not None:
+            of_model[target.found.model.model_id].append(target)
+    found: dict[str, PoseEstimate] = {}
+    for model_id, left in of_model.items():
+        own = [each for each in poses if each.model_id == model_id]
+        for pose in sorted(own, key=lambda each: -each.score)[: len(left)]:
+            nearest = min(left, key=lambda target: _distance(target, pose.cam_from_model))
+            left.remove(nearest)
+            found[nearest.found.object_id] = pose
+    return found
+
+
+def _distance(target: PhotoTarget, est: Alignment) -> float:
+    gt, cad = target.gt, target.cad
+    if gt is None:
+        return float("inf")
+    try:
+        if cad is not None and cad.has_mesh:
+            symmetry = target.found.symmetry
+            vertices = cad.hull_vertices
+            return mssd(est=est, gt=gt, vertices=vertices, symmetry=symmetry, max_step=_STEP)
+    except CadalignError:
+        pass
+    return float(np.linalg.norm(est.translation - gt.translation))

@@ -13,9 +13,8 @@ from cadalign.evaluation.estimates.files import method_names, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.photos.experiment import COLUMNS
-from cadalign.evaluation.photos.figures import plots
 from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.summary import GALLERY, HEADLINE, console_table, summarize
+from cadalign.evaluation.photos.spec import GALLERY, HEADLINE, console_table, plots, summarize
 from cadalign.evaluation.photos.tasks import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

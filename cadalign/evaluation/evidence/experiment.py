@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -38,24 +37,24 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
-from cadalign.evaluation.evidence.methods import (
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.evidence.options import EvidenceRunOptions
+from cadalign.evaluation.evidence.scene import (
     EVERYTHING,
     OWN_METHODS,
     EvidenceEstimate,
     EvidenceInstance,
+    ObjectScene,
     bound_of,
     evidence_for,
+    make_scene,
 )
-from cadalign.evaluation.evidence.options import EvidenceRunOptions
-from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
 from cadalign.evaluation.metrics.registry import Compared, choose_metrics
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -73,12 +72,11 @@ _DRAWS = 1000
 
 
 @dataclass(frozen=True)
-class EvidenceScenes:
+class EvidenceScenes(Setting):
     """Views of annotated models with meshes: the setting of the experiment."""
 
     names = _NAMES
     columns = COLUMNS
-    record_columns = None
 
     options: EvidenceRunOptions
 
@@ -136,12 +134,6 @@ class EvidenceScenes:
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors, and their bounds, by column."""
         return [attempt(self._row, instance.scene, estimate) for instance, estimate in pairs]
-
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], None]:
-        """The outcomes as they are."""
-        return outcomes, None
 
     def _row(self, scene: ObjectScene, estimate: EvidenceEstimate) -> Row:
         result, given = estimate.answer, estimate.given

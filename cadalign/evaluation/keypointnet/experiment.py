@@ -46,7 +46,7 @@ import numpy as np
 from cadalign.datasets import AnnotatedModel
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
@@ -58,7 +58,6 @@ from cadalign.evaluation.instances.instance import (
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, pose_of, record_row
 from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
 from cadalign.evaluation.methods.fitted import SHAPE
 from cadalign.evaluation.methods.method import Method, MethodInput
@@ -70,6 +69,7 @@ from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import AbortError
+from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 
@@ -99,7 +99,7 @@ class KeypointView:
 
 
 @dataclass(frozen=True)
-class KeypointViews:
+class KeypointViews(Setting):
     """Views of annotated models: the setting of the KeypointNet experiment.
 
     The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
@@ -178,12 +178,6 @@ class KeypointViews:
             bounds=found.bounds,
             gt=found.gt,
         )
-
-    def answered(
-        self, method: Method, view: KeypointView, answer: Alignment | Result
-    ) -> Alignment | Result:
-        """The answer as it is."""
-        return answer
 
     def compared(self, view: KeypointView, estimate: Alignment | Result | AlignedShape) -> Compared:
         """The estimated and the true alignment."""

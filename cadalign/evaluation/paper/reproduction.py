@@ -10,7 +10,7 @@ from pathlib import Path
 from cadalign.evaluation.api import run
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import SPEC as KEYPOINTNET
-from cadalign.evaluation.keypointnet.summary import texts
+from cadalign.evaluation.keypointnet.spec import texts
 from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ExperimentOptions, RunOptions

@@ -40,7 +40,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, is_registered
@@ -54,8 +54,7 @@ from cadalign.evaluation.photos.methods import (
     given_of,
     photo_method,
 )
-from cadalign.evaluation.photos.names import TRUTH
-from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.photos.options import TRUTH, PhotosOptions
 from cadalign.evaluation.photos.protocols import SETS, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
 from cadalign.evaluation.photos.sighting import Sighting, sight
@@ -76,7 +75,7 @@ COLUMNS: Columns = (
 
 
 @dataclass(frozen=True)
-class PhotoObjects:
+class PhotoObjects(Setting):
     """Objects in photos: the setting of the experiment.
 
     Parameters
@@ -195,7 +194,7 @@ def targets_of(task: PhotoTask, root: Path) -> list[PhotoTarget | Case]:
 
 def draw(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
     """Write the pictures of an object."""
-    from cadalign.evaluation.photos.drawing import draw_sighting
+    from cadalign.evaluation.photos.records import draw_sighting
 
     try:
         draw_sighting(folder, sighting, estimate)

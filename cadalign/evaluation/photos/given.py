@@ -12,7 +12,7 @@ from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
 from cadalign.evaluation.photos.experiment import COLUMNS
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.summary import summarize_cells
+from cadalign.evaluation.photos.spec import summarize_cells
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
@@ -71,7 +71,7 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
 
 
 def summarize_rows(rows: list[Row]) -> list[Summary]:
-    """Summaries of rows by category and method; see `cadalign.evaluation.photos.summary`."""
+    """Summaries of rows by category and method; see `cadalign.evaluation.photos.spec`."""
     names = (*(name for name, _ in COLUMNS), "seconds")
     cells = {name: np.array([row.get(name) for row in rows], dtype=object) for name in names}
     return summarize_cells(cells, list(dict.fromkeys(row["method"] for row in rows)))

@@ -19,7 +19,7 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.instances.aligned import box_alignment
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.outcome import LeftOutError
-from cadalign.evaluation.photos.names import (
+from cadalign.evaluation.photos.options import (
     DEPTH,
     EPNP,
     GRAVITY,
@@ -87,7 +87,7 @@ class PhotoInstance:
 
 
 def photo_method(name: str) -> Method:
-    """The method of a name; see `cadalign.evaluation.photos.names`."""
+    """The method of a name; see `cadalign.evaluation.photos.options`."""
     return Method(name, partial(estimate_object, name))
 
 

@@ -18,7 +18,7 @@ from cadalign.evaluation.metrics.nine_dof import NINE_DOF
 from cadalign.evaluation.metrics.pascal3d import VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import MetricSet
-from cadalign.evaluation.photos.names import PRIOR, RIGID, SHAPE, SIMILAR, STRETCHED
+from cadalign.evaluation.photos.options import PRIOR, RIGID, SHAPE, SIMILAR, STRETCHED
 
 SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)
 """All sets of metrics, in the order of the result table's columns."""

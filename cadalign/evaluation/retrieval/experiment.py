@@ -42,14 +42,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError, InputError
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
+from cadalign.errors import DegenerateError
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
-from cadalign.evaluation.metrics.registry import Compared
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -107,12 +105,11 @@ class RetrievalInstance:
 
 
 @dataclass(frozen=True)
-class RetrievalQueries:
+class RetrievalQueries(Setting):
     """Queries of a library's file, which all workers map into memory: the experiment's setting."""
 
     names = _NAMES
     columns = COLUMNS
-    record_columns = None
 
     library: str
     options: RetrievalRunOptions
@@ -154,27 +151,9 @@ class RetrievalQueries:
             for case, protocol in zip(self.failed(task), self.options.protocols, strict=True)
         ]
 
-    def given(self, instance: RetrievalInstance) -> MethodInput:
-        """Nothing: there are no general methods of retrieval."""
-        raise InputError("general methods do not retrieve models", where="methods")
-
-    def answered(self, method: Method, instance: RetrievalInstance, answer: object) -> object:
-        """See `given`."""
-        return answer
-
-    def compared(self, instance: RetrievalInstance, matches: Sequence[Match]) -> Compared:
-        """The alignments of the best match and of the true model."""
-        return Compared(matches[0].alignment, instance.query.gt)
-
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Compare matches with the truth; see `match_values`."""
         return [attempt(_row, instance, matches) for instance, matches in pairs]
-
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], None]:
-        """The outcomes as they are."""
-        return outcomes, None
 
 
 def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from cadalign.estimation.result import Result
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.metrics.registry import Compared, choose_metrics
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
@@ -47,13 +45,12 @@ def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
 
 
 @dataclass(frozen=True)
-class SweepProblems:
+class SweepProblems(Setting):
     """Random problems: the setting of the simulation."""
 
     columns = COLUMNS
     # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
     names = (("points", int), ("run", int), ("method", str))
-    record_columns = None
 
     kind: SweepKind
     seed: int
@@ -96,12 +93,6 @@ class SweepProblems:
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Errors of pose and stretch."""
         return [alignment_errors(est=est, gt=problem.alignment) for (problem, _), est in pairs]
-
-    def finish(
-        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
-    ) -> tuple[list[Outcome], None]:
-        """The outcomes as they are."""
-        return outcomes, None
 
     def problem(self, task: SweepTask) -> Problem:
         """The problem of a task."""

@@ -47,7 +47,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, attempt
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
@@ -57,8 +57,7 @@ from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.unseen.calibration import probability_level
-from cadalign.evaluation.unseen.learned import LearnedFiles
+from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.evaluation.unseen.methods import OWN_METHODS, ShapeEstimate, UnseenInstance
 from cadalign.evaluation.unseen.options import UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview, sighting_record
@@ -72,6 +71,49 @@ from cadalign.geometry.metrics import (
 )
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import probability_within
+
+# Of a covariance's largest eigenvalue, and of the square of the largest length [units squared].
+_NO_VARIANCE = 1e-12
+
+
+def probability_level(
+    error: FloatArray, covariance: FloatArray, degrees_of_freedom: float | None = None
+) -> float | None:
+    """Probability of the smallest ellipsoid about the estimate that holds the truth.
+
+    Parameters
+    ----------
+    error : (k,) float
+        Estimate minus truth.
+    covariance : (k, k) float
+        As the estimator states it. Directions without variance are held to be known.
+    degrees_of_freedom : float, optional
+        Of a t distribution; None for a Gaussian.
+
+    Returns
+    -------
+    float or None
+        In [0, 1], uniform where the covariance is that of the errors; 1 if the error has a part in
+        a direction without variance; None if there is no variance at all.
+
+    Examples
+    --------
+    >>> round(probability_level(np.array([1.0]), np.array([[1.0]])), 4)
+    0.6827
+    >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
+    True
+    """
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
+    if not np.isfinite(values).all() or not free.any():
+        return None
+    parts = vectors.T @ error
+    if (parts[~free] ** 2 > 1e-6 * values[-1]).any():
+        return 1.0
+    square = float((parts[free] ** 2 / values[free]).sum())
+    return float(probability_within(square, int(free.sum()), degrees_of_freedom))
+
 
 _NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
@@ -88,7 +130,7 @@ _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class UnseenObjects:
+class UnseenObjects(Setting):
     """Objects with what was learned from others: the setting of the experiment."""
 
     names = _NAMES

@@ -18,7 +18,7 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.methods.method import Method
-from cadalign.evaluation.unseen.learned import LearnedFiles
+from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.evaluation.unseen.options import (
     EXACT,
     LIMIT,

@@ -16,8 +16,7 @@ from cadalign import Alignment
 from cadalign.cli import main
 from cadalign.datasets import Bop, Scan2CAD
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.estimates.files import method_names, open_estimates
-from cadalign.evaluation.estimates.matching import match_estimates
+from cadalign.evaluation.estimates.files import match_estimates, method_names, open_estimates
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

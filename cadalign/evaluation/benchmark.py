@@ -24,6 +24,8 @@ from cadalign.evaluation.runs.work import AbortError, Rows
 R = TypeVar("R")
 Pair = tuple[Any, Any]
 """An instance, and an estimate of it."""
+VIEW_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
+"""The columns that name a row of a method on a view of a model."""
 
 
 @dataclass(frozen=True)

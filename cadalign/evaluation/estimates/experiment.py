@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.datasets.photos.photo import NamedPoints
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.estimates.files import match_estimates, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
@@ -26,11 +26,10 @@ from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.tables import Row
 from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.box import Box
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 _FACTS = {"source": "", "keypoints": 0}
 
 
@@ -55,7 +54,7 @@ class PosesOfFiles(Setting):
         The folder that pictures go to.
     """
 
-    names = _NAMES
+    names = VIEW_NAMES
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 

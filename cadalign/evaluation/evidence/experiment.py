@@ -37,7 +37,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.evidence.scene import (
     EVERYTHING,
@@ -60,11 +60,10 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.seeding import instance_rng
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 _ERRORS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
 BOUNDS = ("rotation_bound_deg", "translation_bound", "scale_y_bound", "scale_z_bound")
 COLUMNS: Columns = (
-    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *((name, float) for name in (*_ERRORS, "box_iou", *BOUNDS, "over_limit")),
     ("warnings", int),
 )
@@ -75,7 +74,7 @@ _DRAWS = 1000
 class EvidenceScenes(Setting):
     """Views of annotated models with meshes: the setting of the experiment."""
 
-    names = _NAMES
+    names = VIEW_NAMES
     columns = COLUMNS
 
     options: EvidenceRunOptions

@@ -12,7 +12,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.estimation.align import align
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
-from cadalign.estimation.model import Model, Size
+from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound
@@ -34,6 +34,7 @@ from cadalign.evaluation.methods.method import Method
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.evidence import Size
 from cadalign.render import Scene, cast_geometry, visible_keypoints
 from cadalign.seeding import instance_rng
 from cadalign.solvers.constants import LINEAR

@@ -46,7 +46,7 @@ import numpy as np
 from cadalign.datasets import AnnotatedModel
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
@@ -73,9 +73,8 @@ from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
-    *_NAMES,
+    *VIEW_NAMES,
     *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
     *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
@@ -106,7 +105,7 @@ class KeypointViews(Setting):
     if one is given; its folders for pictures must exist.
     """
 
-    names = _NAMES
+    names = VIEW_NAMES
     record_columns = RECORD_COLUMNS
 
     options: KeypointNetOptions

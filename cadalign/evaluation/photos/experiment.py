@@ -40,7 +40,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, is_registered
@@ -67,9 +67,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
-    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
     *(("rms_px", float), *score_columns(SETS)),
 )
 
@@ -86,7 +85,7 @@ class PhotoObjects(Setting):
         The folder that pictures go to.
     """
 
-    names = _NAMES
+    names = VIEW_NAMES
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 

@@ -47,7 +47,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
@@ -115,9 +115,8 @@ def probability_level(
     return float(probability_within(square, int(free.sum()), degrees_of_freedom))
 
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
-    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
     *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
@@ -133,7 +132,7 @@ _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 class UnseenObjects(Setting):
     """Objects with what was learned from others: the setting of the experiment."""
 
-    names = _NAMES
+    names = VIEW_NAMES
     columns = COLUMNS
     record_columns = RECORD_COLUMNS
 

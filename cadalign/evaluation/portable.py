@@ -104,6 +104,33 @@ def _innermost(function: Any) -> Any:
     return function
 
 
+def names_of(values: Any, register: Callable[[str, Any], object], *, where: str) -> tuple[str, ...]:
+    """Names of methods or metrics, of which functions are registered by their own names.
+
+    Raises
+    ------
+    InputError
+        If a function has no name of its own, or two have the same.
+    """
+    names: list[str] = []
+    functions: dict[str, Any] = {}
+    for each in [values] if isinstance(values, str) or callable(values) else values:
+        if not callable(each):
+            names.append(each)
+            continue
+        name = name_of(each)
+        what = f"{quote(name)} is the name of more than one function"
+        if not name.isidentifier():
+            what = f"a function that is called {name} has no name for tables"
+        if not name.isidentifier() or functions.get(name, each) is not each:
+            fix = "register it by a name, and give that"
+            raise InputError(what, where=where, fix=fix)
+        functions[name] = each
+        register(name, each)
+        names.append(name)
+    return tuple(names)
+
+
 def code_hash(function: Callable[..., Any]) -> str:
     """Hash of the code of the module that a function is of.
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Row
 
@@ -206,6 +206,15 @@ def with_medians(summary: Summary, cells: Cells, metrics: Sequence[Metric]) -> S
     solved = (cells["method"] == summary.method) & (cells["status"] == OK)
     medians = {metric.key: median_of(cells[metric.key][solved]) for metric in metrics}
     return replace(summary, values={**summary.values, **medians})
+
+
+def counted(cells: Cells, method: str) -> tuple[dict[str, int], int, Cells]:
+    """Numbers of instances and of failures of a method, of skipped ones, and the rows without."""
+    chosen = cells["method"] == method
+    solved = where(cells, chosen & (cells["status"] == OK))
+    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
+    count = int(chosen.sum()) - skipped
+    return {"instances": count, "failed": count - len(solved["method"])}, skipped, solved
 
 
 def text_rows(summaries: Sequence[Summary], shown: Sequence[Metric]) -> list[tuple[str, ...]]:

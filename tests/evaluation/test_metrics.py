@@ -192,3 +192,10 @@ def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     space: dict[str, Any] = {}
     exec(block, space)
     assert np.isfinite(space["table"].upright_error).all()
+
+
+def test_functions_are_metrics_by_their_names() -> None:
+    assert simulate(metrics=[depth_error]).depth_error.notna().all()
+    assert simulate(metrics=depth_error, methods="epnp").method.tolist() == ["epnp"] * 3
+    with pytest.raises(InputError, match="metrics: a function that is called <lambda>"):
+        simulate(metrics=[lambda *, est: 0.0])

@@ -19,7 +19,6 @@ from cadalign.evaluation.evidence.experiment import COLUMNS, evidence_benchmark
 from cadalign.evaluation.evidence.options import EvidenceRunOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTask, KeypointTasks
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import Plot, cumulative
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Cells, Run
@@ -29,10 +28,10 @@ from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
     by_category_and_method,
+    counted,
     mean_of,
     median_of,
     text_rows,
-    where,
 )
 
 ROTATION_BOUND = replace(
@@ -78,14 +77,10 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 
 def _summarize(category: str, method: str, cells: Cells) -> Summary:
-    chosen = cells["method"] == method
-    solved = where(cells, chosen & (cells["status"] == OK))
-    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
-    count = int(chosen.sum()) - skipped
+    counts, skipped, solved = counted(cells, method)
     seconds = np.asarray(solved["seconds"], dtype=float)
     values = {
-        "instances": count,
-        "failed": count - len(solved["method"]),
+        **counts,
         "keypoints": mean_of(solved["keypoints"]),
         **{metric.key: median_of(solved[metric.key]) for metric in _MEDIANS},
         "milliseconds": median_of(1e3 * seconds),

@@ -40,6 +40,7 @@ from cadalign.evaluation.summary import (
     ALL,
     ConsoleTable,
     Summary,
+    counted,
     mean_of,
     median_of,
     text_rows,
@@ -123,14 +124,11 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 
 def _summarize_method(category: str, method: str, cells: Cells, bound: float) -> Summary:
-    chosen = cells["method"] == method
-    solved = where(cells, chosen & (cells["status"] == OK))
-    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
-    count = int(chosen.sum()) - skipped
+    counts, skipped, solved = counted(cells, method)
+    count = counts["instances"]
     medians = {name: median_of(solved[name]) for name in MEDIANS if name in solved}
     values = {
-        "instances": count,
-        "failed": count - len(solved["method"]),
+        **counts,
         "keypoints": mean_of(solved["keypoints"]),
         **medians,
         "success_5deg_5pct": _success(solved, 5.0, 0.05) / count if count else np.nan,

@@ -28,7 +28,7 @@ from typing import Any, Literal
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods.fitted import fit_methods
 from cadalign.evaluation.methods.method import POINTS, VIEWS, Method, RegisteredFunction
-from cadalign.evaluation.portable import Portable, code_hash, module_of, name_of
+from cadalign.evaluation.portable import Portable, code_hash, module_of
 
 ENTRY_POINTS = "cadalign.methods"
 """Group of entry points whose functions are methods by the entry points' names."""
@@ -198,32 +198,6 @@ def _entry_points() -> dict[str, EntryPoint]:
     return {each.name: each for each in entry_points(group=ENTRY_POINTS)}
 
 
-def names_of(methods: Iterable[Any]) -> tuple[str, ...]:
-    """Names of methods, some of which may be given as functions: these are registered by theirs.
-
-    Raises
-    ------
-    InputError
-        If a function has no name of its own, or two have the same.
-    """
-    names: list[str] = []
-    functions: dict[str, Any] = {}
-    for each in methods:
-        if isinstance(each, str) or not callable(each):
-            names.append(each)
-            continue
-        name = name_of(each)
-        if not name.isidentifier() or functions.get(name, each) is not each:
-            what = f"{quote(name)} is the name of more than one function"
-            if not name.isidentifier():
-                what = f"a function that is called {name} has no name for tables"
-            fix = "give it one by cadalign.evaluation.register_method, and that name"
-            raise InputError(what, where="methods", fix=fix)
-        functions[name] = each
-        names.append(register_method(name, each).name)
-    return tuple(names)
-
-
 def load_plugin(text: str) -> str | None:
     """Import a module and register a function of it; returns the name, None for a module alone.
 
@@ -263,7 +237,8 @@ def _imported(name: str) -> ModuleType:
             if "" not in sys.path and str(Path.cwd()) not in sys.path:
                 sys.path.insert(0, str(Path.cwd()))
             return import_module(name)
-        spec = spec_from_file_location(Path(name).stem, name)
+        # Not by its own name: a file may be called as a module that is there already.
+        spec = spec_from_file_location(f"cadalign_plugin_{Path(name).stem}", name)
         assert spec is not None
         assert spec.loader is not None
         module = module_from_spec(spec)

@@ -13,12 +13,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative
-from cadalign.evaluation.instances.aligned import (
-    AlignedAlternative,
-    AlignedShape,
-    Warp,
-    box_alignment,
-)
+from cadalign.evaluation.instances.aligned import Warp, box_alignment, shape_of_result
 from cadalign.evaluation.instances.drawing import write_webp
 from cadalign.evaluation.instances.preview import write_preview
 from cadalign.evaluation.instances.record import Estimate, record_of, record_stem
@@ -61,20 +56,11 @@ def _described(estimate: PhotoEstimate | CadalignError, sighting: Sighting) -> E
     result = estimate.result
     if result is None:
         return estimate.alignment
-    alternatives = []
-    for other in result.alternatives:
-        alignment = _of_box(other, sighting)
-        alternatives.append(
-            AlignedAlternative(alignment, other.relative_likelihood, _warp(result, other, sighting))
-        )
-    return AlignedShape(
-        _of_box(result, sighting),
-        result.std,
-        result.rms,
-        sighting.sigma,
-        result.warnings,
-        tuple(alternatives),
-        _warp(result, result, sighting),
+    return shape_of_result(
+        result,
+        lambda each: (_of_box(each, sighting), _warp(result, each, sighting)),
+        rms=result.rms,
+        sigma=sighting.sigma,
     )
 
 

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace, cumulative
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Cells, Run
@@ -30,11 +29,11 @@ from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
     by_category_and_method,
+    counted,
     known,
     mean_of,
     median_of,
     text_rows,
-    where,
 )
 from cadalign.evaluation.unseen.experiment import COLUMNS, unseen_benchmark
 from cadalign.evaluation.unseen.options import UnseenOptions
@@ -85,13 +84,10 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 
 def _summarize(category: str, method: str, cells: Cells) -> Summary:
-    chosen = cells["method"] == method
-    solved = where(cells, chosen & (cells["status"] == OK))
-    count = int(chosen.sum())
+    counts, _, solved = counted(cells, method)
     rotations = known(solved["rotation_error_deg"])
     values = {
-        "instances": count,
-        "failed": count - len(solved["method"]),
+        **counts,
         "keypoints": mean_of(solved["keypoints"]),
         **{metric.key: median_of(solved[metric.key]) for metric in _MEDIANS},
         "rotation_error_deg_90": float(np.percentile(rotations, 90)) if len(rotations) else np.nan,

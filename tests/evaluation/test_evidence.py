@@ -148,7 +148,10 @@ def test_model_that_fails_gives_failed_rows(root: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"methods": ("masks",)}, "methods: unknown method 'masks', did you mean 'mask'?; known are "),
+        (
+            {"methods": ("masks",)},
+            "methods: unknown method 'masks', did you mean 'mask'?; known are ",
+        ),
         ({"methods": ()}, "methods: none is given; "),
         ({"min_visible": 3}, "min_visible: 3 is less than 4"),
         ({"depth_sigma": 0.0}, "depth_sigma: 0.0 is not between 0 and 90"),

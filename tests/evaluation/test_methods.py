@@ -24,6 +24,9 @@ from cadalign.evaluation.accuracy.style import look_of
 from cadalign.evaluation.methods import registry
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, registered_method
+from cadalign.evaluation.photos.experiment import photos_benchmark
+from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.simulation.problems import simulate_problem
 
 
@@ -161,6 +164,10 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
     register_method("shape", linear)
     with pytest.raises(InputError, match="'shape' is a method of the experiment; register"):
         cadalign.evaluate(tmp_path, "unseen", methods=["shape"])
+    register_method("rigid", linear)
+    options = PhotosOptions(tmp_path, methods=("rigid",))
+    with pytest.raises(InputError, match="'rigid' is a method of the experiment; register"):
+        photos_benchmark(options, (), RunFolder(tmp_path))
     with pytest.raises(InputError, match="unknown: 'linear'; known are optimal, optimal-"):
         cadalign.evaluate(tmp_path, "retrieval", methods=["linear"])
 

@@ -39,7 +39,7 @@ _REGISTERED: dict[str, Method] = {}
 def register_method(
     name: str, function: Callable[..., Any], *, takes: Literal["points", "views"] | None = None
 ) -> Method:
-    """Make a function known as a method of evaluations.
+    """Register a function as a method of evaluations.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ def register_metric(
     better: str | None = "low",
     factor: float = 1.0,
 ) -> Metric:
-    """Make a function known as a metric of evaluations.
+    """Register a function as a metric of evaluations.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.methods.registry import choose_methods, is_registered
+from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.metrics.sets import score_alignment, score_columns
 from cadalign.evaluation.outcome import Outcome
@@ -54,7 +54,7 @@ from cadalign.evaluation.photos.methods import (
     given_of,
     photo_method,
 )
-from cadalign.evaluation.photos.options import TRUTH, PhotosOptions
+from cadalign.evaluation.photos.options import TRUTH, PhotosOptions, is_own
 from cadalign.evaluation.photos.protocols import SETS, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
 from cadalign.evaluation.photos.sighting import Sighting, sight
@@ -169,7 +169,7 @@ def photos_benchmark(
     options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
 ) -> Benchmark:
     """The methods of the options on objects in photos."""
-    own = {name: photo_method(name) for name in options.methods if not is_registered(name)}
+    own = {name: photo_method(name) for name in options.methods if is_own(name)}
     methods = choose_methods(options.methods, own)
     metrics = choose_metrics(options.metrics, COLUMNS)
     return Benchmark(PhotoObjects(options, shapes, drawn_in), methods, metrics=metrics)

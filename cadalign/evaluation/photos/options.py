@@ -36,6 +36,11 @@ def parts_of(method: str) -> tuple[str, frozenset[str]]:
     return base, frozenset(evidence)
 
 
+def is_own(method: str) -> bool:
+    """True for a name whose base is one of the experiment's."""
+    return parts_of(method)[0] in (*BASES, TRUTH)
+
+
 def check_method(method: str) -> None:
     """Check the name of a method.
 
@@ -141,7 +146,7 @@ class PhotosOptions(FunctionOptions):
         from cadalign.evaluation.methods.registry import is_registered
 
         for name in self.methods:
-            if not is_registered(name):
+            if is_own(name) or not is_registered(name):
                 check_method(name)
 
 

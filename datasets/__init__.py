@@ -17,18 +17,17 @@ if TYPE_CHECKING:
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.models.shapenet import ShapeNet, ShapeNetModel
     from cadalign.datasets.photos.bop import Bop
-    from cadalign.datasets.photos.dataset import PhotoDataset, PhotoSummary
+    from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, PhotoSummary
+
+    # `open` is not in __all__: a star import must not hide the built-in function.
+    from cadalign.datasets.photos.formats import open_photos, write_photos
+    from cadalign.datasets.photos.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.photos.kitti import KittiCars
     from cadalign.datasets.photos.objectron import Objectron
-    from cadalign.datasets.photos.pascal3d import Pascal3D
-    from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
+    from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
     from cadalign.datasets.photos.posed_photos import PosedPhotos
-
-    # `open` is not in __all__: a star import must not hide the built-in function.
-    from cadalign.datasets.photos.recognise import open_photos
-    from cadalign.datasets.photos.recognise import open_photos as open  # noqa: F401
     from cadalign.datasets.photos.scan2cad import Scan2CAD
     from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
@@ -61,6 +60,7 @@ __all__ = [
     "Pascal3DDetections",
     "Photo",
     "PhotoDataset",
+    "PhotoFormat",
     "PhotoKeypoints",
     "PhotoObject",
     "PhotoSummary",
@@ -81,6 +81,7 @@ __all__ = [
     "open_photos",
     "read_image_keypoints",
     "sample_models",
+    "write_photos",
     "write_sample_dataset",
 ]
 

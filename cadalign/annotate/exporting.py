@@ -15,6 +15,7 @@ from cadalign.annotate.objects.listing import shown_objects
 from cadalign.annotate.objects.models import OpenedModel
 from cadalign.annotate.session import PhotoState, Session
 from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.datasets.detections.coco import CocoObject, coco_document
 from cadalign.errors import InputError
 from cadalign.estimation.exporting import object_of
 from cadalign.estimation.observed import own_ids, shape_ids
@@ -36,41 +37,22 @@ def coco_of(session: Session) -> dict[str, Any]:
         kept = [objects for objects in photos if session.work_state(objects[0]) != "skipped"]
         used = [model for model in session.models.opened if _marked(session, model)]
         models = used or [session.models[0]]
-        annotated = [
-            (row, state)
-            for row, objects in enumerate(kept)
-            for state in objects
-            if state.document.complete_pairs
-        ]
-        return {
-            "images": [
-                {
-                    "id": row,
-                    "file_name": objects[0].photo.path.name,
-                    "width": objects[0].photo.width,
-                    "height": objects[0].photo.height,
-                }
+        return coco_document(
+            [
+                (objects[0].photo.path.name, objects[0].photo.width, objects[0].photo.height)
+                for objects in kept
+            ],
+            [
+                (model.path.stem, [model.registry[each].name for each in _marked(session, model)])
+                for model in models
+            ],
+            [
+                _coco_object(row, state, models.index(state.model), _marked(session, state.model))
                 for row, objects in enumerate(kept)
+                for state in objects
+                if state.document.complete_pairs
             ],
-            "categories": [
-                {
-                    "id": number,
-                    "name": model.path.stem,
-                    "keypoints": [model.registry[each].name for each in _marked(session, model)],
-                    "skeleton": [],
-                }
-                for number, model in enumerate(models, start=1)
-            ],
-            "annotations": [
-                {
-                    "id": number,
-                    "image_id": row,
-                    "category_id": 1 + models.index(state.model),
-                    **_annotation(state, _marked(session, state.model)),
-                }
-                for number, (row, state) in enumerate(annotated, start=1)
-            ],
-        }
+        )
 
 
 def _marked(session: Session, model: OpenedModel) -> list[int]:
@@ -86,21 +68,13 @@ def _marked(session: Session, model: OpenedModel) -> list[int]:
     )
 
 
-def _annotation(state: PhotoState, numbers: list[int]) -> dict[str, Any]:
+def _coco_object(image: int, state: PhotoState, category: int, numbers: list[int]) -> CocoObject:
     places = {pair.keypoint: pair.uv for pair in state.document.complete_pairs}
-    keypoints: list[float] = []
-    for number in numbers:
-        uv = places.get(number)
-        keypoints += (0.0, 0.0, 0) if uv is None else (*uv, _MARKED)
-    marked = np.array([uv for uv in places.values() if uv is not None])
-    low, size = marked.min(axis=0), np.ptp(marked, axis=0)
-    return {
-        "keypoints": keypoints,
-        "num_keypoints": len(places),
-        "bbox": [*low.tolist(), *size.tolist()],
-        "area": float(size.prod()),
-        "iscrowd": 0,
-    }
+    uv = np.array([places.get(number) or (0.0, 0.0) for number in numbers], dtype=float)
+    flags = np.array([_MARKED if number in places else 0 for number in numbers])
+    marked = uv[flags > 0]
+    rectangle = np.concatenate([marked.min(axis=0), marked.max(axis=0)])
+    return CocoObject(image, category, uv, flags, rectangle)
 
 
 def _ids(session: Session, observation: Observation) -> list[tuple[Hashable, ...]]:

@@ -16,11 +16,11 @@ from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.worklist import natural_key
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
+from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.files import read_bytes, reading
 from cadalign.io.images import open_photo, photo_size, read_photo
-from cadalign.render.views.camera_files import read_camera_views
 
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 MASK, SECOND_MASK = ".mask.png", ".mask-2.png"

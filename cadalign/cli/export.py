@@ -10,7 +10,7 @@ import tyro
 
 from cadalign.cli.options import OptionError, named_as_flags
 from cadalign.cli.output import new_console
-from cadalign.datasets.photos.records import read_matrix
+from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
 
 

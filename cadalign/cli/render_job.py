@@ -10,6 +10,7 @@ from pathlib import Path
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
+from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -23,7 +24,6 @@ from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_vi
 from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
 from cadalign.render.scene import Scene
 from cadalign.render.select import make_renderer
-from cadalign.render.views.camera_files import read_camera_views
 from cadalign.render.views.visibility import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}

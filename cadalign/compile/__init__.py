@@ -2,9 +2,9 @@
 
 from numba.core import event
 
-from cadalign.compile.decorators import KernelFamily, fast_sums, inlined, kernel
+from cadalign.compile.decorators import KernelFamily, borrowing, fast_sums, inlined, kernel
 from cadalign.compile.progress import CompileProgress
 
-__all__ = ["KernelFamily", "fast_sums", "inlined", "kernel"]
+__all__ = ["KernelFamily", "borrowing", "fast_sums", "inlined", "kernel"]
 
 event.register("numba:compile", CompileProgress())

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.datasets.photos.kitti_shape import car_shape
+from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.files import read_bytes, writing

@@ -10,6 +10,15 @@ from typing import Literal, get_args
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
+from cadalign.datasets.photos.photo import (
+    CadModel,
+    LoadedModel,
+    NamedPoints,
+    Photo,
+    PhotoKeypoints,
+    PhotoObject,
+    Truth,
+)
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -193,6 +202,42 @@ class AlignedObject:
         """The mesh, stretched and placed in a frame [units of the camera frame]."""
         mesh, placing = self.require_mesh(), self.frame_from_model(frame)
         return replace(mesh, vertices=placing.apply(mesh.vertices))
+
+
+def photos_of(
+    exported: AlignedObject, *, category: str = "object", mask: Path | None = None
+) -> tuple[Photo, ...]:
+    """The views of an aligned object as photos of a data set.
+
+    Parameters
+    ----------
+    exported : AlignedObject
+    category : str
+        What the object is.
+    mask : Path, optional
+        Image of the object's pixels.
+    """
+    names = tuple(str(name) for name in exported.ids)
+    model = CadModel(
+        exported.name,
+        LoadedModel(exported.mesh, NamedPoints(names, exported.points_3d)),
+        bounds=exported.bounds if exported.mesh or names else None,
+    )
+    photos = []
+    for number, view in enumerate(exported.views):
+        marked = tuple(str(name) for name in view.ids)
+        found = PhotoObject(
+            object_id="0",
+            category=category,
+            truth=Truth(view.cam_from_model, metres=exported.metres),
+            keypoints=PhotoKeypoints(view.points_2d, marked, np.ones(len(marked), dtype=bool)),
+            model=model,
+            mask_path=mask,
+        )
+        image = view.image if isinstance(view.image, Path) else None
+        name = view.image_name or f"{number}.png"
+        photos.append(Photo(name, image, view.camera, (found,)))
+    return tuple(photos)
 
 
 def _check_rigid(matrix: FloatArray) -> None:

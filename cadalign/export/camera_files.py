@@ -1,4 +1,4 @@
-"""Writing cameras as other programs do: Open3D, COLMAP, and NeRF's transforms.json.
+"""Cameras of other programs, read and written: Open3D, and NeRF's transforms.json; COLMAP's, read.
 
 Each program has its own axes, pixel origin and direction of transforms:
 
@@ -14,41 +14,73 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray
+from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import PIXEL_CENTRE, opengl_from_model
-from cadalign.geometry.rotations import quat_wxyz_from_rotation
-from cadalign.io.files import write_json, write_text, writing
+from cadalign.geometry.conventions import (
+    PIXEL_CENTRE,
+    alignment_from_opengl,
+    opengl_from_model,
+)
+from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
+from cadalign.io.files import write_json
 
-OPEN3D_VIEW = "PinholeCameraParameters"
-OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
+_OPEN3D_VIEW = "PinholeCameraParameters"
+_OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
 _VERSION = {"version_major": 1, "version_minor": 0}
 _NERF_DISTORTION = ("k1", "k2", "p1", "p2")
+_Angle = Annotated[float, Meta(gt=0, lt=np.pi)]
 
 
-@dataclass(frozen=True, eq=False)
-class CameraView:
-    """A camera and where it stands.
+class _Open3dIntrinsic(ForeignDocument):
+    intrinsic_matrix: list[Any]  # column by column
+    width: int = 0
+    height: int = 0
 
-    Parameters
-    ----------
-    camera : Camera
-    cam_from_world : Alignment
-        Its pose, with all scales 1.
-    name : str
-        The image's name; empty where the file has none.
-    """
 
-    camera: Camera
-    cam_from_world: Alignment
-    name: str = ""
+class _Open3dView(ForeignDocument):
+    """Open3D's ``PinholeCameraParameters``."""
+
+    intrinsic: _Open3dIntrinsic
+    extrinsic: list[Any]  # column by column
+
+
+class _Open3dTrajectory(ForeignDocument):
+    parameters: Annotated[list[_Open3dView], Meta(min_length=1)]
+
+
+class _NerfFrame(ForeignDocument):
+    """A frame of ``transforms.json``, together with what the file's top says for all frames."""
+
+    transform_matrix: list[Any]
+    w: Finite | None = None
+    h: Finite | None = None
+    fl_x: Finite | None = None
+    fl_y: Finite | None = None
+    cx: Finite | None = None
+    cy: Finite | None = None
+    camera_angle_x: _Angle | None = None
+    camera_angle_y: _Angle | None = None
+    k1: Finite | None = None
+    k2: Finite | None = None
+    k3: Finite | None = None
+    k4: Finite | None = None
+    p1: Finite | None = None
+    p2: Finite | None = None
+    file_path: Any = ""
+
+
+class _NerfFile(ForeignDocument):
+    frames: Annotated[list[dict[str, Any]], Meta(min_length=1)]
 
 
 def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -60,7 +92,7 @@ def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> N
     entries = [_open3d_entry(view, number) for number, view in enumerate(views)]
     data: dict[str, Any] = entries[0]
     if len(entries) > 1:
-        data = {"class_name": OPEN3D_TRAJECTORY, "parameters": entries, **_VERSION}
+        data = {"class_name": _OPEN3D_TRAJECTORY, "parameters": entries, **_VERSION}
     write_json(Path(path), data)
 
 
@@ -75,40 +107,9 @@ def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> Non
     frames = []
     for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
         own = {key: value for key, value in camera.items() if key not in shared}
-        pose = np.linalg.inv(opengl_from_model(_rigid(view, number)))
+        pose = np.linalg.inv(opengl_from_model(view.rigid(f"views[{number}]")))
         frames.append({"file_path": view.name, **own, "transform_matrix": pose.tolist()})
     write_json(Path(path), {**shared, "frames": frames})
-
-
-def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
-
-    Cameras that are equal are written once. Refused are poses with a scale, and names that are
-    missing, hold a line break or occur twice.
-    """
-    _require_views(views)
-    names = [view.name for view in views]
-    if len(set(names)) < len(names) or any(not n or "\n" in n or n != n.strip() for n in names):
-        raise InputError("every view needs an image name of its own", where="views")
-    numbers: dict[Camera, int] = {}
-    images = []
-    for number, view in enumerate(views, start=1):
-        camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
-        pose = _rigid(view, number - 1)
-        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
-        text = " ".join(f"{value:.17g}" for value in values)
-        images.append(f"{number} {text} {camera_id} {view.name}\n\n")
-    cameras = []
-    for camera, camera_id in numbers.items():
-        entry = camera.to_dict()
-        params = " ".join(f"{value:.17g}" for value in entry["params"])
-        cameras.append(f"{camera_id} {entry['model']} {camera.width} {camera.height} {params}\n")
-    folder = Path(folder)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "cameras.txt", "".join(cameras))
-    write_text(folder / "images.txt", "".join(images))
-    write_text(folder / "points3D.txt", "")
 
 
 def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
@@ -120,8 +121,8 @@ def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
             fix="undistort the image and give its camera, or write another format",
         )
     return {
-        "class_name": OPEN3D_VIEW,
-        "extrinsic": _rigid(view, number).cam_from_model.T.ravel().tolist(),
+        "class_name": _OPEN3D_VIEW,
+        "extrinsic": view.rigid(f"views[{number}]").cam_from_model.T.ravel().tolist(),
         "intrinsic": {
             "height": camera.height,
             "intrinsic_matrix": camera.matrix.T.ravel().tolist(),
@@ -152,11 +153,91 @@ def _require_views(views: Sequence[CameraView]) -> None:
         raise InputError("give at least one view", where="views")
 
 
-def _rigid(view: CameraView, number: int) -> Alignment:
-    if (view.cam_from_world.scale != 1).any():
-        raise InputError(
-            f"the pose has the scale {view.cam_from_world.scale.tolist()}",
-            where=f"views[{number}]",
-            fix="camera files hold rigid poses: stretch the model and give the pose with scale 1",
-        )
-    return view.cam_from_world
+def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
+    """Read cameras and poses from an Open3D or NeRF JSON file, or the folder of a COLMAP model."""
+    path = Path(path)
+    if path.is_dir():
+        model = Colmap(path)
+        images = (model[name] for name in model.ids)
+        return [CameraView(image.camera, image.cam_from_world, image.id) for image in images]
+    data = read_json(path)
+    with in_file(path), np.errstate(over="ignore", invalid="ignore"):
+        return _views_of(data)
+
+
+def _views_of(data: Any) -> list[CameraView]:
+    """The cameras of a parsed Open3D or NeRF file."""
+    fields = data if isinstance(data, dict) else {}
+    if "frames" in fields:
+        return _nerf_views(fields)
+    if fields.get("class_name") == _OPEN3D_TRAJECTORY:
+        views = convert(fields, _Open3dTrajectory).parameters
+        return [_open3d_view(view, f"parameters[{n}]") for n, view in enumerate(views)]
+    if fields.get("class_name") == _OPEN3D_VIEW or {"extrinsic", "intrinsic"} <= fields.keys():
+        return [_open3d_view(convert(fields, _Open3dView), "")]
+    raise DataError(
+        "not a camera file that is known",
+        fix="give an Open3D PinholeCameraParameters or a NeRF transforms.json file, or the folder "
+        "of a COLMAP model",
+    )
+
+
+def _open3d_view(view: _Open3dView, where: str) -> CameraView:
+    with within(where):
+        matrix = _matrix(view.intrinsic.intrinsic_matrix, 3, "intrinsic_matrix").T
+        extrinsic = _matrix(view.extrinsic, 4, "extrinsic").T
+        size, focal = (view.intrinsic.width, view.intrinsic.height), (matrix[0, 0], matrix[1, 1])
+        camera = Camera(*size, *focal, matrix[0, 2], matrix[1, 2])
+        return CameraView(camera, Alignment(extrinsic[:3, :3], extrinsic[:3, 3], np.ones(3)))
+
+
+def _nerf_views(data: dict[str, Any]) -> list[CameraView]:
+    shared = {key: data[key] for key in _NerfFrame.__struct_fields__ if key in data}
+    views = []
+    for number, entry in enumerate(convert(data, _NerfFile).frames):
+        with within(f"frames[{number}]"):
+            frame: _NerfFrame = convert({**shared, **entry}, _NerfFrame)
+            matrix = _matrix(frame.transform_matrix, 4, "transform_matrix")
+            with np.errstate(all="ignore"):
+                determinant = abs(np.linalg.det(matrix))
+            if not 1e-12 <= determinant < np.inf:
+                raise InputError("the matrix has no inverse", where="transform_matrix")
+            pose = alignment_from_opengl(np.asarray(np.linalg.inv(matrix), dtype=float))
+            views.append(CameraView(_camera_from_nerf(frame), pose, str(frame.file_path)))
+    return views
+
+
+def _camera_from_nerf(frame: _NerfFrame) -> Camera:
+    for name, value in (("k3", frame.k3), ("k4", frame.k4)):
+        if value:
+            what = f"{name} is a fisheye's coefficient"
+            raise InputError(what, where=name, fix="undistort first")
+    width, height = frame.w, frame.h
+    if width is None or height is None:
+        raise InputError("w and h, the image's size, are missing")
+    fx, fy = frame.fl_x, frame.fl_y
+    if fx is None and frame.camera_angle_x is not None:
+        fx = width / 2 / float(np.tan(frame.camera_angle_x / 2))
+    if fy is None and frame.camera_angle_y is not None:
+        fy = height / 2 / float(np.tan(frame.camera_angle_y / 2))
+    if fx is None:
+        raise InputError("neither fl_x nor camera_angle_x is there")
+    return Camera(
+        width=int(width),
+        height=int(height),
+        fx=fx,
+        fy=fx if fy is None else fy,
+        cx=(width / 2 if frame.cx is None else frame.cx) - PIXEL_CENTRE,
+        cy=(height / 2 if frame.cy is None else frame.cy) - PIXEL_CENTRE,
+        distortion=(frame.k1 or 0.0, frame.k2 or 0.0, frame.p1 or 0.0, frame.p2 or 0.0),
+    )
+
+
+def _matrix(value: list[Any], size: int, where: str) -> FloatArray:
+    """A flat or nested list of numbers as (size, size) float, row by row."""
+    nested = bool(value) and isinstance(value[0], list)
+    rows = convert(value, list[list[Finite]] if nested else list[Finite], where=where)
+    flat = [number for row in rows for number in row] if nested else rows
+    if len(flat) != size * size or (nested and any(len(row) != size for row in rows)):
+        raise DataError(f"is not {size} x {size} finite numbers", where=where)
+    return np.array(flat).reshape(size, size)

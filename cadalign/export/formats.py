@@ -9,16 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
+from cadalign.datasets.detections.coco import write_coco_keypoints
+from cadalign.datasets.photos import bop, bop_files
+from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.datasets.photos.scan2cad import scan_entry
+from cadalign.datasets.sfm.colmap import write_colmap
+from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, quote
-from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame
-from cadalign.export.camera_files import CameraView, write_colmap, write_nerf, write_open3d
-from cadalign.export.coco import write_coco
+from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
+from cadalign.export.camera_files import write_nerf, write_open3d
 from cadalign.export.line_set import write_line_set
-from cadalign.export.scan2cad import write_scan2cad
 from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import written_path
-from cadalign.io.files import printable, refuse_nul
+from cadalign.io.files import printable, refuse_nul, write_json
+from cadalign.io.meshes.write import write_obj_mesh, write_ply_mesh
+
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,15 +103,15 @@ def _usd(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _obj(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.mesh_files import write_obj
-
-    write_obj(path, exported, frame=options.frame)
+    write_obj_mesh(path, _mesh_in_metres(exported, options))
 
 
 def _ply(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.mesh_files import write_ply
+    write_ply_mesh(path, _mesh_in_metres(exported, options))
 
-    write_ply(path, exported, frame=options.frame)
+
+def _mesh_in_metres(exported: AlignedObject, options: ExportOptions) -> Mesh:
+    return exported.placed_mesh(options.frame).stretched(exported.metres)
 
 
 def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
@@ -111,38 +119,64 @@ def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 
 
 def _bop_results(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.bop import bop_poses, write_bop_model, write_bop_results
-
-    poses = bop_poses(
-        exported,
-        scene_id=options.scene_id,
-        image_id=options.image_id,
-        object_id=options.object_id,
-    )
-    write_bop_model(path.parent, exported, object_id=options.object_id)
-    write_bop_results(path, poses)
+    mesh, poses = _bop_mesh(exported), _bop_poses(exported, options)
+    _write_bop_model(path.parent, mesh, options)
+    bop_files.write_bop_results(path, poses)
 
 
 def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.bop import TRUTH_FILE, write_bop_scene
+    folder = path.parent if path.name == bop_files.TRUTH else path
+    mesh, poses = _bop_mesh(exported), _bop_poses(exported, options)
+    cameras = {each.image: view.camera for each, view in zip(poses, exported.views, strict=True)}
+    bop.write_scene(folder, poses, cameras)
+    _write_bop_model(folder, mesh, options)
 
-    write_bop_scene(
-        path.parent if path.name == TRUTH_FILE else path,
-        exported,
-        scene_id=options.scene_id,
-        image_id=options.image_id,
-        object_id=options.object_id,
-    )
+
+def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEstimate]:
+    """The poses of an object in its photos, in millimetres, of its stretched mesh.
+
+    A photo's number is that of its file's name, where that is one, or else its view's; the given
+    one is that of the first view.
+    """
+    poses = []
+    for number, view in enumerate(exported.views):
+        pose = view.cam_from_model
+        shift = pose.translation * exported.metres / bop.MILLIMETRES
+        stem = Path(view.image_name).stem
+        image = int(stem) if stem.isdecimal() else number
+        if options.image_id is not None:
+            image = options.image_id + number
+        rigid = Alignment(pose.rotation, shift, np.ones(3))
+        ids = str(options.scene_id), str(image), str(options.object_id)
+        poses.append(PoseEstimate(*ids, rigid))
+    return poses
+
+
+def _bop_mesh(exported: AlignedObject) -> Mesh | None:
+    """The stretched mesh [mm]; poses alone are enough of a model without stretch and mesh."""
+    scale = exported.views[0].cam_from_model.scale * exported.metres / bop.MILLIMETRES
+    if exported.mesh is None and np.abs(scale - 1).max() > _SAME:
+        what = "BOP's poses have no stretch, and there is no mesh to stretch instead"
+        raise InputError(what, where="mesh", fix="give it: an observation's `model`")
+    return None if exported.mesh is None else exported.mesh.stretched(scale)
+
+
+def _write_bop_model(folder: Path, mesh: Mesh | None, options: ExportOptions) -> None:
+    if mesh is not None:
+        entry = bop_files.write_model(folder, mesh, options.object_id)
+        bop_files.write_models_info(folder, {options.object_id: entry})
 
 
 def _scan2cad(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_scan2cad(
-        path,
-        exported,
-        frame=options.frame,
-        scan_id=options.scan_id,
+    pose, metres = exported.frame_from_model(options.frame), exported.metres
+    entry = scan_entry(
+        options.scan_id,
+        Alignment(pose.rotation, pose.translation * metres, pose.scale * metres),
+        model_id=exported.name,
         category_id=options.category_id,
+        bounds=exported.bounds,
     )
+    write_json(path, [entry])
 
 
 def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
@@ -163,7 +197,7 @@ def _open3d(path: Path, exported: AlignedObject, options: ExportOptions) -> None
 
 
 def _coco(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_coco(path, exported)
+    write_coco_keypoints(path, photos_of(exported))
 
 
 def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[CameraView]:

@@ -3,7 +3,7 @@
 The scene's axes are those of the chosen frame; the first camera's are turned to glTF's, so that it
 stands in the origin, looks along -z and has y up. Lengths are metres, by `AlignedObject.metres`.
 The model is a node whose transform holds pose and stretch. Every view is a camera node with the
-photo's field of view, see `cadalign.export.photo_plane`, and a rectangle with the photo behind the
+photo's field of view, see `cadalign.export.scene_parts`, and a rectangle with the photo behind the
 object, seen from its camera's side only and unlit (KHR_materials_unlit).
 
 Buffers, accessors and images are trimesh's. Cameras and materials are written here: trimesh has one
@@ -24,8 +24,7 @@ from trimesh.visual.color import srgb_to_linear
 
 from cadalign.arrays import FloatArray
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.mesh_parts import MeshPart, parts_of
-from cadalign.export.photo_plane import PhotoPlane, photo_depth, photo_plane
+from cadalign.export.scene_parts import MeshPart, PhotoPlane, parts_of, photo_depth, photo_plane
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Material
 from cadalign.io.files import write_whole

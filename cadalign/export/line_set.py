@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.photo_plane import photo_plane
+from cadalign.export.scene_parts import photo_plane
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.io.files import write_text
 

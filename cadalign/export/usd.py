@@ -16,8 +16,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.mesh_parts import parts_of
-from cadalign.export.photo_plane import PhotoPlane, photo_depth, photo_plane
+from cadalign.export.scene_parts import PhotoPlane, parts_of, photo_depth, photo_plane
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.io.files import write_whole
 from cadalign.io.images import ByteImage, write_image

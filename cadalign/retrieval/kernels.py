@@ -15,7 +15,6 @@ from cadalign.compile import kernel
 from cadalign.retrieval.bounds import error_bound, least_weights
 from cadalign.solvers.alignment import (
     Objective,
-    accept_new,
     evaluate_alignment,
     evaluate_cost,
     room_for,
@@ -226,7 +225,6 @@ def _linearised_cost(objective: Objective, pose: FloatArray, cost: float) -> flo
     """
     equations = room_for(UNKNOWNS)
     evaluate_alignment(objective, pose, equations)
-    accept_new(equations, UNKNOWNS)
     decrease = solve_damped(equations, UNKNOWNS, 0.0, np.empty(UNKNOWNS))
     return cost - _OPTIMISM * decrease if decrease == decrease else 0.0
 

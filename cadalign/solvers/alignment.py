@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.constants import LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import (
     BLOCK,
@@ -24,7 +24,6 @@ from cadalign.solvers.evidence import (
 )
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 from cadalign.solvers.system import (
-    accept,
     are_same,
     cost_at,
     evaluate,
@@ -49,30 +48,31 @@ class Objective(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """Normal equations of U unknowns: ``hessian`` (U, U), ``gradient`` (U,), and scratch space.
-
-    Those that were evaluated last are ``new_hessian`` and ``new_gradient``.
-    """
+    """Normal equations of U unknowns: ``hessian`` (U, U), ``gradient`` (U,), and scratch space."""
 
     hessian: FloatArray
     gradient: FloatArray
-    new_hessian: FloatArray
-    new_gradient: FloatArray
     rows: FloatArray
     factor: FloatArray
 
 
-@inlined
+@kernel
 def room_for(unknowns: int) -> Equations:
     """Room for the equations of so many unknowns."""
     return Equations(
         np.empty((unknowns, unknowns)),
         np.empty(unknowns),
-        np.empty((unknowns, unknowns)),
-        np.empty(unknowns),
         np.empty((UNKNOWNS + 1, 2 * BLOCK)),
         np.empty((unknowns, unknowns)),
     )
+
+
+@kernel
+def room_for_two(unknowns: int) -> tuple[Equations, Equations]:
+    """Room for equations that take turns, with the same scratch space."""
+    first = room_for(unknowns)
+    second = np.empty((unknowns, unknowns)), np.empty(unknowns)
+    return first, Equations(second[0], second[1], first.rows, first.factor)
 
 
 def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> Objective:
@@ -83,16 +83,16 @@ def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArr
 
 
 @room_of.of(Objective)
-@inlined
-def _room_of(objective: Objective) -> Equations:
-    return room_for(UNKNOWNS)
+@kernel
+def _room_of(objective: Objective) -> tuple[Equations, Equations]:
+    return room_for_two(UNKNOWNS)
 
 
 @evaluate.of(Objective)
-@kernel
+@borrowing
 def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
     """Build the Gauss-Newton system at a pose (15,); unit rows for unknowns that are not free."""
-    hessian, gradient = equations.new_hessian, equations.new_gradient
+    hessian, gradient = equations.hessian, equations.gradient
     hessian[:] = 0.0
     gradient[:] = 0.0
     cost = add_keypoints(objective.keypoints, pose, equations.rows, hessian, gradient)
@@ -107,7 +107,7 @@ def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equati
 
 
 @cost_at.of(Objective)
-@kernel
+@borrowing
 def evaluate_cost(objective: Objective, pose: FloatArray) -> float:
     """The cost of a pose, without derivatives."""
     cost = keypoint_cost(objective.keypoints, pose)
@@ -159,21 +159,6 @@ def _move(
     moved: FloatArray,
 ) -> None:
     move_pose(pose, step, moved)
-
-
-@accept.of(Objective)
-@inlined
-def _accept(objective: Objective, pose: FloatArray, equations: Equations) -> None:
-    accept_new(equations, UNKNOWNS)
-
-
-@inlined
-def accept_new(equations: Equations, unknowns: int) -> None:
-    """Make the new equations the current ones."""
-    for k in range(unknowns):
-        equations.gradient[k] = equations.new_gradient[k]
-        for m in range(unknowns):
-            equations.hessian[k, m] = equations.new_hessian[k, m]
 
 
 @score_of.of(Objective)

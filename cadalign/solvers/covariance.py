@@ -24,7 +24,7 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
     local = with_points(objective, (objective.keypoints.points - center) / unit)
     equations = room_for(UNKNOWNS)
     evaluate_alignment(local, _centered(pose, center, unit), equations)
-    undetermined = _invert(equations.new_hessian, objective.free, 0.0, covariance)
+    undetermined = _invert(equations.hessian, objective.free, 0.0, covariance)
     _uncenter_covariance(pose, center, unit, covariance)
     return undetermined
 
@@ -45,7 +45,7 @@ def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: Float
     equations = room_for(UNKNOWNS + 1)
     unbounded = LogFocalPrior(-np.inf, np.inf, system.prior.center, system.prior.weight)
     evaluate_focal(FocalObjective(local, system.slopes, unbounded), state, equations)
-    hessian, distance = equations.new_hessian, state[11]
+    hessian, distance = equations.hessian, state[11]
     least = UNOBSERVABLE * hessian[5, 5] * distance * distance
     undetermined = _invert(hessian, system.objective.free, least, covariance)
     # The distance follows the focal length, see `cadalign.solvers.focal`.

@@ -12,12 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import fast_sums, inlined, kernel
+from cadalign.compile import borrowing, fast_sums, inlined, kernel
 from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS
-from cadalign.solvers.linalg import copy_into
+from cadalign.solvers.linalg import Triple, copy_into
 from cadalign.solvers.projection import (
     Scalars,
-    Triple,
     project_point,
     scalars_of,
     write_derivatives,
@@ -86,7 +85,7 @@ def add_keypoints(
     return cost
 
 
-@kernel
+@borrowing
 def keypoint_rows(
     keypoints: Keypoints, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
@@ -157,7 +156,7 @@ def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: 
                 gradient[k] += total
 
 
-@kernel
+@borrowing
 def keypoint_cost(keypoints: Keypoints, pose: FloatArray) -> float:
     """The keypoints' cost; infinite if a point lies behind the camera."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening

@@ -18,10 +18,9 @@ from cadalign.compile import inlined, kernel
 from cadalign.solvers.alignment import (
     Equations,
     Objective,
-    accept_new,
     are_same_poses,
     evaluate_cost,
-    room_for,
+    room_for_two,
     solve_damped,
     with_keypoints,
 )
@@ -40,7 +39,6 @@ from cadalign.solvers.linear import affine_rows
 from cadalign.solvers.projection import project_point, scalars_of
 from cadalign.solvers.refine import refine
 from cadalign.solvers.system import (
-    accept,
     are_same,
     cost_at,
     evaluate,
@@ -108,16 +106,16 @@ def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Obje
 
 
 @room_of.of(FocalObjective)
-@inlined
-def _room_of(system: FocalObjective) -> Equations:
-    return room_for(UNKNOWNS + 1)
+@kernel
+def _room_of(system: FocalObjective) -> tuple[Equations, Equations]:
+    return room_for_two(UNKNOWNS + 1)
 
 
 @evaluate.of(FocalObjective)
 @kernel
 def evaluate_focal(system: FocalObjective, state: FloatArray, equations: Equations) -> float:
     """Build the Gauss-Newton system of all 9 unknowns; see `FocalObjective`."""
-    rows, hessian, gradient = equations.rows, equations.new_hessian, equations.new_gradient
+    rows, hessian, gradient = equations.rows, equations.hessian, equations.gradient
     log_ratio = state[POSE_SIZE]
     ratio = np.exp(log_ratio)
     here = at_focal(system.objective, system.slopes, log_ratio)
@@ -204,12 +202,6 @@ def _move(
     log_ratio = min(max(state[POSE_SIZE] + log_step, system.prior.low), system.prior.high)
     moved[POSE_SIZE] = log_ratio
     moved[11] *= np.exp(log_ratio - state[POSE_SIZE])
-
-
-@accept.of(FocalObjective)
-@inlined
-def _accept(system: FocalObjective, state: FloatArray, equations: Equations) -> None:
-    accept_new(equations, UNKNOWNS + 1)
 
 
 @score_of.of(FocalObjective)

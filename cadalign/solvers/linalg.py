@@ -7,6 +7,20 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
 
+Triple = tuple[float, float, float]
+
+
+@inlined
+def cross(a: Triple, b: Triple) -> Triple:
+    """The vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def dot(a: Triple, b: Triple) -> float:
+    """The scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
 
 @kernel
 def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:

@@ -8,14 +8,11 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import POSE_SIZE
-from cadalign.solvers.linalg import polish_rotation
+from cadalign.solvers.linalg import Triple, cross, dot, polish_rotation
 from cadalign.solvers.quadrics import (
     INTERSECTION_ROWS,
     POINTS,
     QUADRICS,
-    Triple,
-    cross,
-    dot,
     hadamard,
     intersect_quadrics,
 )
@@ -80,7 +77,7 @@ def ap4p_kernel(points: FloatArray, rays: FloatArray, solutions: FloatArray) -> 
     return _solve_sample(memory, solutions)
 
 
-@inlined
+@kernel
 def minimal_memory() -> FloatArray:
     """Scratch space for any number of calls of `solve_subset`."""
     return np.empty((_ROWS, 16))

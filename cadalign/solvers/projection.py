@@ -1,7 +1,9 @@
 """Projection of model points and its derivatives: the one place that has their formulas.
 
 ``depth * (u, v, 1) = rotation @ diag(scale) @ x + translation`` for a packed pose (see
-`cadalign.solvers.unknowns`), given as a tuple of scalars so that loops keep it in registers.
+`cadalign.solvers.unknowns`), given as a tuple of scalars so that loops keep it in registers. Where
+a shape varies, or several cameras share a pose, the parts serve: a `Motion` is the rotation row by
+row and the translation, and a slope the derivative of a residual by the point in the camera.
 """
 
 from __future__ import annotations
@@ -11,28 +13,87 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
+from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.unknowns import is_pose
 
 Scalars = tuple[float, ...]
-Triple = tuple[float, float, float]
+Motion = tuple[float, ...] | FloatArray
+
+
+@inlined
+def motion_of(pose: FloatArray) -> Motion:
+    """The first 12 numbers of a packed pose as a tuple."""
+    rotation = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
+    return rotation + (pose[9], pose[10], pose[11])
 
 
 @inlined
 def scalars_of(pose: FloatArray) -> Scalars:
     """The 15 numbers of a packed pose as a tuple."""
-    rotation = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
-    return rotation + (pose[9], pose[10], pose[11], pose[12], pose[13], pose[14])
+    return motion_of(pose) + (pose[12], pose[13], pose[14])
+
+
+@inlined
+def turn(motion: Motion, point: Triple) -> Triple:
+    """The rotated point."""
+    x, y, z = point
+    return (
+        motion[0] * x + motion[1] * y + motion[2] * z,
+        motion[3] * x + motion[4] * y + motion[5] * z,
+        motion[6] * x + motion[7] * y + motion[8] * z,
+    )
+
+
+@inlined
+def turn_back(motion: Motion, slope: Triple) -> Triple:
+    """The slope by the point before the rotation."""
+    x, y, z = slope
+    return (
+        motion[0] * x + motion[3] * y + motion[6] * z,
+        motion[1] * x + motion[4] * y + motion[7] * z,
+        motion[2] * x + motion[5] * y + motion[8] * z,
+    )
+
+
+@inlined
+def shift(motion: Motion, turned: Triple) -> Triple:
+    """The moved point, from the rotated one."""
+    return turned[0] + motion[9], turned[1] + motion[10], turned[2] + motion[11]
+
+
+@inlined
+def see(point: Triple) -> Triple:
+    """Normalised image coordinates u, v of a point in the camera, and its depth."""
+    inverse = 1.0 / point[2]
+    return point[0] * inverse, point[1] * inverse, point[2]
+
+
+@inlined
+def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
+    """Slopes of a u + b v and of c v for the ``weights`` (a, b, c), at a point that `see` gave."""
+    u, v, depth = seen
+    inverse = 1.0 / depth
+    e, f, h = weights[0] * inverse, weights[1] * inverse, weights[2] * inverse
+    return (e, f, -(e * u + f * v)), (0.0, h, -h * v)
+
+
+@inlined
+def write_motion(turned: Triple, slope: Triple, rows: FloatArray, column: int) -> None:
+    """Write the derivatives by rotation vector and translation into ``rows[:6, column]``."""
+    rows[0, column], rows[1, column], rows[2, column] = cross(turned, slope)
+    rows[3, column], rows[4, column], rows[5, column] = slope
 
 
 @inlined
 def project_point(pose: Scalars, point: Triple) -> Triple:
     """Project a model point; normalised image coordinates u, v, and the depth."""
-    x, y, z = point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
-    depth = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
-    inverse = 1.0 / depth
-    u = (pose[0] * x + pose[1] * y + pose[2] * z + pose[9]) * inverse
-    v = (pose[3] * x + pose[4] * y + pose[5] * z + pose[10]) * inverse
-    return u, v, depth
+    return see(shift(pose, turn(pose, stretch(pose, point))))
+
+
+@inlined
+def stretch(pose: Scalars, point: Triple) -> Triple:
+    """The point with the scale of a packed pose."""
+    return point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
 
 
 @inlined
@@ -48,37 +109,19 @@ def write_derivatives(
 
     Column ``first`` receives those of a u + b v, column ``second`` those of c v.
     """
-    x, y, z = point[0] * pose[12], point[1] * pose[13], point[2] * pose[14]
-    ax, ay, az = pose[1] * y, pose[4] * y, pose[7] * y  # by log s_y
-    bx, by, bz = pose[2] * z, pose[5] * z, pose[8] * z  # by log s_z
-    px = pose[0] * x + ax + bx
-    py = pose[3] * x + ay + by
-    pz = pose[6] * x + az + bz
-    inverse = 1.0 / (pz + pose[11])
-    u = (px + pose[9]) * inverse
-    v = (py + pose[10]) * inverse
-    # Derivatives of the pair by the camera-frame point: (e, f, -g) and (0, h, -k).
-    e = weights[0] * inverse
-    f = weights[1] * inverse
-    g = e * u + f * v
-    h = weights[2] * inverse
-    k = h * v
-    rows[0, first] = -f * pz - g * py
-    rows[1, first] = e * pz + g * px
-    rows[2, first] = f * px - e * py
-    rows[3, first] = e
-    rows[4, first] = f
-    rows[5, first] = -g
-    rows[6, first] = e * ax + f * ay - g * az
-    rows[7, first] = e * bx + f * by - g * bz
-    rows[0, second] = -h * pz - k * py
-    rows[1, second] = k * px
-    rows[2, second] = h * px
-    rows[3, second] = 0.0
-    rows[4, second] = h
-    rows[5, second] = -k
-    rows[6, second] = h * ay - k * az
-    rows[7, second] = h * by - k * bz
+    stretched = stretch(pose, point)
+    turned = turn(pose, stretched)
+    slopes = ray_slopes(see(shift(pose, turned)), weights)
+    write_motion(turned, slopes[0], rows, first)
+    write_motion(turned, slopes[1], rows, second)
+    for k in range(1, 3):
+        longer = (
+            pose[k] * stretched[k],
+            pose[3 + k] * stretched[k],
+            pose[6 + k] * stretched[k],
+        )
+        rows[5 + k, first] = dot(slopes[0], longer)
+        rows[5 + k, second] = dot(slopes[1], longer)
 
 
 @kernel

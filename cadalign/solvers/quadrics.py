@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
+from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
 _DEGREE = 8
@@ -22,7 +23,6 @@ _FAR_BEHIND = -0.05  # depth, over half the sum of all, that polishing cannot ma
 _SAME = 1e-6  # relative difference of depths below which two solutions are one
 
 Pair = tuple[float, float]
-Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]
 Quintuple = tuple[float, float, float, float, float]
 Sextuple = tuple[float, float, float, float, float, float]
@@ -199,16 +199,6 @@ def _parabola(memory: FloatArray, row: int) -> Triple:
 def _write(memory: FloatArray, row: int, values: Quintuple) -> None:
     for k in range(5):
         memory[_SYSTEM + row, k] = values[k]
-
-
-@inlined
-def cross(a: Triple, b: Triple) -> Triple:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@inlined
-def dot(a: Triple, b: Triple) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import kernel
+from cadalign.compile import borrowing, kernel
 from cadalign.solvers.linalg import copy_into
-from cadalign.solvers.system import accept, evaluate, move, room_of, solve
+from cadalign.solvers.system import evaluate, move, room_of, solve
 
 _RELATIVE_DECREASE = 1e-12
 _ABSOLUTE_DECREASE = 1e-16
@@ -24,9 +24,22 @@ def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, 
 
     The cost is infinite if a point lies behind a camera at the start.
     """
-    equations = room_of(system)
-    step = np.zeros(equations.gradient.shape[0])
-    trial = state.copy()
+    current, new = room_of(system)
+    step = np.zeros(current.gradient.shape[0])
+    return _descend(system, max_iterations, state, state.copy(), step, current, new)
+
+
+@borrowing
+def _descend(
+    system: Any,
+    max_iterations: int,
+    state: FloatArray,
+    trial: FloatArray,
+    step: FloatArray,
+    current: Any,
+    new: Any,
+) -> tuple[float, int, bool]:
+    """Improve ``state``; ``trial`` is a copy of it, the others are room for equations and step."""
     cost = np.inf
     damping = _FIRST_DAMPING
     growth = 4.0
@@ -34,11 +47,11 @@ def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, 
     done = False
     iterations = 0
     while True:
-        trial_cost = evaluate(system, trial, equations)
+        trial_cost = evaluate(system, trial, new)
         accepted = trial_cost <= cost or (done and trial_cost <= cost * (1 + 1e-9))
         if accepted and trial_cost < np.inf:
             copy_into(state, trial)
-            accept(system, state, equations)
+            current, new = new, current
             if cost < np.inf:
                 iterations += 1
                 gain = (cost - trial_cost) / expected if expected > 0 else 1.0
@@ -54,11 +67,11 @@ def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, 
         while True:
             if damping > _LARGEST_DAMPING:
                 return cost, iterations, False
-            expected = solve(system, equations, damping, step)
+            expected = solve(system, current, damping, step)
             if expected == expected:
                 break
             damping *= growth
             growth *= 2.0
         # A small step counts as the end only where it is not the damping that made it small.
         done = damping < 1e-2 and expected <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost
-        move(system, state, equations, damping, step, trial)
+        move(system, state, current, damping, step, trial)

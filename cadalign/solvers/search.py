@@ -13,6 +13,7 @@ from cadalign.solvers.refine import refine
 from cadalign.solvers.system import (
     are_same,
     cost_at,
+    integrating,
     is_estimate,
     score_of,
 )
@@ -68,8 +69,8 @@ def search(
     """
     count = starts.shape[0]
     scores = np.empty(count)
-    for s in range(count):
-        scores[s] = cost_at(system, starts[s])
+    for s in range(count):  # a single one has no rank
+        scores[s] = cost_at(system, starts[s]) if count > 1 else 0.0
     most = min(effort.starts, count)
     probed, converged = np.full(most, np.inf), np.zeros(most, dtype=np.bool_)
     states = np.empty((most, starts.shape[1]))
@@ -100,11 +101,47 @@ def search(
         state = states[best]
         if not is_estimate(system, state) or _find(system, state, cost, label, minima) >= 0:
             continue
-        if not converged[best]:
+        if not converged[best] and effort.iterations > 0:
             cost, used, _ = refine(system, effort.iterations, state)
             minima.counts[1] += used
         least = min(least, cost)
         add_minimum(system, state, cost, label, penalty, minima)
+
+
+@kernel
+def descend(
+    system: Any,
+    likely: Minima,
+    max_iterations: int,
+    unlikely: float,
+    label: int,
+    penalty: float,
+    minima: Minima,
+) -> None:
+    """Add the minima with the shape integrated out that states of a low cost lead to.
+
+    The most promising of the ``likely`` states of this label is refined first, none whose score
+    exceeds the best one by ``unlikely``. Minima of the cost are no starts: some lie so near the
+    camera that the descent ends in another minimum. The ``costs`` are without what is integrated.
+    """
+    whole = integrating(system, True)
+    count = likely.counts[0]
+    scores = np.full(count, np.inf)
+    for k in range(count):
+        if likely.label[k] == label:
+            scores[k] = score_of(whole, likely.states[k], likely.costs[k]) + penalty
+    for k in np.argsort(scores):
+        if not scores[k] < minima.scores[0] + unlikely:
+            break
+        state = likely.states[k]
+        if _find(whole, state, np.inf, label, minima) >= 0:
+            continue
+        cost, used, _ = refine(whole, max_iterations, state)
+        minima.counts[1] += used
+        add_minimum(whole, state, cost, label, penalty, minima)
+    for k in range(minima.counts[0]):
+        if minima.label[k] == label:
+            minima.costs[k] = cost_at(integrating(system, False), minima.states[k])
 
 
 @kernel

@@ -6,9 +6,15 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.linalg import cholesky, rotation_from_quaternion, solve_cholesky
+from cadalign.solvers.linalg import (
+    Triple,
+    cholesky,
+    cross,
+    dot,
+    rotation_from_quaternion,
+    solve_cholesky,
+)
 from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
-from cadalign.solvers.projection import Triple
 from cadalign.solvers.sampling import next_subset
 from cadalign.solvers.unknowns import pack_pose
 
@@ -84,12 +90,10 @@ def _difference(points: FloatArray, i: int, j: int) -> Triple:
 @kernel
 def _volume(points: FloatArray, chosen: IntArray) -> float:
     """Six times the volume of a tetrahedron."""
-    ux, uy, uz = _difference(points, chosen[1], chosen[0])
-    vx, vy, vz = _difference(points, chosen[2], chosen[0])
-    wx, wy, wz = _difference(points, chosen[3], chosen[0])
-    return float(
-        abs(ux * (vy * wz - vz * wy) - uy * (vx * wz - vz * wx) + uz * (vx * wy - vy * wx))
-    )
+    u = _difference(points, chosen[1], chosen[0])
+    v = _difference(points, chosen[2], chosen[0])
+    w = _difference(points, chosen[3], chosen[0])
+    return abs(dot(u, cross(v, w)))
 
 
 @kernel

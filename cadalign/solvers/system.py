@@ -25,7 +25,10 @@ from cadalign.compile import KernelFamily
 
 @KernelFamily
 def room_of(system: Any) -> Any:
-    """Room for the system's equations, whose ``gradient`` has one entry for each unknown."""
+    """Room for the equations that steps are from and for those of a trial, which take turns.
+
+    Their ``gradient`` has one entry for each unknown. They may share scratch space.
+    """
     raise NotImplementedError
 
 
@@ -65,12 +68,6 @@ def move(
 
 
 @KernelFamily
-def accept(system: Any, state: FloatArray, equations: Any) -> None:
-    """Make the equations that were evaluated last, at this state, those that steps are from."""
-    raise NotImplementedError
-
-
-@KernelFamily
 def score_of(system: Any, state: FloatArray, cost: float) -> float:
     """-2 log of the evidence by Laplace's approximation, up to a constant.
 
@@ -88,4 +85,13 @@ def are_same(system: Any, first: FloatArray, second: FloatArray) -> bool:
 @KernelFamily
 def is_estimate(system: Any, state: FloatArray) -> bool:
     """False for a state that no object has, such as one whose scales ran off to zero."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def integrating(system: Any, integrates: bool) -> Any:
+    """The system with the shape integrated out of its objective, or with that of the cost alone.
+
+    Systems that have no shape have no member.
+    """
     raise NotImplementedError

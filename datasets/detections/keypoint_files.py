@@ -1,13 +1,57 @@
-"""Files of keypoints in images, of any kind that is known."""
+"""Files of keypoints in images: COCO's JSON and its relatives, or plain CSV.
+
+The first line of a CSV file names the columns, in any order:
+
+``u``, ``v``
+    The pixel; integers are pixel centres. ``x`` and ``y`` mean the same. Empty for a keypoint that
+    was not found.
+``name``
+    What the keypoint is called.
+``semantic_id``
+    What the keypoint means, a whole number; used where there is no name.
+``score``
+    How sure the detector is.
+``visibility``
+    COCO's flag: 0 not labelled, 1 hidden, 2 visible. Instead of a score.
+``sigma``
+    Standard deviation [px].
+``image``
+    The image's file name; the rows of each image make one object.
+
+Only ``u`` and ``v`` must be there. Example::
+
+    image,name,u,v,score
+    photo.jpg,"seat, front left",351.2,204.9,0.93
+    photo.jpg,"back, top left",377.0,96.4,0.71
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 from pathlib import Path
+from typing import Any
 
-from cadalign.datasets.detections.coco_keypoints import read_coco_keypoints
-from cadalign.datasets.detections.csv_keypoints import read_csv_keypoints
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints
+import numpy as np
+
+from cadalign.datasets.detections.coco import read_coco_keypoints
+from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.errors import DataError, InputError, brief, quote
+from cadalign.io.documents import Finite, Text, convert, in_file
+from cadalign.io.files import read_text
+
+_OTHER_NAMES = {"x": "u", "y": "v"}
+_COLUMNS: dict[str, Any] = {
+    "u": Finite,
+    "v": Finite,
+    "image": str,
+    "name": Text,
+    "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
+    "score": Finite,
+    "visibility": Finite,
+    "sigma": Finite,
+}
 
 
 def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
@@ -16,8 +60,8 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     Parameters
     ----------
     path : str or path-like
-        A .csv file, see `cadalign.datasets.detections.csv_keypoints`, or JSON, see
-        `cadalign.datasets.detections.coco_keypoints`.
+        A .csv file, see the module's documentation, or JSON, see
+        `cadalign.datasets.detections.coco`.
 
     Returns
     -------
@@ -31,3 +75,84 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     """
     path = Path(path)
     return read_csv_keypoints(path) if path.suffix.lower() == ".csv" else read_coco_keypoints(path)
+
+
+def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
+    """Read a CSV file, one object for each image."""
+    by_image: dict[str | None, list[dict[str, Any]]] = {}
+    try:
+        lines = csv.reader(io.StringIO(read_text(path)), strict=True)
+        header = _header(next(lines, []), f"{path}, line 1")
+        for line in lines:
+            row = _row(header, line, f"{path}, line {lines.line_num}")
+            if row is not None:
+                by_image.setdefault(row.get("image") or None, []).append(row)
+    except csv.Error as error:
+        raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
+    if not by_image:
+        raise DataError("there are no keypoints", where=str(path))
+    return [_object(path, image, rows) for image, rows in by_image.items()]
+
+
+def _header(cells: list[str], where: str) -> list[str]:
+    names = [_OTHER_NAMES.get(cell.strip().lower(), cell.strip().lower()) for cell in cells]
+    for name in names:
+        if name not in _COLUMNS:
+            what = f"unknown column {quote(name)}"
+            raise DataError(what, where=where, fix=f"known are {', '.join(_COLUMNS)}")
+        if names.count(name) > 1:
+            raise DataError(f"the column {name!r} occurs twice", where=where)
+    for name in ("u", "v"):
+        if name not in names:
+            fix = "the first line names the columns, such as name,u,v"
+            raise DataError(f"the column {name!r} is missing", where=where, fix=fix)
+    if {"score", "visibility"} <= set(names):
+        raise DataError("give score or visibility, not both", where=where)
+    return names
+
+
+def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | None:
+    """One line; None for one that is empty or has no pixel."""
+    cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
+    if not any(cells.values()):
+        return None
+    if len(line) != len(header):
+        raise DataError(f"{len(line)} values for {len(header)} columns", where=where)
+    if not cells["u"] and not cells["v"]:
+        return None
+    with in_file(where):
+        row = {
+            name: convert(_value(name, cell), _COLUMNS[name], where=name)
+            for name, cell in cells.items()
+        }
+        if row.get("semantic_id", 0) % 1:
+            raise InputError(f"{row['semantic_id']} is not a whole number", where="semantic_id")
+        if row.get("visibility", 0) not in (0, 1, 2):
+            raise InputError(f"{row['visibility']:g} is not 0, 1 or 2", where="visibility")
+    return row
+
+
+def _value(name: str, cell: str) -> str | float:
+    """A cell as a number in the columns that hold numbers, where it is a finite one."""
+    try:
+        number = np.nan if name in ("image", "name") else float(cell)
+    except ValueError:
+        return cell
+    return number if np.isfinite(number) else cell
+
+
+def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    scores = columns.get("score")
+    if "visibility" in columns:
+        scores = [VISIBILITY_SCORES[int(flag)] for flag in columns["visibility"]]
+    names, ids, sigma = (columns.get(name) for name in ("name", "semantic_id", "sigma"))
+    return ImageKeypoints(
+        points_2d=np.column_stack([columns["u"], columns["v"]]),
+        scores=None if scores is None else np.array(scores),
+        names=None if names is None else tuple(names),
+        semantic_ids=None if ids is None or names is not None else tuple(map(int, ids)),
+        sigma=None if sigma is None else np.array(sigma),
+        image=image,
+        source=str(path) if image is None else f"{path}, {image}",
+    )

@@ -17,10 +17,15 @@ from typing import NamedTuple, overload
 import numpy as np
 
 from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
-from cadalign.datasets.models.annotations import entry_id, parse_entry, read_entries
 from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
-from cadalign.datasets.models.keypoints import Keypoints, Symmetries
-from cadalign.datasets.models.locate import MeshLocator
+from cadalign.datasets.models.keypoints import (
+    Keypoints,
+    Symmetries,
+    entry_id,
+    parse_entry,
+    read_entries,
+)
+from cadalign.datasets.models.shapenet import MeshLocator
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry

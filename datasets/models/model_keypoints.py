@@ -33,9 +33,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.annotations import entry_id, parse_entry, require_unique
 from cadalign.datasets.models.keypointnet import AnnotatedModel
-from cadalign.datasets.models.keypoints import Keypoints
+from cadalign.datasets.models.keypoints import Keypoints, entry_id, parse_entry, require_unique
 from cadalign.errors import CadalignError, DataError, InputError, quote
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import (

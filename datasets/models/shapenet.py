@@ -1,4 +1,4 @@
-"""ShapeNetCore as it is distributed: one folder per category, one folder per model."""
+"""ShapeNetCore as it is distributed, a folder per category and per model, or with KeypointNet."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ from cadalign.io.meshes.load import load_mesh
 # Where a model's mesh lies in its folder: version 2, then version 1.
 _MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
 _SYNSET_DIGITS = 8
+# KeypointNet's folder of ShapeNet's meshes as PLY.
+_PLY_FOLDER = "ShapeNetCore.v2.ply"
+# Folders in ShapeNet's layout that may lie below KeypointNet's root.
+_SHAPENET_FOLDERS = ("models", "ShapeNetCore.v2")
 
 
 @dataclass(frozen=True)
@@ -145,3 +149,38 @@ class ShapeNet:
 
 def _mesh_file(folder: Path) -> Path | None:
     return next((folder / file for file in _MESH_FILES if (folder / file).is_file()), None)
+
+
+class MeshLocator:
+    """Finds mesh files below KeypointNet's root or in ShapeNetCore, listing each folder once."""
+
+    def __init__(self, root: Path, shapenet_root: str | os.PathLike[str] | None) -> None:
+        self._ply_folder = root / _PLY_FOLDER
+        self._given = [] if shapenet_root is None else [ShapeNet(shapenet_root)]
+        below = [root / name for name in _SHAPENET_FOLDERS]
+        self._below = [ShapeNet(folder) for folder in below if folder.is_dir()]
+        self._listings: dict[str, tuple[dict[str, Path], ...]] = {}
+
+    def paths(self, synset: str, model_id: str) -> tuple[Path, ...]:
+        """All mesh files of a model: of the given ShapeNetCore, KeypointNet's, of those below."""
+        if synset not in self._listings:
+            self._listings[synset] = (
+                *(_list_models(shapenet, synset) for shapenet in self._given),
+                _list_ply(self._ply_folder / synset),
+                *(_list_models(shapenet, synset) for shapenet in self._below),
+            )
+        return tuple(paths[model_id] for paths in self._listings[synset] if model_id in paths)
+
+
+def _list_models(shapenet: ShapeNet, synset: str) -> dict[str, Path]:
+    name = name_of_synset(synset)
+    models = shapenet[name] if name in shapenet.categories else ()
+    return {model.model_id: model.mesh_path for model in models}
+
+
+def _list_ply(folder: Path) -> dict[str, Path]:
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        names = []
+    return {name.removesuffix(".ply"): folder / name for name in names if name.endswith(".ply")}

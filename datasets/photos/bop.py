@@ -7,57 +7,62 @@ bop_toolkit's ``docs/bop_datasets_format.md``.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Raw
+from msgspec import Raw
 
-from cadalign.datasets.photos.bop_models import BopModels
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.bop_files import (
+    TRUTH,
+    BopModels,
+    Nine,
+    ScenePose,
+    object_name,
+    read_bop_results,
+    read_scene_gt,
+    write_model,
+    write_models_info,
+    write_scene_gt,
+)
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, parse, read_each, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
     DepthImage,
     Photo,
     PhotoObject,
     Truth,
-    existing,
+    first_existing,
 )
-from cadalign.datasets.photos.records import parse, read_table
+from cadalign.datasets.photos.placed import PlacedObject, converted
+from cadalign.datasets.photos.poses import Estimates, PoseEstimate, PoseFile
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import nearest_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
     NotNegative,
-    Point3,
     Positive,
     convert,
     in_file,
     read_json,
 )
+from cadalign.io.files import write_json, writing
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
-TRUTH = "scene_gt.json"
 _CAMERAS = "scene_camera.json"
 _INFO = "scene_gt_info.json"
 _CAMERA = "camera.json"
 _COLOR_FOLDERS = ("rgb", "gray")
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif")
-_Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
-
-
-class _Pose(ForeignDocument):
-    cam_R_m2c: _Nine
-    cam_t_m2c: Point3
-    obj_id: Annotated[int, Meta(ge=0, le=10**6)]
+_WRITTEN_SCENE = Path("test", "000001")
 
 
 class _Info(ForeignDocument):
@@ -66,7 +71,7 @@ class _Info(ForeignDocument):
 
 
 class _FrameCamera(ForeignDocument):
-    cam_K: _Nine
+    cam_K: Nine
     depth_scale: NotNegative = 1.0
 
 
@@ -169,18 +174,26 @@ class Bop(PhotoDataset):
             infos = parse(scene.info[key], list[_Info], path=folder / _INFO, where=key)
 
         def read_object(number: int, pose: Any) -> PhotoObject:
-            checked: _Pose = convert(pose, _Pose)
+            checked: ScenePose = convert(pose, ScenePose)
             found = _object(number, checked, *self._model(checked.obj_id))
             if number < len(infos):
                 found = _with_info(found, infos[number])
             name = f"{int(key):06d}_{number:06d}.png"
-            masks = (existing(folder / kind / name) for kind in ("mask_visib", "mask"))
-            return replace(found, mask_path=next(filter(None, masks), None))
+            masks = (folder / kind / name for kind in ("mask_visib", "mask"))
+            return replace(found, mask_path=first_existing(masks))
 
         objects, problems = read_each(poses, read_object, where=f"{folder / TRUTH}, {key}")
         depth_path = _image(folder, ("depth",), key)
         depth = None if depth_path is None else DepthImage(depth_path, depth_scale)
         return Photo(self.names[index], image, camera, objects, depth=depth, problems=problems)
+
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open a CSV file of results of the BOP challenge, or one as ``scene_gt.json``."""
+        if path.suffix.lower() == ".csv":
+            return _Poses(read_bop_results(path), self)
+        if isinstance(read_json(path), list):
+            raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
+        return _Poses(read_scene_gt(path), self)
 
     def _model(self, obj_id: int) -> tuple[CadModel | None, Symmetry]:
         """A model and its symmetries, read once while photos have the same models."""
@@ -210,12 +223,8 @@ def _read_scene(folder: Path) -> _Scene:
 def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
     if not key.isdecimal():
         raise DataError(f"{key!r} is not the number of an image", where=str(folder / TRUTH))
-    for kind in kinds:
-        for suffix in _IMAGES:
-            path = folder / kind / f"{int(key):06d}{suffix}"
-            if path.is_file():
-                return path
-    return None
+    name = f"{int(key):06d}"
+    return first_existing(folder / kind / f"{name}{end}" for kind in kinds for end in _IMAGES)
 
 
 def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None, float]:
@@ -237,35 +246,32 @@ def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None,
         )
     if size is None:
         return None, scale
-    try:
+    with in_file(f"{scene.folder}, camera of photo {key}"):
         return Camera(*size, *values), scale
-    except InputError as error:
-        where = f"{scene.folder}, camera of photo {key}"
-        raise DataError(error.what, where=where) from None
 
 
 def _common_camera(folder: Path) -> _SceneCamera | None:
     """The camera of all photos of a scene: its own, or that of a folder above it."""
     for place in (folder, *folder.parents[:2]):
         path = place / _CAMERA
-        if path.is_file():
-            data = read_json(path)
-            if isinstance(data, dict) and "fx" in data:
-                with in_file(path):
-                    found: _SceneCamera = convert(data, _SceneCamera)
-                return found
+        data = read_json(path) if path.is_file() else None
+        if isinstance(data, dict) and "fx" in data:
+            with in_file(path):
+                found: _SceneCamera = convert(data, _SceneCamera)
+            return found
     return None
 
 
-def _object(number: int, pose: _Pose, model: CadModel | None, symmetry: Symmetry) -> PhotoObject:
-    rotation = nearest_rotation(np.reshape(pose.cam_R_m2c, (3, 3)).astype(float))
-    alignment = Alignment(rotation, np.array(pose.cam_t_m2c), np.ones(3), is_valid=True)
+def _object(
+    number: int, pose: ScenePose, model: CadModel | None, symmetry: Symmetry
+) -> PhotoObject:
+    alignment = pose.alignment()
     box = None
     if model is not None and model.bounds is not None:
         box = Box.from_model(model.bounds, alignment)
     return PhotoObject(
         object_id=str(number),
-        category=f"obj_{pose.obj_id:06d}",
+        category=object_name(pose.obj_id),
         truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
         model=model,
         symmetry=symmetry,
@@ -278,3 +284,107 @@ def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:
         left, top, width, height = info.bbox_obj
         bbox = np.array([left, top, left + width, top + height])
     return replace(found, bbox=bbox, visible_fraction=info.visib_fract)
+
+
+class _Poses(PoseFile):
+    """BOP's poses, by the numbers of scene and image."""
+
+    def __init__(self, estimates: Estimates, dataset: Bop) -> None:
+        self.problems = estimates.problems
+        self._own = str(int(dataset.root.name)) if dataset.root.name.isdecimal() else ""
+        scenes = {each.scene for each in estimates.poses}
+        is_numbered = self._own or any("/" in name for name in dataset.names)
+        if not is_numbered and len(scenes) > 1:
+            raise DataError(
+                f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number",
+                where=str(estimates.path),
+                fix="give the data set's folder, or a file of that scene alone",
+            )
+        # A file or a folder that tells no number is of the one scene there is.
+        self._any_scene = not is_numbered or scenes == {""}
+        self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
+        for each in estimates.poses:
+            self._poses["" if self._any_scene else each.scene, each.image].append(each)
+
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        return tuple(self._poses.get(self._key(photo.name), ()))
+
+    def strays(self, names: Sequence[str]) -> int:
+        known = {self._key(name) for name in names}
+        return sum(len(poses) for key, poses in self._poses.items() if key not in known)
+
+    def _key(self, name: str) -> tuple[str, str]:
+        scene, _, image = name.rpartition("/")
+        scene = scene.rpartition("/")[2]
+        number = str(int(scene)) if scene.isdecimal() else self._own
+        return "" if self._any_scene else number, str(int(image)) if image.isdecimal() else image
+
+
+def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write objects as one scene, a photo for each, with the stretched meshes [mm] as its models.
+
+    Each object has a model of its own, ``obj_000001`` and so on: poses have no stretch. Returns
+    why objects were left out.
+    """
+    scene = folder / _WRITTEN_SCENE
+    entries, problems = converted(numbered, partial(_written, folder))
+    write_models_info(folder, {int(each.pose.model_id): each.model for each in entries})
+    cameras = {each.pose.image: each.camera for each in entries}
+    write_scene(scene, [each.pose for each in entries], cameras)
+    write_json(scene / _INFO, {each.pose.image: [each.info] for each in entries})
+    return problems
+
+
+class _Written(NamedTuple):
+    """What the tables of a scene say of a written object."""
+
+    pose: PoseEstimate
+    camera: Camera
+    model: dict[str, float]
+    info: dict[str, list[float]]
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> _Written:
+    placed.require_plain_camera("BOP")
+    scene, image, model_id = folder / _WRITTEN_SCENE, str(number), number + 1
+    left, top, right, bottom = placed.bbox.tolist()
+    mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
+    placed.copy_image(scene / "rgb" / f"{number:06d}")
+    placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
+    pose = replace(placed.pose, translation=placed.pose.translation / MILLIMETRES)
+    return _Written(
+        PoseEstimate("1", image, str(model_id), pose),
+        placed.camera,
+        write_model(folder, mesh, model_id),
+        {"bbox_obj": [left, top, right - left, bottom - top]},
+    )
+
+
+def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:
+    """Write ``scene_gt.json`` and ``scene_camera.json`` of photos named by their numbers.
+
+    Raises
+    ------
+    InputError
+        If a camera has lens distortion, or a pose a stretch, which the format lacks.
+    """
+    table = {}
+    for number, (image, camera) in enumerate(cameras.items()):
+        if any(camera.distortion):
+            fix = "undistort the photo and fit again, or export the result CSV alone"
+            what = "BOP's camera files have no place for lens distortion"
+            raise InputError(what, where=f"views[{number}].camera", fix=fix)
+        table[image] = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / _CAMERAS, table)
+    write_scene_gt(folder / TRUTH, poses)
+
+
+FORMAT = PhotoFormat(
+    "bop",
+    f"BOP: {TRUTH}, in the folder or one or two below",
+    lambda folder: next(find_scenes(folder), None) is not None,
+    Bop,
+    write_bop,
+)

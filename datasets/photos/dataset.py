@@ -1,4 +1,4 @@
-"""Lazy iteration over photos, in which no bad record stops the rest."""
+"""Photos of a data set and their JSON records, read when asked for: no bad one stops the rest."""
 
 from __future__ import annotations
 
@@ -8,13 +8,22 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
-from cadalign.errors import CadalignError, DataError
+from cadalign.datasets.photos.placed import PlacedObject
+from cadalign.datasets.photos.poses import PoseFile
+from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.io.documents import convert, in_file
+from cadalign.io.files import damaged, read_bytes
 
 logger = logging.getLogger("cadalign")
 
+T = TypeVar("T")
 _Record = TypeVar("_Record")
 # Warnings of one data set that are logged; `problems` has all.
 _LOGGED = 20
@@ -131,6 +140,23 @@ class PhotoDataset(ABC):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}): {len(self)} photos"
 
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open a file of poses that were estimated on this data set.
+
+        Raises
+        ------
+        InputError
+            If it is not of the form of this data set.
+        DataError
+            If it cannot be read.
+        """
+        raise self.other_poses(path, "give poses on a data set of BOP or Scan2CAD")
+
+    def other_poses(self, path: Path, fix: str) -> InputError:
+        """The error of a file of poses that this data set's format does not know."""
+        what = f"not a file of poses for {self.kind}, which {self.root} holds"
+        return InputError(what, where=str(path), fix=fix)
+
     def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
         """Read all records, not the images, and count what there is.
 
@@ -167,7 +193,8 @@ class PhotoDataset(ABC):
 
     def _read(self, index: int) -> Photo:
         try:
-            return self.read(index)
+            with np.errstate(all="ignore"):  # what is not finite in the end is refused by name
+                return self.read(index)
         except DataError:
             raise
         except CadalignError as error:  # a value that a camera or a pose refuses
@@ -180,6 +207,36 @@ class PhotoDataset(ABC):
             more = " (further problems are counted only)" if len(self.problems) == _LOGGED else ""
             logger.warning("%s: left out: %s%s", self.kind, error, more)
         self.problems[name] = error
+
+
+@dataclass(frozen=True)
+class PhotoFormat:
+    """A format of data sets of photos: how it is told, read and written.
+
+    Parameters
+    ----------
+    name : str
+        Its short name, which `write_photos` knows it by.
+    signature : str
+        What tells it, for messages.
+    is_here : callable
+        Whether a folder holds it.
+    open : callable
+        Makes the data set of the folder.
+    write : callable, optional
+        Writes objects with their numbers into a folder; returns why some cannot be held.
+    """
+
+    name: str
+    signature: str
+    is_here: Callable[[Path], bool]
+    open: Callable[[Path], PhotoDataset]
+    write: Callable[[Path, Iterable[tuple[int, PlacedObject]]], list[InputError]] | None = None
+
+
+def has(*patterns: str) -> Callable[[Path], bool]:
+    """The test whether a folder has a file of one of these patterns."""
+    return lambda folder: any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
 def _parts(found: PhotoObject) -> Iterator[str]:
@@ -222,3 +279,55 @@ def read_each(
         if each is not None:
             found.append(each)
     return tuple(found), tuple(problems)
+
+
+def read_list(path: Path) -> list[Raw]:
+    """Read a JSON file that holds a list, its entries not yet parsed.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is no valid JSON (cut short, say), or holds no list.
+    """
+    return list(_read_raw(path, list[Raw], "a list"))
+
+
+def read_table(path: Path) -> dict[str, Raw]:
+    """Read a JSON file that holds an object, its values not yet parsed.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is no valid JSON (cut short, say), or holds no object.
+    """
+    return dict(_read_raw(path, dict[str, Raw], "an object"))
+
+
+def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
+    """Parse an entry as a declared type; errors name the file and the place in it.
+
+    Raises
+    ------
+    DataError
+        If it is not of this type, or no valid JSON.
+    """
+    try:
+        data = msgspec.json.decode(raw)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"not valid JSON: {brief(error)}", where=f"{path}: {where}") from None
+    except RecursionError:
+        raise DataError("nested too deeply", where=f"{path}: {where}") from None
+    with in_file(path):
+        return convert(data, kind, where)
+
+
+def _read_raw(path: Path, kind: Any, name: str) -> Any:
+    data = read_bytes(path)
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.ValidationError:
+        raise DataError(f"expected {name}", where=str(path)) from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise damaged(f"not valid JSON: {brief(error)}", path) from None
+    except RecursionError:
+        raise DataError("not valid JSON: nested too deeply", where=str(path)) from None

@@ -13,25 +13,70 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
-from cadalign.datasets.photos.kitti_files import KittiLabel, read_labels, read_projection
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
 from cadalign.datasets.photos.kitti_keypoints import (
     CARS,
     TRACKS,
     UP,
     KeypointFrame,
+    car_box,
     list_cars,
     list_tracks,
+    write_cars,
 )
 from cadalign.datasets.photos.photo import Photo, PhotoObject, Truth, existing
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.io.documents import in_file
+from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 
 SIZE = (1242, 375)
 """The size of most of KITTI's photos, taken where the photo itself is not there [px]."""
 _OBJECT, _TRACKING = ("label_2", "image_2"), ("label_02", "image_02")
 _PLACES = (".", "training")
+# The numbers after an object's type: truncated, occluded, alpha, bbox 4, dimensions h w l,
+# location 3, rotation_y; a detector's score may follow.
+_NUMBERS = 14
+_NO_FRAME = -1
+
+
+@dataclass(frozen=True, eq=False)
+class KittiLabel:
+    """One line of a label file.
+
+    Parameters
+    ----------
+    kind : str
+        The object's type, such as "Car".
+    numbers : (14,) float
+        What follows the type.
+    frame, track : int, optional
+        The tracking benchmark's first two columns.
+    """
+
+    kind: str
+    numbers: FloatArray
+    frame: int | None = None
+    track: int | None = None
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """Some of "truncated" and "occluded"."""
+        found = {"truncated": self.numbers[0] > 0, "occluded": self.numbers[1] > 0}
+        return frozenset(name for name, is_set in found.items() if is_set)
+
+    @property
+    def bbox(self) -> FloatArray:
+        """Left, top, right and bottom [px], (4,) float."""
+        return self.numbers[3:7]
+
+    def box(self, shift: FloatArray) -> Box:
+        """The object's box in the frame of a camera that lies ``shift`` off the reference."""
+        height, width, length, x, y, z, rotation_y = self.numbers[7:14]
+        dims = np.array([height, width, length])
+        return car_box(dims, np.array([x, y, z]) + shift, float(rotation_y))
 
 
 @dataclass(frozen=True)
@@ -169,9 +214,6 @@ def _list_tracking_labels(root: Path) -> Iterator[_LabelFrame | DataError]:
                 yield _LabelFrame(f"{path.stem}/{name}", path, image, calibration, frame)
 
 
-_NO_FRAME = -1
-
-
 def _by_frame(
     labels: Iterable[KittiLabel | DataError],
 ) -> dict[int, list[KittiLabel | DataError]]:
@@ -182,3 +224,84 @@ def _by_frame(
         frame = label.frame if is_read and isinstance(label, KittiLabel) else _NO_FRAME
         found.setdefault(_NO_FRAME if frame is None else frame, []).append(label)
     return found
+
+
+def read_labels(path: Path, *, tracking: bool) -> list[KittiLabel | DataError]:
+    """Read a label file; a bad line is the reason why, in its place.
+
+    Parameters
+    ----------
+    path : Path
+    tracking : bool
+        Whether frame and track come before the type.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read.
+    """
+    lines = read_text(path).splitlines()
+    found: list[KittiLabel | DataError] = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                found.append(_label(line.split(), tracking=tracking))
+            except InputError as error:
+                found.append(DataError(error.what, where=f"{path}, line {number}"))
+    return found
+
+
+def _label(fields: list[str], *, tracking: bool) -> KittiLabel:
+    skipped = 2 if tracking else 0
+    if len(fields) not in (skipped + 1 + _NUMBERS, skipped + 2 + _NUMBERS):
+        raise InputError(f"{len(fields)} columns, expected {skipped + 1 + _NUMBERS}")
+    try:
+        numbers = np.array(fields[skipped + 1 : skipped + 1 + _NUMBERS], dtype=np.float64)
+        frame, track = map(int, fields[:2]) if tracking else (None, None)
+    except ValueError:
+        raise InputError(f"{quote(' '.join(fields))} are not a label's numbers") from None
+    if not np.isfinite(numbers).all():
+        raise InputError("some of its numbers are not finite")
+    return KittiLabel(fields[skipped], numbers, frame, track)
+
+
+def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArray]:
+    """Read the left colour camera's matrix P2 from a calibration file.
+
+    Returns
+    -------
+    camera : Camera
+    shift : (3,) float
+        What is added to the reference camera's coordinates, in which locations are given, to get
+        this camera's [m].
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or holds no valid P2.
+    """
+    lines = read_text(path).splitlines()
+    for line in lines:
+        name, _, rest = line.partition(" ")
+        if name.rstrip(":") != "P2":
+            continue
+        try:
+            matrix = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
+        except ValueError:
+            raise damaged("P2 is not a 3 x 4 matrix", path) from None
+        k = matrix[:, :3]
+        with in_file(f"{path}: P2"):
+            camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+        return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
+    raise damaged("there is no line P2", path)
+
+
+FORMAT = PhotoFormat(
+    "kitti",
+    f"KITTI: {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}",
+    has(
+        CARS, TRACKS, *(f"{place}/{kind[0]}" for place in _PLACES for kind in (_OBJECT, _TRACKING))
+    ),
+    KittiCars,
+    write_cars,
+)

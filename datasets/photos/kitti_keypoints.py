@@ -1,4 +1,4 @@
-"""Files of cars' keypoints in KITTI's photos, as keypoint networks and their papers write them.
+"""Cars of KITTI: their boxes, files of their keypoints, read and written, and their linear shape.
 
 ``cars.json`` is a list of cars, each with its photo, which is listed once for each car in it::
 
@@ -14,12 +14,19 @@
                              "rotation_y": -1.7, "uv": k x 2, "score": [...]}]}]}
 
 ``xyz`` is the keypoint on the model: x to the car's left, y to its rear, z up [m].
+
+Beside ``car_tracks.json`` may lie a linear shape model, as in Krishna et al., "Reconstructing
+Vehicles from a Single Image: Shape Priors for Road Scene Understanding", ICRA 2017::
+
+    meanShape_2.txt     the same mean in another unit and frame, k x 3
+    vectors2.txt        modes of deformation of unit norm, in that frame, each 3 k numbers
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +34,7 @@ import numpy as np
 from msgspec import Raw
 
 from cadalign.arrays import FloatArray, read_only
-from cadalign.datasets.photos.kitti_files import car_box
+from cadalign.datasets.photos.dataset import parse, read_list, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
     ModelFiles,
@@ -38,9 +45,11 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.records import parse, read_list, read_table
+from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, converted
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.documents import (
     Finite,
     ForeignDocument,
@@ -53,15 +62,27 @@ from cadalign.io.documents import (
     in_file,
     within,
 )
+from cadalign.io.files import damaged, read_text, write_json
 from cadalign.io.images import photo_size
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.reflections import find_reflection
 
 CARS = "cars.json"
 TRACKS = "car_tracks.json"
 HIDDEN = 0.1
 """Scores below this are those of keypoints that something hides."""
-UP = read_only(np.array([0.0, -1.0, 0.0]))
+UP = read_only(np.array(LEVEL_UP))
 """KITTI's cameras are level, and so are the boxes of its labels."""
 _MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
+# The car's frame from KITTI's object frame (x forward, y down, z left at rotation_y = 0).
+_OBJECT_FROM_CAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+# The car's frame from a model whose y is up: left is -x, rear z, up y.
+_CAR_FROM_Y_UP = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+_MOST_TILT = 10.0  # of a written model's up from the camera's [degrees]
+_MEAN, _MODES = "meanShape_2.txt", "vectors2.txt"
+_LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of the logs of width, length, height of cars in KITTI
+_MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
+_REST = 0.03  # what the modes leave of a keypoint's place [m]
 _Matrix = tuple[Point3, Point3, Point3]
 _Dims = tuple[Positive, Positive, Positive]
 _Four = tuple[Finite, Finite, Finite, Finite]
@@ -176,6 +197,46 @@ class KeypointFrame:
         return Photo(self.name, None, _camera(track.K, size), (found,), up=UP)
 
 
+def car_box(dims_hwl: FloatArray, location: FloatArray, rotation_y: float) -> Box:
+    """The box of a car from KITTI's numbers.
+
+    Its axes are the car's: x to its left, y to its rear, z up; its extents width, length, height.
+
+    Parameters
+    ----------
+    dims_hwl : (3,) float
+        Height, width and length [m].
+    location : (3,) float
+        The centre of its bottom in the camera frame [m].
+    rotation_y : float
+        The rotation about the camera's y [rad]; 0 for a car that heads along the camera's x.
+
+    Raises
+    ------
+    InputError
+        If a dimension is not positive.
+    """
+    height, width, length = dims_hwl.tolist()
+    if not min(height, width, length) > 0:
+        raise InputError(f"{dims_hwl.tolist()} are not positive", where="dimensions")
+    turn = rotation_from_vector(np.array([0.0, rotation_y, 0.0]))
+    center = location - np.array([0, height / 2, 0])
+    return Box(center, turn @ _OBJECT_FROM_CAR, np.array([width, length, height]))
+
+
+def yaw_of_car(rotation: FloatArray) -> float:
+    """KITTI's rotation_y [rad] of a rotation (3, 3) from the car's frame to the camera's.
+
+    Examples
+    --------
+    >>> box = car_box(np.ones(3), np.array([0.0, 0.0, 9.0]), 0.7)
+    >>> round(yaw_of_car(box.rotation), 12)
+    0.7
+    """
+    forward = -rotation[:, 1]
+    return float(np.arctan2(-forward[2], forward[0]))
+
+
 def list_cars(path: Path) -> Iterator[KeypointFrame | DataError]:
     """List the cars of ``cars.json``; a file that cannot be read is the reason why."""
     try:
@@ -199,13 +260,10 @@ def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
     """List the frames of ``car_tracks.json``; what cannot be read is the reason why."""
     try:
         table = read_table(path)
-        raw = {
-            name: parse(table.get(name, Raw(b"null")), Any, path=path, where=name)
-            for name in ("names", "model_xyz", "tracks")
-        }
+        model = _mean_car(path, table)
+        raw = parse(table.get("tracks", Raw(b"null")), Any, path=path, where="tracks")
         with in_file(path):
-            model = convert({key: raw[key] for key in ("names", "model_xyz")}, MeanCar)
-            tracks = convert(raw["tracks"], list[Any], "tracks")
+            tracks = convert(raw, list[Any], "tracks")
     except DataError as error:
         yield error
         return
@@ -258,3 +316,103 @@ def _object(
         model=CadModel("mean car", ModelFiles(None, points), bounds=car_bounds(points.xyz)),
         bbox=np.array(pose.bbox),
     )
+
+
+def write_cars(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write objects as ``cars.json``, with boxes that stand upright before a level camera.
+
+    A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
+    Returns why objects were left out.
+    """
+    entries, problems = converted(numbered, partial(_written, folder))
+    write_json(folder / CARS, entries)
+    return problems
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    placed.require_plain_camera("KITTI")
+    pose = placed.pose
+    is_z_up = (pose.rotation[:, 2] @ UP) > (pose.rotation[:, 1] @ UP)
+    car_from_model = np.eye(3) if is_z_up else _CAR_FROM_Y_UP
+    cam_from_car: FloatArray = pose.rotation @ car_from_model.T
+    tilt = np.degrees(np.arccos(np.clip(cam_from_car[:, 2] @ UP, -1, 1)))
+    if tilt > _MOST_TILT:
+        raise InputError(
+            f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees",
+            where=placed.photo.name,
+            fix="choose another form, such as bop",
+        )
+    width, length, height = np.abs(car_from_model @ placed.sides).tolist()
+    image = placed.copy_image(folder / "images" / f"{number:06d}")
+    keypoints = [
+        {"name": name, "xyz": xyz.tolist(), "uv": placed.marked[name].tolist()}
+        for name, xyz in zip(placed.names, placed.points @ car_from_model.T, strict=True)
+        if name in placed.marked
+    ]
+    return {
+        "image": image.relative_to(folder).as_posix(),
+        "K": placed.camera.matrix.tolist(),
+        "bbox": placed.bbox.tolist(),
+        "dims_hwl": [height, width, length],
+        "location_bottom_centre": (placed.center + [0.0, height / 2, 0.0]).tolist(),
+        "rotation_y": yaw_of_car(cam_from_car),
+        "keypoints": keypoints,
+    }
+
+
+def car_shape(folder: Path) -> ShapeModel | None:
+    """The shape model of the cars of a folder, in metres; None without its three files.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be read, or their sizes disagree.
+    """
+    paths = [folder / name for name in (TRACKS, _MEAN, _MODES)]
+    if not all(path.is_file() for path in paths):
+        return None
+    car = _mean_car(paths[0], read_table(paths[0]))
+    points = np.array(car.model_xyz, dtype=float).reshape(-1, 3)
+    mean = _numbers(paths[1], len(points) * 3).reshape(-1, 3)
+    modes = _numbers(paths[2], len(points) * 3).reshape(-1, len(points), 3)
+    box = car_bounds(points)
+    metres, *_ = np.linalg.lstsq(mean - mean.mean(axis=0), points - points.mean(axis=0), rcond=None)
+    return ShapeModel.from_basis(
+        points,
+        modes @ metres,
+        np.full(len(modes), _MODE_DEVIATION),
+        names=car.names,
+        box=box,
+        residual_sigma=_REST,
+        size_sigma=_LENGTH_SIGMAS,
+        # The mean of annotated cars is a little skew: its left wheel stands before its right one.
+        reflection=find_reflection(np.vstack([points, box])[None], car.names, axis=0),
+        category="Car",
+        up_axis="z",
+        unit="m",
+    )
+
+
+def _mean_car(path: Path, table: dict[str, Raw]) -> MeanCar:
+    raw = {
+        name: parse(table.get(name, Raw(b"null")), Any, path=path, where=name)
+        for name in ("names", "model_xyz")
+    }
+    with in_file(path):
+        found: MeanCar = convert(raw, MeanCar)
+    return found
+
+
+def _numbers(path: Path, multiple: int) -> FloatArray:
+    """All numbers of a text file, a multiple of so many."""
+    text = read_text(path)
+    try:
+        values = np.array(text.split(), dtype=np.float64)
+    except ValueError:
+        raise damaged("not a table of numbers", path) from None
+    if not len(values) or len(values) % multiple:
+        what = f"{len(values)} numbers are not a multiple of {multiple}"
+        raise DataError(what, where=str(path))
+    if not np.isfinite(values).all():
+        raise DataError("some of its numbers are not finite", where=str(path))
+    return values

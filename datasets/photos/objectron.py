@@ -7,7 +7,7 @@ Annotations", CVPR 2021.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, read_each
 from cadalign.datasets.photos.objectron_files import (
     ArCamera,
     ObjectronAnnotation,
@@ -34,7 +34,9 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    first_existing,
 )
+from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -42,7 +44,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
-from cadalign.io.files import open_input
+from cadalign.io.files import open_input, write_json
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -61,6 +63,10 @@ _NAMES = ("center", *(f"corner {number}" for number in range(1, 9)))
 # (right) the photo's y (down), and it looks along -z.
 _CV_FROM_SENSOR = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _VISIBLE = 0.1
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_NEAR, _FAR = 1e-3, 1e3  # of written projection matrices
+_CONTAINERS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+_MOST_BYTES = 2**36  # of a video
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,11 @@ class VideoFrame:
         """
         import cv2  # on first use: it takes longer to import than all the rest
 
-        video = cv2.VideoCapture(str(self.path))
+        # Going by the content, OpenCV would play lists of other files and addresses, too.
+        with open_input(self.path, most=_MOST_BYTES) as (file, _):
+            if file.read(8)[4:] not in _CONTAINERS:
+                raise DataError("not a video in QuickTime's or MP4's form", where=str(self.path))
+        video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         try:
             video.set(cv2.CAP_PROP_POS_FRAMES, self.number)
             is_read, pixels = video.read()
@@ -150,8 +160,10 @@ class Objectron(PhotoDataset):
             stem = path.relative_to(folder).with_suffix("").as_posix()
             self._frames += [(path, number) for number in range(count)]
             names += [f"{stem}/{number}" for number in range(count)]
-        if not names:
+        if bad and not names:
             raise next(iter(bad.values()))
+        if not names:
+            raise DataError("the annotation files have no frames", where=str(folder))
         super().__init__(folder, names)
         self.problems |= bad
         self._sequence: Sequence | None = None
@@ -255,10 +267,10 @@ def _cam_from_world(found: ArCamera) -> Alignment:
 
 def _image(root: Path, annotation: Path, frame_id: int) -> Path | ImageReader | None:
     for folder in _image_folders(root, annotation):
-        for name in (f"{frame_id}", f"{frame_id:06d}"):
-            for suffix in (".jpg", ".png"):
-                if (folder / f"{name}{suffix}").is_file():
-                    return folder / f"{name}{suffix}"
+        names = (str(frame_id), f"{frame_id:06d}")
+        image = first_existing(folder / f"{n}{end}" for n in names for end in (".jpg", ".png"))
+        if image is not None:
+            return image
         if (folder / "video.MOV").is_file():
             return VideoFrame(folder / "video.MOV", frame_id)
     return None
@@ -269,3 +281,79 @@ def _image_folders(root: Path, annotation: Path) -> Iterator[Path]:
     place = annotation.with_suffix("").relative_to(root)
     if place.parts[0] == ANNOTATIONS:
         yield root / Path("videos", *place.parts[1:])
+
+
+def write_objectron(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write each object as a sequence of one frame, as JSON: its box with centre and corners.
+
+    The scene's y points up. Returns why objects were left out.
+    """
+    _, problems = converted(numbered, partial(_written, folder))
+    return problems
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    sequence = _sequence(placed)
+    place = folder / ANNOTATIONS / placed.category / "batch-1"
+    placed.copy_image(place / f"{number}" / "0")
+    write_json(place / f"{number}.json", sequence)
+    return sequence
+
+
+def _sequence(placed: PlacedObject) -> dict[str, Any]:
+    placed.require_plain_camera("Objectron")
+    pose, camera, sides, center = placed.pose, placed.camera, placed.sides, placed.center
+    if not sides.min() > 0:
+        raise InputError("the model is flat, which no box is", where=placed.photo.name)
+    corners = center + (_UNIT_BOX * sides) @ pose.rotation.T
+    share = (camera.project_where_ahead(corners) + PIXEL_CENTRE) / (camera.width, camera.height)
+    if not np.isfinite(share).all():
+        raise InputError("the box reaches behind the camera", where=placed.photo.name)
+    world_from_cam = _Y_UP_FROM_Z_UP @ upright_rotation(placed.up)
+    view = np.eye(4)
+    view[:3, :3] = _CV_FROM_SENSOR.T @ world_from_cam.T
+    found = {
+        "id": 1,
+        "category": placed.found.category,
+        "rotation": (world_from_cam @ pose.rotation).ravel().tolist(),
+        "translation": (world_from_cam @ center).tolist(),
+        "scale": sides.tolist(),
+    }
+    keypoints = [
+        {"id": k, "point2d": {"x": x, "y": y, "depth": depth}}
+        for k, ((x, y), depth) in enumerate(
+            zip(share.tolist(), corners[:, 2].tolist(), strict=True)
+        )
+    ]
+    frame = {
+        "frameId": 0,
+        "annotations": [{"objectId": 1, "keypoints": keypoints, "visibility": 1.0}],
+        "camera": {
+            "imageResolutionWidth": camera.height,
+            "imageResolutionHeight": camera.width,
+            "projectionMatrix": _projection(camera).ravel().tolist(),
+            "viewMatrix": view.ravel().tolist(),
+        },
+    }
+    return {"objects": [found], "frameAnnotations": [frame]}
+
+
+def _projection(camera: Camera) -> FloatArray:
+    """The projection matrix of the sensor on its side."""
+    width, height = camera.width, camera.height
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[1, 1] = 2 * camera.fy / height, 2 * camera.fx / width
+    matrix[0, 2] = 1 - 2 * (camera.cy + PIXEL_CENTRE) / height
+    matrix[1, 2] = 1 - 2 * (camera.cx + PIXEL_CENTRE) / width
+    matrix[2, 2:] = -(_FAR + _NEAR) / (_FAR - _NEAR), -2 * _FAR * _NEAR / (_FAR - _NEAR)
+    matrix[3, 2] = -1.0
+    return matrix
+
+
+FORMAT = PhotoFormat(
+    "objectron",
+    f"Objectron: .pbdata files, or JSON files in {ANNOTATIONS}",
+    has_annotations,
+    Objectron,
+    write_objectron,
+)

@@ -9,27 +9,43 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
 from cadalign.datasets.photos.mat_files import MatStruct, read_structs
-from cadalign.datasets.photos.pascal3d_cad import PascalCad
 from cadalign.datasets.photos.photo import (
     CadModel,
+    NamedPoints,
     Photo,
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    first_existing,
 )
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    PathText,
+    Point2,
+    Text,
+    in_file,
+    read_document,
+)
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
+DETECTED = "annot"
+_OBSERVATIONS = "observations"
 # MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
 # The focal length, in pixels, that annotations without one were made with.
@@ -112,12 +128,9 @@ class Pascal3D(PhotoDataset):
 
 def find_image(root: Path, name: str) -> Path | None:
     """Find the image of an annotation, named without its ending; None where it is missing."""
-    for folder in _IMAGE_FOLDERS:
-        for suffix in _IMAGES:
-            path = root / folder / f"{name}{suffix}"
-            if path.is_file():
-                return path
-    return None
+    return first_existing(
+        root / folder / f"{name}{end}" for folder in _IMAGE_FOLDERS for end in _IMAGES
+    )
 
 
 def cad_folder(root: Path) -> Path | None:
@@ -179,7 +192,7 @@ def _object(
 
 def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
     """The anchors that are visible."""
-    marked: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {}
+    marked: dict[str, FloatArray] = {}
     for name in () if anchors is None else anchors.names:
         each = None if anchors is None else anchors.struct(name)
         if each is None or each.number("status", default=0.0) != _VISIBLE:
@@ -213,9 +226,11 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
             np.sin(elevation),
         ]
     )
-    tilt = elevation - np.pi / 2
-    upright = _about_x(tilt) @ _about_z(-azimuth)
-    rotation = OPENGL_AXES[:, None] * (_about_z(theta) @ upright)
+    about_x, about_z = np.eye(3)[[0, 2]]
+    upright = rotation_from_vector((elevation - np.pi / 2) * about_x) @ rotation_from_vector(
+        -azimuth * about_z
+    )
+    rotation = OPENGL_AXES[:, None] * (rotation_from_vector(theta * about_z) @ upright)
     annotated = Camera(
         camera.width,
         camera.height,
@@ -228,11 +243,172 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
     return Truth(cam_from_model=pose, camera=annotated)
 
 
-def _about_x(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+# CAD models -------------------------------------------------------------------------------------
 
 
-def _about_z(angle: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+@dataclass(frozen=True)
+class PascalCad:
+    """One CAD model of a category.
+
+    Parameters
+    ----------
+    path : Path
+        The category's file, whose variable has the category's name: a struct array with
+        ``vertices``, ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral,
+        y along the length, z up.
+    category : str
+        The category.
+    index : int
+        The model's number, from 1 as in the annotations.
+    """
+
+    path: Path
+    category: str
+    index: int
+
+    def load_mesh(self) -> Mesh:
+        """Read the mesh."""
+        found = self._find()
+        where = f"{self.path}: model {self.index}"
+        with in_file(where):
+            vertices, faces = found.array("vertices", 3), found.array("faces", 3)
+            return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """Read the anchors that this model has."""
+        found = self._find()
+        with in_file(f"{self.path}: model {self.index}"):
+            anchors = {
+                name: found.array(name, 3) for name in found.texts("pnames") if name in found.names
+            }
+        present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
+        if not present:
+            return None
+        return NamedPoints(tuple(present), np.array(list(present.values())))
+
+    def _find(self) -> MatStruct:
+        models = _models(self.path, self.category)
+        if not 1 <= self.index <= len(models):
+            what = f"there is no model {self.index}, only {len(models)}"
+            raise DataError(what, where=str(self.path))
+        return models[self.index - 1]
+
+
+# A category's file takes a second to read, and all of a category's objects need it.
+@lru_cache(maxsize=4)
+def _models(path: Path, category: str) -> tuple[MatStruct, ...]:
+    return read_structs(path, category)
+
+
+# Detected keypoints -----------------------------------------------------------------------------
+
+
+class _Keypoint(ForeignDocument):
+    uv: Point2
+    name: Text
+    confidence: Finite | None = None
+
+
+class _Observation(ForeignDocument):
+    image: PathText
+    keypoints: list[_Keypoint]
+
+
+@dataclass(frozen=True)
+class _Detected:
+    category: str
+    cad_index: int
+
+
+class Pascal3DDetections(PhotoDataset):
+    """Photos of PASCAL3D+ with the keypoints of a detector, and without viewpoints.
+
+    The layout of the data of Pavlakos et al., "6-DoF Object Pose from Semantic Keypoints", ICRA
+    2017::
+
+        annot/*.mat           a struct ``annot`` of lists: imgname, class, cad_index
+        images/<imgname>.jpg
+        cad/<category>.mat    as in PASCAL3D+
+        observations/*.json   {"image", "keypoints": [{"name", "uv", "confidence"}]} of each photo
+
+    There are no poses, and the file's squares around the objects are crops, no rectangles of
+    theirs. Photos that are listed but not there are problems.
+
+    Parameters
+    ----------
+    root : str or path-like
+        The folder.
+
+    Raises
+    ------
+    DataError
+        If there are no lists of photos, or one cannot be read.
+    """
+
+    kind = "PASCAL3D+ photos with detected keypoints"
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        folder = Path(root)
+        self._records: list[_Detected] = []
+        names: list[str] = []
+        for path in sorted((folder / DETECTED).glob("*.mat")):
+            found = read_structs(path, "annot")[0]
+            with in_file(path):
+                images, categories = found.texts("imgname"), found.texts("class")
+                indices = found.array("cad_index").ravel()
+                if len({len(each) for each in (images, categories, indices)}) != 1:
+                    raise InputError("its lists have different lengths")
+            names += images
+            self._records += [
+                _Detected(category, int(index))
+                for category, index in zip(categories, indices, strict=True)
+            ]
+        if not names:
+            raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
+        super().__init__(folder, names)
+        self._observations: dict[str, Path] | None = None
+
+    def read(self, index: int) -> Photo:
+        """Read the photo of a number from 0."""
+        name, record = self.names[index], self._records[index]
+        image = find_image(self.root, name)
+        if image is None:
+            raise DataError("the image is missing", where=f"{self.root}, photo {name}")
+        shown = PhotoObject(
+            object_id="0",
+            category=record.category,
+            keypoints=self._keypoints(name),
+            model=cad_model(cad_folder(self.root), record.category, record.cad_index),
+        )
+        return Photo(name, image, Camera.without_focal(*photo_size(image)), (shown,))
+
+    def _keypoints(self, name: str) -> PhotoKeypoints | None:
+        if self._observations is None:
+            self._observations = {}
+            for path in sorted((self.root / _OBSERVATIONS).glob("*.json")):
+                stem = Path(read_document(path, _Observation).image).stem
+                self._observations[stem] = path
+        if name not in self._observations:
+            return None
+        found = read_document(self._observations[name], _Observation).keypoints
+        scores = [each.confidence for each in found if each.confidence is not None]
+        return PhotoKeypoints(
+            points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),
+            names=tuple(each.name for each in found),
+            visible=np.ones(len(found), dtype=bool),
+            scores=np.array(scores) if scores else None,
+        )
+
+
+FORMAT = PhotoFormat(
+    "pascal3d",
+    f"PASCAL3D+ or ObjectNet3D: {ANNOTATIONS} with .mat files",
+    has(f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat"),
+    Pascal3D,
+)
+DETECTIONS = PhotoFormat(
+    "pascal3d-detections",
+    f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat",
+    has(f"{DETECTED}/*.mat"),
+    Pascal3DDetections,
+)

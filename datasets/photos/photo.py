@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -116,6 +117,28 @@ class ModelFiles:
 
     def load_keypoints(self) -> NamedPoints | None:
         """The annotation's keypoints."""
+        return self.keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedModel:
+    """A model that is in memory.
+
+    Parameters
+    ----------
+    mesh : Mesh, optional
+    keypoints : NamedPoints, optional
+    """
+
+    mesh: Mesh | None = None
+    keypoints: NamedPoints | None = None
+
+    def load_mesh(self) -> Mesh | None:
+        """The mesh."""
+        return self.mesh
+
+    def load_keypoints(self) -> NamedPoints | None:
+        """The keypoints."""
         return self.keypoints
 
 
@@ -319,6 +342,13 @@ class Photo:
     up: FloatArray | None = None
     problems: tuple[DataError, ...] = ()
 
+    @property
+    def known_camera(self) -> Camera:
+        """The camera; raises InputError where there is none."""
+        if self.camera is None:
+            raise InputError("the camera of this photo is not known", where=self.name)
+        return self.camera
+
     def read_image(self) -> npt.NDArray[np.uint8]:
         """Read the photo's pixels, (h, w, 3) uint8.
 
@@ -335,3 +365,8 @@ class Photo:
 def existing(path: Path) -> Path | None:
     """The path if there is such a file, else None."""
     return path if path.is_file() else None
+
+
+def first_existing(paths: Iterable[Path]) -> Path | None:
+    """The first of the paths that is a file; None where none is."""
+    return next((path for path in paths if path.is_file()), None)

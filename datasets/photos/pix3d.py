@@ -6,14 +6,16 @@ Sun et al., "Pix3D: Dataset and Methods for Single-Image 3D Shape Modeling", CVP
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec import field
 
-from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, parse, read_list
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -23,7 +25,8 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.records import parse, read_list
+from cadalign.datasets.photos.placed import PlacedObject, converted
+from cadalign.datasets.photos.scannet import read_matrix, write_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -39,7 +42,7 @@ from cadalign.io.documents import (
     Positive,
     Text,
 )
-from cadalign.io.files import damaged, read_text
+from cadalign.io.files import write_json
 from cadalign.io.meshes.load import load_mesh
 
 ANNOTATIONS = "pix3d.json"
@@ -47,6 +50,9 @@ ANNOTATIONS = "pix3d.json"
 _SENSOR = 32.0
 # Pix3D's camera has x to the left, y up and z forward.
 _PIX3D_AXES = np.array([-1.0, -1.0, 1.0])
+_NEAR_MIDDLE = 1.0  # farthest principal point of written cameras from the image's middle [px]
+_SAME_FOCAL = 1e-3
+_UNMARKED = (-1.0, -1.0)
 _FLAGS = {"truncated": "truncated", "occluded": "occluded", "slightly_occluded": "occluded"}
 
 
@@ -89,13 +95,7 @@ class _Model:
     def load_keypoints(self) -> NamedPoints | None:
         if self.keypoints_path is None or not self.keypoints_path.is_file():
             return None
-        rows = read_text(self.keypoints_path).split("\n")
-        try:
-            xyz = np.array([row.split() for row in rows if row.strip()], dtype=np.float64)
-        except ValueError:
-            raise damaged("not a table of numbers", self.keypoints_path) from None
-        if xyz.ndim != 2 or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
-            raise damaged("not a table of x, y, z", self.keypoints_path)
+        xyz = read_matrix(self.keypoints_path, (None, 3))
         return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
 
 
@@ -181,3 +181,58 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     mean = marked.sum(axis=0) / is_marked[:, rows].sum(axis=0)[:, None] - PIXEL_CENTRE
     names = tuple(str(row) for row in rows)
     return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
+
+
+def write_pix3d(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write objects as entries of ``pix3d.json``: a rigid pose of the stretched mesh [m].
+
+    Returns why objects were left out.
+    """
+    entries, problems = converted(numbered, partial(_written, folder))
+    write_json(folder / ANNOTATIONS, entries)
+    return problems
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    camera, category = placed.camera, placed.category
+    placed.require_plain_camera("Pix3D")
+    middle = (camera.width - 1) / 2, (camera.height - 1) / 2
+    is_off = max(abs(camera.cx - middle[0]), abs(camera.cy - middle[1])) > _NEAR_MIDDLE
+    if is_off or abs(camera.fy / camera.fx - 1) > _SAME_FOCAL:
+        raise InputError(
+            "Pix3D has the principal point in the image's middle, and square pixels",
+            where=placed.photo.name,
+            fix="choose another form, such as bop",
+        )
+    bbox = placed.bbox + PIXEL_CENTRE
+    model = folder / "model" / category / f"{number:06d}"
+    placed.write_model(model / "model.obj", is_stretched=True)
+    write_matrix(model / "3d_keypoints.txt", placed.points)
+    image = placed.copy_image(folder / "img" / category / f"{number:06d}")
+    mask = placed.write_mask(folder / "mask" / category / f"{number:06d}.png")
+    marked = placed.marked
+    pixels = [
+        (marked[name] + PIXEL_CENTRE).tolist() if name in marked else list(_UNMARKED)
+        for name in placed.names
+    ]
+
+    def written(path: Path) -> str:
+        return path.relative_to(folder).as_posix()
+
+    return {
+        "img": written(image),
+        "category": placed.found.category,
+        "img_size": [camera.width, camera.height],
+        "2d_keypoints": [pixels],
+        "mask": None if mask is None else written(mask),
+        "model": written(model / "model.obj"),
+        "3d_keypoints": written(model / "3d_keypoints.txt"),
+        "rot_mat": (_PIX3D_AXES[:, None] * placed.pose.rotation).tolist(),
+        "trans_mat": (_PIX3D_AXES * placed.pose.translation).tolist(),
+        "focal_length": camera.fx / camera.width * _SENSOR,
+        "bbox": bbox.tolist(),
+        **dict.fromkeys(_FLAGS, False),
+    }
+
+
+FORMAT = PhotoFormat("pix3d", f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D, write_pix3d)

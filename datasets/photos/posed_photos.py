@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, parse, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
     ModelFiles,
@@ -25,7 +25,6 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.records import parse, read_table
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
@@ -87,3 +86,6 @@ class PosedPhotos(PhotoDataset):
             model=CadModel(model.stem, ModelFiles(existing(self.root / model))),
         )
         return Photo(name, existing(self.root / name), camera, (shown,))
+
+
+FORMAT = PhotoFormat("posed-photos", f"posed photos: {POSES}", has(POSES), PosedPhotos)

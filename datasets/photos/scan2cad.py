@@ -6,9 +6,10 @@ Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,14 @@ from msgspec import Meta, Raw
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.categories import name_of_synset
-from cadalign.datasets.photos.dataset import PhotoDataset, read_each
+from cadalign.datasets.photos.dataset import (
+    PhotoDataset,
+    PhotoFormat,
+    has,
+    parse,
+    read_each,
+    read_list,
+)
 from cadalign.datasets.photos.photo import (
     CadModel,
     ModelFiles,
@@ -26,17 +34,19 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
-    existing,
+    first_existing,
 )
-from cadalign.datasets.photos.records import parse, read_list
-from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames
+from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
+from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
+from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
-from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, read_json
+from cadalign.io.files import write_json
 
 FULL = "full_annotations.json"
 # One scan's annotations, as in the repository and its derivatives.
@@ -163,19 +173,15 @@ class Scan2CAD(PhotoDataset):
                 fix="give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)",
             )
 
-    def with_annotations(self, path: str | os.PathLike[str]) -> Scan2CAD:
-        """Open a file of annotations, such as an estimate's, on the frames of this data set.
-
-        Raises
-        ------
-        DataError
-            If it cannot be read, or there is no frame of its scans.
-        """
+    def open_poses(self, path: Path) -> PoseFile:
+        """Open annotations in the form of these, such as an estimate's, seen from these frames."""
+        if path.suffix.lower() == ".csv" or not isinstance(read_json(path), list):
+            raise self.other_poses(path, f"give JSON as {FULL}")
         *others, last = self._frame_folders
         for folder in others:
             with suppress(DataError):
-                return Scan2CAD(path, scannet=folder)
-        return Scan2CAD(path, scannet=last)
+                return _Poses(Scan2CAD(path, scannet=folder))
+        return _Poses(Scan2CAD(path, scannet=last))
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -267,12 +273,12 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
 
 
 def _mesh_path(folders: Iterable[Path], synset: str, model_id: str) -> Path | None:
-    for folder in folders:
-        for place in (folder / synset / model_id, folder / model_id):
-            found = next((place / file for file in _MESH_FILES if existing(place / file)), None)
-            if found is not None:
-                return found
-    return None
+    return first_existing(
+        place / file
+        for folder in folders
+        for place in (folder / synset / model_id, folder / model_id)
+        for file in _MESH_FILES
+    )
 
 
 def _inverse(alignment: Alignment) -> Alignment:
@@ -289,11 +295,127 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
     """The folder and the annotation file that a path means."""
     if path.is_file():
         return path.parent, path
-    for name in (FULL, *_SAMPLES):
-        if (path / name).is_file():
-            return path, path / name
+    found = first_existing(path / name for name in (FULL, *_SAMPLES))
+    if found is not None:
+        return path, found
     raise DataError(
         f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here",
         where=str(path),
         fix="give the folder of Scan2CAD's annotations",
     )
+
+
+class _Poses(PoseFile):
+    """Poses in the form of Scan2CAD's annotations, seen from the frames of the data set."""
+
+    def __init__(self, photos: Scan2CAD) -> None:
+        self._photos, self._names = photos, set(photos.names)
+        self.problems = tuple(photos.problems.values())
+
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        if photo.name not in self._names:
+            return ()
+        seen = self._photos[photo.name]
+        return tuple(
+            PoseEstimate("", photo.name, each.model.model_id, each.truth.cam_from_model)
+            for each in seen.objects
+            if each.model is not None and each.truth.cam_from_model is not None
+        )
+
+    def strays(self, names: Sequence[str]) -> int:
+        return len(self._names - set(names))
+
+
+def scan_entry(
+    scan_id: str,
+    aligned: Alignment,
+    *,
+    model_id: str,
+    category_id: str,
+    bounds: FloatArray,
+    keypoints: Mapping[str, FloatArray] | None = None,
+) -> dict[str, Any]:
+    """Entry of a scan with one model in Scan2CAD's annotations, in the scan's coordinates [m].
+
+    Parameters
+    ----------
+    scan_id : str
+        Such as ``scene0470_00``.
+    aligned : Alignment
+        Pose and stretch of the model in the scan.
+    model_id, category_id : str
+        The model's id and synset.
+    bounds : (2, 3) float
+        Its lowest and highest coordinates, before the stretch.
+    keypoints : mapping of str to (k, 3) float, optional
+        ``keypoints_cad`` and ``keypoints_scan``: pairs of points.
+    """
+    low, high = bounds
+    model = {
+        "trs": _trs_of(aligned),
+        "id_cad": model_id,
+        "catid_cad": category_id,
+        "sym": "__SYM_NONE",
+        "bbox": ((high - low) / 2).tolist(),
+        "center": ((high + low) / 2).tolist(),
+        **{name: {"position": xyz.ravel().tolist()} for name, xyz in (keypoints or {}).items()},
+    }
+    trs = _trs_of(Alignment.identity())
+    return {"id_scan": scan_id, "trs": trs, "n_aligned_models": 1, "aligned_models": [model]}
+
+
+def write_scan2cad(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+    """Write each object as the only model of a scan of one frame, whose z points up.
+
+    Keypoints are pairs: on the CAD model, and on the scan, where the marked pixel's ray has the
+    depth of the model's keypoint. Returns why objects were left out.
+    """
+    scans, problems = converted(numbered, partial(_written, folder))
+    write_json(folder / FULL, scans)
+    return problems
+
+
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    placed.require_plain_camera("Scan2CAD")
+    scene, category = f"scene{number:04d}_00", placed.category
+    model_id = f"{number:06d}-{placed.model_id}"
+    models = folder / _MODEL_FOLDERS[0] / category / model_id
+    placed.write_model(models / _MESH_FILES[0], is_stretched=False)
+    pose, turn, scan_from_cam = placed.pose, upright_rotation(placed.up), np.eye(4)
+    scan_from_cam[:3, :3] = turn
+    place = folder / "scans" / scene
+    write_frame(place, placed.camera.matrix, scan_from_cam)
+    placed.copy_image(place / "color" / "0")
+    names, marked = placed.names, placed.marked
+    rows = [row for row, name in enumerate(names) if name in marked]
+    on_model = pose.apply(placed.points)[rows]
+    pixels = np.array([marked[names[row]] for row in rows]).reshape(-1, 2)
+    rays = np.column_stack([placed.camera.normalize(pixels), np.ones(len(rows))])
+    return scan_entry(
+        scene,
+        Alignment(turn @ pose.rotation, turn @ pose.translation, placed.scale),
+        model_id=model_id,
+        category_id=category,
+        bounds=placed.bounds,
+        keypoints={
+            "keypoints_cad": on_model @ turn.T,
+            "keypoints_scan": (rays * on_model[:, 2:]) @ turn.T,
+        },
+    )
+
+
+def _trs_of(alignment: Alignment) -> dict[str, Any]:
+    return {
+        "translation": alignment.translation.tolist(),
+        "rotation": np.asarray(quat_wxyz_from_rotation(alignment.rotation)).tolist(),
+        "scale": alignment.scale.tolist(),
+    }
+
+
+FORMAT = PhotoFormat(
+    "scan2cad",
+    f"Scan2CAD: {FULL} or annot.json",
+    has(FULL, *_SAMPLES),
+    Scan2CAD,
+    write_scan2cad,
+)

@@ -1,4 +1,4 @@
-"""Frames of ScanNet scenes: photos with intrinsics and poses."""
+"""Frames of ScanNet scenes, read and written: photos with intrinsics and poses."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.photos.records import read_matrix
-from cadalign.errors import DataError, InputError
+from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.photo import first_existing
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
+from cadalign.io.documents import in_file
+from cadalign.io.files import damaged, read_text, write_text, writing
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -43,10 +46,8 @@ class ScanNetFrame:
         matrix = read_matrix(self.intrinsics_path, (4, 4))
         width, height = photo_size(self.image_path)
         (fx, _, cx), (_, fy, cy) = matrix[:2, :3].tolist()
-        try:
+        with in_file(self.intrinsics_path):
             return Camera(width, height, fx, fy, cx, cy)
-        except InputError as error:
-            raise DataError(error.what, where=str(self.intrinsics_path)) from None
 
     def cam_from_scan(self) -> Alignment:
         """Read the pose: the camera's coordinates from the scan's [m].
@@ -57,10 +58,8 @@ class ScanNetFrame:
             If it is no pose, such as ScanNet's -inf of a frame whose tracking was lost.
         """
         pose = read_matrix(self.pose_path, (4, 4))
-        try:
+        with in_file(self.pose_path):
             rotation = nearest_rotation(pose[:3, :3]).T
-        except InputError as error:
-            raise DataError(error.what, where=str(self.pose_path)) from None
         return Alignment(rotation, -rotation @ pose[:3, 3], np.ones(3))
 
 
@@ -80,7 +79,7 @@ def list_frames(folders: Iterable[Path], scene: str) -> tuple[ScanNetFrame, ...]
 
 
 def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
-    intrinsics = next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
+    intrinsics = first_existing(folder / name for name in _INTRINSICS)
     if intrinsics is None:
         return
     for image in (folder / "color").glob("*"):
@@ -96,5 +95,44 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")
         images = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
-        image = next((path for path in images if path.is_file()), folder / f"{stem}.jpg")
+        image = first_existing(images) or folder / f"{stem}.jpg"
         yield ScanNetFrame(stem.removeprefix(prefix), image, pose, intrinsics)
+
+
+def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
+    """Read a text file of a matrix, a row on each line; None for any number of rows.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or is not a matrix of finite numbers of this shape.
+    """
+    text = read_text(path)
+    rows = [line.split() for line in text.splitlines() if line.strip()]
+    try:
+        matrix = np.array(rows, dtype=np.float64)
+    except ValueError:
+        raise damaged("not a table of numbers", path) from None
+    rows_wanted, columns = shape
+    if matrix.shape != (rows_wanted or len(matrix), columns):
+        wanted = f"{rows_wanted or 'some'} rows of {columns} numbers"
+        raise damaged(f"shape {matrix.shape}, expected {wanted}", path)
+    if not np.isfinite(matrix).all():
+        raise DataError("some of its numbers are not finite", where=str(path))
+    return matrix
+
+
+def write_matrix(path: Path, matrix: FloatArray) -> None:
+    """Write a text file of a matrix, a row on each line; folders above it are made."""
+    with writing(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    rows = (" ".join(f"{value:.17g}" for value in row) for row in matrix.tolist())
+    write_text(path, "".join(f"{row}\n" for row in rows))
+
+
+def write_frame(folder: Path, matrix: FloatArray, scan_from_cam: FloatArray) -> None:
+    """Write pose (4, 4) and intrinsics (3, 3) of the only frame of a scene, number 0."""
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = matrix
+    write_matrix(folder / "pose" / "0.txt", scan_from_cam)
+    write_matrix(folder / _INTRINSICS[0], intrinsics)

@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats
-from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.datasets.sfm.correspondences import (
+    CorrespondenceFormat,
+    Correspondences,
+    CorrespondenceSet,
+    rigid_pose,
+)
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
@@ -26,6 +31,7 @@ DEFAULT_FOCAL = 800.0
 """The virtual camera's focal length [px] where the files don't say one."""
 
 _LARGEST_IMAGE = 2**30
+_FOLDERS = (".", "preprocessed")
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
 
@@ -223,7 +229,7 @@ def _find_layout(root: Path) -> tuple[Path, _Layout]:
     if not root.is_dir():
         raise DataError("no such folder", where=str(root), fix="give a split's folder")
     closest: tuple[int, str] = (0, "there are no correspondences")
-    for folder in (root, root / "preprocessed"):
+    for folder in (root / name for name in _FOLDERS):
         for layout in (_MATCHES, _PREPROCESSED):
             missing = [n for n in layout.required if not (folder / f"{n}.pkl").is_file()]
             if not missing:
@@ -278,3 +284,16 @@ def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
         raise InputError(f"image points reach {reach.max():g} px from the centre", where="points")
     width, height = (2 * int(length) + 1 for length in reach)
     return Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)
+
+
+FORMAT = CorrespondenceFormat(
+    "blind-pnp",
+    BlindPnP,
+    "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
+    "(also in preprocessed)",
+    tuple(
+        tuple(f"{folder}/{stem}.pkl" for stem in layout.required)
+        for folder in _FOLDERS
+        for layout in (_MATCHES, _PREPROCESSED)
+    ),
+)

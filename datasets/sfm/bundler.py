@@ -15,7 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.datasets.sfm.correspondences import (
+    CorrespondenceFormat,
+    Correspondences,
+    CorrespondenceSet,
+    rigid_pose,
+)
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
@@ -283,3 +288,13 @@ def _as_count(value: float, path: Path, where: str) -> int:
     if not (0 <= value < np.inf and value % 1 == 0):
         raise damaged(f"{value:g} is not a number of things", f"{path}, {where}")
     return int(value)
+
+
+FORMAT = CorrespondenceFormat(
+    "bundler",
+    Bundler,
+    "bundle.out (also in bundle, or one *.out)",
+    (("bundle.out",), ("bundle/bundle.out",), ("*.out",)),
+    # Many a program calls its log something.out.
+    header=b"# Bundle file",
+)

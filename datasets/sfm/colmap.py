@@ -1,4 +1,4 @@
-"""COLMAP's sparse models: photos with known poses and the points that they see.
+"""COLMAP's sparse models, read and written: photos with known poses and the points they see.
 
 Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016. The format is described at
 https://colmap.github.io/format.html.
@@ -7,17 +7,25 @@ https://colmap.github.io/format.html.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cadalign.arrays import IntArray
 from cadalign.datasets.sfm import colmap_files
-from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.datasets.sfm.correspondences import (
+    CameraView,
+    CorrespondenceFormat,
+    Correspondences,
+    CorrespondenceSet,
+    rigid_pose,
+)
 from cadalign.errors import DataError, InputError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
-from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from cadalign.io.files import write_text, writing
 
 _STEMS = ("cameras", "images", "points3D")
 _SUBFOLDERS = (".", "sparse/0", "sparse", "0")
@@ -128,3 +136,47 @@ def _find_model(root: Path) -> tuple[Path, str]:
         where=str(root),
         fix="cameras, images and points3D are needed, all three as .bin or as .txt",
     )
+
+
+def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
+    """Write a model without points as text, whose cameras other programs read.
+
+    Cameras that are equal are written once. Refused are poses with a scale, and names that are
+    missing, hold a line break or occur twice.
+    """
+    if not views:
+        raise InputError("give at least one view", where="views")
+    names = [view.name for view in views]
+    if len(set(names)) < len(names) or any(not n or "\n" in n or n != n.strip() for n in names):
+        raise InputError("every view needs an image name of its own", where="views")
+    numbers: dict[Camera, int] = {}
+    images = []
+    for number, view in enumerate(views, start=1):
+        camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
+        pose = view.rigid(f"views[{number - 1}]")
+        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
+        text = " ".join(f"{value:.17g}" for value in values)
+        images.append(f"{number} {text} {camera_id} {view.name}\n\n")
+    cameras = []
+    for camera, camera_id in numbers.items():
+        entry = camera.to_dict()
+        params = " ".join(f"{value:.17g}" for value in entry["params"])
+        cameras.append(f"{camera_id} {entry['model']} {camera.width} {camera.height} {params}\n")
+    folder = Path(folder)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "cameras.txt", "".join(cameras))
+    write_text(folder / "images.txt", "".join(images))
+    write_text(folder / "points3D.txt", "")
+
+
+FORMAT = CorrespondenceFormat(
+    "colmap",
+    Colmap,
+    "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
+    tuple(
+        tuple(f"{folder}/{stem}{suffix}" for stem in _STEMS)
+        for folder in _SUBFOLDERS
+        for suffix in colmap_files.READERS
+    ),
+)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -16,6 +17,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import open_input
 
 logger = logging.getLogger("cadalign")
 
@@ -121,6 +123,35 @@ class Correspondences:
             points_2d=self.points_2d[chosen],
             point_ids=None if self.point_ids is None else self.point_ids[chosen],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """A camera and where it stands.
+
+    Parameters
+    ----------
+    camera : Camera
+    cam_from_world : Alignment
+        Its pose, with all scales 1.
+    name : str
+        The image's name; empty where the file has none.
+    """
+
+    camera: Camera
+    cam_from_world: Alignment
+    name: str = ""
+
+    def rigid(self, where: str) -> Alignment:
+        """The pose; raises InputError, which names the place, where it has a scale."""
+        if (self.cam_from_world.scale != 1).any():
+            raise InputError(
+                f"the pose has the scale {self.cam_from_world.scale.tolist()}",
+                where=where,
+                fix="camera files hold rigid poses: stretch the model and give the pose with scale "
+                "1",
+            )
+        return self.cam_from_world
 
 
 class CorrespondenceSet(ABC):
@@ -250,3 +281,43 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
         raise InputError(f"not a rotation matrix: {shown}", where="rotation")
     left, _, right = np.linalg.svd(matrix)
     return Alignment(left @ right, shift, np.ones(3))
+
+
+@dataclass(frozen=True)
+class CorrespondenceFormat:
+    """A format of correspondences, and the files that it is recognised by.
+
+    Parameters
+    ----------
+    name : str
+    load : callable
+        Makes the set of a folder.
+    sought : str
+        The files of this format, for messages.
+    layouts : tuple of tuples of str
+        Patterns of the files below a folder, which all belong to one of the layouts.
+    header : bytes
+        The first bytes of each file.
+    """
+
+    name: str
+    load: Callable[[Path], CorrespondenceSet]
+    sought: str
+    layouts: tuple[tuple[str, ...], ...]
+    header: bytes = b""
+
+    def fit(self, folder: Path) -> int:
+        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
+        best = 0
+        for layout in self.layouts:
+            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
+            if all(any(begins_with(file, self.header) for file in found) for found in files):
+                return 2
+            best = max(best, int(any(files)))
+        return best
+
+
+def begins_with(file: Path, header: bytes) -> bool:
+    """True if a file begins with these bytes."""
+    with open_input(file, most=sys.maxsize) as (stream, _):
+        return stream.read(len(header)) == header

@@ -19,6 +19,7 @@ from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.exporting import annotated_photos
 from cadalign.annotate.session import Session
 from cadalign.cli import main
+from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import CadalignError
 from cadalign.export.photo_sets import FORMS, AnnotatedPhoto, write_photo_set
 from cadalign.io.images import read_photo
@@ -77,7 +78,9 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
     assert not read.problems
     (found,) = read.objects
 
-    camera = photo.camera
+    given = photo.to_photo()
+    placed = PlacedObject(given, given.objects[0])
+    camera = placed.camera
     assert read.camera is not None
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(read.camera, name) == pytest.approx(getattr(camera, name), abs=1e-9)
@@ -99,9 +102,9 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
             assert np.linalg.norm(there - corner, axis=1).min() < 1e-9
     else:
         assert found.truth.cam_from_model is not None
-        given = corners * scale * unit if form in RIGID else corners
+        ends = corners * scale * unit if form in RIGID else corners
         np.testing.assert_allclose(
-            found.truth.cam_from_model.apply(given) / unit, pose.apply(corners), atol=1e-9
+            found.truth.cam_from_model.apply(ends) / unit, pose.apply(corners), atol=1e-9
         )
         assert found.model is not None
         mesh = found.model.load_mesh()
@@ -114,11 +117,11 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
         assert found.model is not None
         points = found.model.load_keypoints()
         assert points is not None
-        marked = photo.marked
+        marked = placed.marked
         assert len(found.keypoints) == len(marked) == 8
-        names = photo.names if form in NAMED else tuple(map(str, range(len(photo.names))))
+        names = placed.names if form in NAMED else tuple(map(str, range(len(placed.names))))
         seen = dict(zip(found.keypoints.names, found.keypoints.points_2d, strict=True))
-        for name, own_name in zip(names, photo.names, strict=True):
+        for name, own_name in zip(names, placed.names, strict=True):
             np.testing.assert_allclose(seen[name], marked[own_name], atol=1e-6)
     if form in HAVE_MASKS:
         assert found.mask_path is not None

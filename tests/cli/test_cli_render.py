@@ -19,11 +19,12 @@ from cadalign import Camera
 from cadalign.cli.doctor import Doctor
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
+from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, RenderError
+from cadalign.export.camera_files import write_open3d
 from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at
 from cadalign.render.probe import Probe, probe_renderer
-from cadalign.render.views.camera_files import CameraView, write_open3d
 
 
 @pytest.fixture

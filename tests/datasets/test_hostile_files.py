@@ -28,10 +28,10 @@ from cadalign.datasets import (
 )
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError
+from cadalign.export.camera_files import read_camera_views
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_photo
 from cadalign.io.observation import Observation
-from cadalign.render.views.camera_files import read_camera_views
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 MANY_DIGITS = "9" * 5000

@@ -14,8 +14,8 @@ import cadalign
 import cadalign.datasets
 from cadalign.cli import main
 from cadalign.datasets import Bop, CadModel, PhotoKeypoints, PhotoObject
+from cadalign.datasets.photos.formats import PHOTO_FORMATS
 from cadalign.datasets.photos.photo import DepthImage, ModelFiles
-from cadalign.datasets.photos.recognise import PHOTO_FORMATS
 from cadalign.errors import DataError
 
 

@@ -11,7 +11,7 @@ from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import KittiCars
-from cadalign.datasets.photos.kitti_files import car_box, yaw_of_car
+from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
 from cadalign.errors import DataError
 
 P2 = "P2: 700 0 600 70 0 700 170 7 0 0 1 0.5\n"

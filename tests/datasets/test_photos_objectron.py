@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -10,8 +12,8 @@ from support.photo_data import assert_damage_is_told, message, rigid, write_phot
 
 import cadalign.datasets
 from cadalign.datasets import Objectron
-from cadalign.datasets.photos.objectron_files import read_sequence
-from cadalign.datasets.photos.protobuf import Field, decode
+from cadalign.datasets.photos.objectron import VideoFrame
+from cadalign.datasets.photos.objectron_files import Field, decode, read_sequence
 from cadalign.errors import DataError, InputError
 
 SCALE = [0.2, 0.5, 0.3]
@@ -198,3 +200,20 @@ def test_decoding_follows_the_wire_format():
         decode(bytes.fromhex("12077465"), fields)
     with pytest.raises(InputError):
         decode(bytes.fromhex("0b01"), fields)
+
+
+def test_videos_are_not_lists_of_other_files(tmp_path):
+    path = tmp_path / "video.MOV"
+    path.write_text("#EXTM3U\n#EXTINF:1,\n/etc/passwd\n")
+    with pytest.raises(DataError, match=r"video\.MOV: not a video in QuickTime's or MP4's form"):
+        VideoFrame(path, 0).read()
+    os.remove(path)
+    os.mkfifo(path)
+    with pytest.raises(DataError, match=r"video\.MOV: not a regular file"):
+        VideoFrame(path, 0).read()
+
+
+def test_files_without_frames_are_refused(tmp_path):
+    write_json(tmp_path / "annotations" / "a.json", {"objects": [], "frameAnnotations": []})
+    with pytest.raises(DataError, match="the annotation files have no frames"):
+        Objectron(tmp_path)

@@ -15,9 +15,9 @@ from support.exported import CAMERA, KEYPOINTS, LENS, POSE, aligned, turned, wed
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
 from cadalign.export import FORMATS, ExportOptions, export_object, format_of
+from cadalign.export.camera_files import read_camera_views
 from cadalign.export.usd import INSTALL
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
-from cadalign.render.views.camera_files import read_camera_views
 
 WORLD = np.array([[0.0, 0, 1, 5], [1, 0, 0, 6], [0, 1, 0, 7], [0, 0, 0, 1]])
 

@@ -20,7 +20,7 @@ from cadalign import Camera
 from cadalign.datasets import open as open_photos
 from cadalign.errors import DataError, InputError
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
-from cadalign.export.photo_plane import photo_plane
+from cadalign.export.scene_parts import photo_plane
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.views.silhouette import silhouette_iou
 

@@ -28,14 +28,10 @@ from cadalign.datasets import (
     load_mesh,
     read_image_keypoints,
 )
+from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.export.camera_files import read_camera_views, write_nerf, write_open3d
 from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
-from cadalign.render.views.camera_files import (
-    CameraView,
-    read_camera_views,
-    write_nerf,
-    write_open3d,
-)
 from cadalign.report import headline_text
 from cadalign.retrieval import LibraryModel
 

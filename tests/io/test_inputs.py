@@ -14,19 +14,20 @@ from support.refusals import refusal_line
 
 from cadalign import Library, ShapeModel
 from cadalign.datasets import load_mesh, read_image_keypoints
-from cadalign.datasets.photos.kitti_files import read_labels
+from cadalign.datasets.photos.bop_files import read_bop_results
+from cadalign.datasets.photos.dataset import read_list, read_table
+from cadalign.datasets.photos.kitti import read_labels
 from cadalign.datasets.photos.mat_files import read_structs
 from cadalign.datasets.photos.objectron_files import read_sequence
-from cadalign.datasets.photos.records import read_list, read_matrix, read_table
+from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.export.bop import read_bop_results
+from cadalign.export.camera_files import read_camera_views
 from cadalign.io.camera_file import read_camera
 from cadalign.io.files import open_input, read_bytes, read_text
 from cadalign.io.images import read_grey, read_photo
 from cadalign.io.observation import Observation
-from cadalign.render.views.camera_files import read_camera_views
 
 BYTES = 2**33
 

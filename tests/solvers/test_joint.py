@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
+from cadalign.solvers.joint.equations import joint_room
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
@@ -27,9 +28,9 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.search import refine_joint
-from cadalign.solvers.joint.system import Joint, joint_cost, joint_room
+from cadalign.solvers.joint.system import Joint, joint_cost
 from cadalign.solvers.refine import refine
-from cadalign.solvers.system import accept, evaluate, move
+from cadalign.solvers.system import evaluate, move
 
 POINTS, MODES, VIEWS = 7, 3, 2
 
@@ -100,9 +101,9 @@ def evidence_of(
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
     system = Joint(evidence, integrates)
-    room = joint_room(system)
+    room = joint_room(system.evidence)
     assert evaluate(system, packed(state), room) < np.inf
-    return room.new.gradient
+    return room.gradient
 
 
 def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> float:
@@ -111,9 +112,8 @@ def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> fl
 
 def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
     system = Joint(evidence, False)
-    row, room = packed(state), joint_room(system)
+    row, room = packed(state), joint_room(system.evidence)
     evaluate(system, row, room)
-    accept(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
     return unpacked(evidence, there)
@@ -206,10 +206,10 @@ def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
 def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     """The change of the gradient by the prior means that the log determinant moves."""
     system = Joint(evidence, True)
-    room = joint_room(system)
+    room = joint_room(system.evidence)
     evaluate(system, packed(state), room)
     shifted = room.rows[-4].copy()
-    plain = joint_room(Joint(evidence, False))
+    plain = joint_room(evidence)
     evaluate(Joint(evidence, False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
+from cadalign.solvers.joint.equations import joint_room
 from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
@@ -23,7 +24,7 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.joint.reduction import reduce_modes, used_points
 from cadalign.solvers.joint.search import search_joint
-from cadalign.solvers.joint.system import Joint, joint_room
+from cadalign.solvers.joint.system import Joint
 from cadalign.solvers.system import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
@@ -102,10 +103,10 @@ def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
     system = Joint(evidence, True)
-    room = joint_room(system)
+    room = joint_room(system.evidence)
     evaluate(system, packed(state), room)
-    slope = np.linalg.solve(information, room.new.gradient)
-    assert room.new.gradient @ slope < 1e-9 * max(cost, 1.0)
+    slope = np.linalg.solve(information, room.gradient)
+    assert room.gradient @ slope < 1e-9 * max(cost, 1.0)
     assert score == pytest.approx(cost + np.linalg.slogdet(information)[1], rel=1e-9)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.datasets.photos.photo import NamedPoints
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.estimates.files import match_estimates, opened_estimates
@@ -27,7 +28,6 @@ from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
-from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.box import Box
 
 _FACTS = {"source": "", "keypoints": 0}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.datasets.photos.kitti_files import car_box, yaw_of_car
+from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.photos.target import PhotoTarget

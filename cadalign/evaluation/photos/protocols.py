@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from cadalign.datasets.photos.bop import Bop
 from cadalign.datasets.photos.kitti import KittiCars
 from cadalign.datasets.photos.objectron import Objectron
-from cadalign.datasets.photos.pascal3d import Pascal3D
-from cadalign.datasets.photos.pascal3d_detections import Pascal3DDetections
+from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.recognise import open_photos
+from cadalign.datasets.photos.formats import open_photos
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.tables import Row
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.joint.arrow import (
     Arrow,
@@ -15,10 +15,10 @@ from cadalign.solvers.joint.arrow import (
     invert_arrow,
 )
 from cadalign.solvers.joint.blocks import first_scale
+from cadalign.solvers.joint.equations import JointEquations, joint_room
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked, unstretched
-from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
-from cadalign.solvers.joint.rows import count_equations
-from cadalign.solvers.joint.system import Joint, JointEquations, evaluate_joint, joint_room
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, sighted_points
+from cadalign.solvers.joint.system import Joint, evaluate_joint
 
 
 class JointCovariance(NamedTuple):
@@ -51,10 +51,10 @@ def _covariance_of(
 ) -> JointCovariance:
     """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
     system = Joint(reduced, False)
-    equations = joint_room(system)
+    equations = joint_room(reduced)
     evaluate_joint(system, row, equations)
     state = unpacked(reduced, row)
-    arrow = equations.new
+    arrow = equations.arrow
     poses, points = state.poses.shape[0], evidence.shape.mean.shape[0]
     decide_on_undetermined(arrow, poses)
     first = first_scale(evidence)
@@ -140,7 +140,7 @@ def _points_by_unknowns(
     first = 6 + first_scale(evidence)
     unknowns = first + 3 + modes
     scale = np.exp(state.log_scales)
-    starts, ends = _columns_of_points(reduced, equations, points)
+    columns, sighted = equations.columns, sighted_points(evidence)
     rows = np.zeros((points, 3, unknowns))
     own = np.zeros((points, 3, 3))
     left_out = evidence.shape.modes.shape[0] > 0
@@ -152,14 +152,14 @@ def _points_by_unknowns(
         square = reduced.shape.spread[i] ** 2
         for a in range(3):
             own[i, a, a] = scale[a] * scale[a] * square
-        for c in range(starts[i], ends[i]):
+        for c in range(columns[i, 0], columns[i, 1]):
             for a in range(3):
                 by_own = scale[a] * square * equations.rows[unknowns + 1 + a, c]
                 for b in range(3):
                     own[i, a, b] -= by_own * scale[b] * square * equations.rows[unknowns + 1 + b, c]
                 for k in range(unknowns):
                     rows[i, a, k] -= by_own * equations.rows[k, c]
-        if left_out and ends[i] == 0:
+        if left_out and not sighted[i]:
             _add_rest(evidence.shape.modes, reduced.shape.modes, scale, i, own[i])
     return rows, own
 
@@ -177,30 +177,6 @@ def _add_rest(
             for k in range(reduced.shape[0]):
                 total -= reduced[k, i, a] * reduced[k, i, b]
             own[a, b] += scale[a] * scale[b] * total
-
-
-@kernel
-def _columns_of_points(
-    evidence: Evidence, equations: JointEquations, points: int
-) -> tuple[IntArray, IntArray]:
-    """The first column of each point's equations (m,) and the one after its last (m,).
-
-    None where there are several poses, of which no displacement is eliminated.
-    """
-    starts = np.zeros(points, dtype=np.int64)
-    ends = np.zeros(points, dtype=np.int64)
-    if equations.first.shape[0] > 2:
-        for i in evidence.sightings.point:
-            ends[i] = -1
-        return starts, ends
-    column = 0
-    for n in equations.order:
-        i = evidence.sightings.point[n]
-        if ends[i] == 0:
-            starts[i] = column
-        column += count_equations(evidence.sightings, n)
-        ends[i] = column
-    return starts, ends
 
 
 @fast_sums
@@ -255,9 +231,9 @@ def _cam_from_model(evidence: Evidence, state: State) -> FloatArray:
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """The cost at a state, and the information (U, U) about all unknowns, border last."""
     system = Joint(evidence, False)
-    equations = joint_room(system)
+    equations = joint_room(evidence)
     cost = evaluate_joint(system, packed(state), equations)
-    arrow = equations.new
+    arrow = equations.arrow
     poses, size = len(arrow.blocks), len(arrow.border)
     first = 6 * poses
     dense = np.zeros((first + size, first + size))

@@ -40,7 +40,7 @@ def reduce_modes(evidence: Evidence) -> Reduction:
     used = used_points(evidence)
     displaced = np.empty(0, dtype=np.int64)
     if count_poses(evidence) > 1:
-        displaced = np.flatnonzero(_sighted_points(evidence) & (shape.spread > 0.0))
+        displaced = np.flatnonzero(sighted_points(evidence) & (shape.spread > 0.0))
     extra = 3 * displaced.shape[0]
     if 3 * used.sum() >= modes + extra and not extra:
         return Reduction(evidence, np.eye(modes), displaced)
@@ -104,7 +104,7 @@ def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
 @kernel
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
-    used = _sighted_points(evidence)
+    used = sighted_points(evidence)
     ends = evidence.offsets.ends
     for i in evidence.planes.point:
         used[i] = True
@@ -116,7 +116,7 @@ def used_points(evidence: Evidence) -> BoolArray:
 
 
 @kernel
-def _sighted_points(evidence: Evidence) -> BoolArray:
+def sighted_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that are sighted."""
     sighted = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
     for i in evidence.sightings.point:

@@ -5,30 +5,36 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import borrowing, inlined
 from cadalign.solvers.evidence import loss_and_root
-from cadalign.solvers.joint.evidence import Evidence, Sightings, State, unstretched
+from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
+from cadalign.solvers.linalg import Triple
+from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
+
+
+@borrowing
+def count_equations(sightings: Sightings, n: int) -> int:
+    """Number of equations that sighting n gives: a contour point one, a keypoint two or three."""
+    return 1 + int(sightings.whitening[n, 2] > 0.0) + int(sightings.depths[n, 1] > 0.0)
 
 
 @inlined
-def _is_equation(second_weight: float, depth_weight: float, q: int) -> bool:
-    """True if equation ``q`` of a sighting counts: along the first axis, the second, in depth."""
-    if q == 0:
-        return True
-    return second_weight > 0.0 if q == 1 else depth_weight > 0.0
+def exp_of(logs: FloatArray) -> Triple:
+    """The scales of their logarithms (3,)."""
+    return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
 
 
-@kernel
-def count_equations(sightings: Sightings, n: int) -> int:
-    """Number of equations that sighting n gives: a contour point one, a keypoint two or three."""
-    count = 0
-    for q in range(3):
-        if _is_equation(sightings.whitening[n, 2], sightings.depths[n, 1], q):
-            count += 1
-    return count
+@inlined
+def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
+    """Point i in the model's frame."""
+    return (
+        scale[0] * unstretched(shape, state, i, 0),
+        scale[1] * unstretched(shape, state, i, 1),
+        scale[2] * unstretched(shape, state, i, 2),
+    )
 
 
-@kernel
+@borrowing
 def write_rows(
     evidence: Evidence,
     state: State,
@@ -41,110 +47,65 @@ def write_rows(
 
     The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
     that pose and of the border, the residual, and the displacement of the point; columns are those
-    of `count_equations`, sighting after sighting. ``seen`` (7, N) receives, from column
+    of `count_equations`, sighting after sighting. ``seen`` (6, N) receives, from column
     ``first_seen`` on, the vector by which the residual changes with the point in the rig's frame,
-    the camera's z there over the depth (none for equations in depth), and the loss's root.
+    and the camera's z there over the depth (none for equations in depth).
     """
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     rows[:] = 0.0
-    modes, focals = shape.modes.shape[0], evidence.focals.low.shape[0]
-    first = 6 + focals
-    last = first + 3 + modes
-    scale = np.exp(state.log_scales)
-    stretched = np.empty(3)
-    rotated = np.empty(3)
-    by_camera = np.empty((3, 3))
-    by_rig = np.empty(3)
-    by_model = np.empty(3)
-    residual = np.empty(3)
-    by_focal = np.empty(3)
+    first = 6 + evidence.focals.low.shape[0]
+    last = first + 3 + shape.modes.shape[0]
+    scale = exp_of(state.log_scales)
     cost = 0.0
-    last_point = -1
     column = 0
     for n in chosen:
         i, v = sightings.point[n], sightings.image[n]
-        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        if i != last_point:
-            for a in range(3):
-                stretched[a] = scale[a] * unstretched(shape, state, i, a)
-            for r in range(3):
-                rotated[r] = 0.0
-                for a in range(3):
-                    rotated[r] += pose[3 * r + a] * stretched[a]
-            last_point = i
-        x, y, z = _apply(camera, rotated[0] + pose[9], rotated[1] + pose[10], rotated[2] + pose[11])
-        if not z > 0:
+        camera, motion = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        point = stretched_point(shape, state, scale, i)
+        turned = turn(motion, point)
+        place = see(shift(camera, turn(camera, shift(motion, turned))))
+        u, w, depth = place
+        if not depth > 0:
             return np.inf
         group = evidence.focals.group[v]
         log_ratio = state.log_focals[group] if group >= 0 else 0.0
         ratio = np.exp(log_ratio)
-        slope_u, slope_w = sightings.slopes[n, 0], sightings.slopes[n, 1]
-        u, w = x / z, y / z
-        # In pixels over the reference focal length.
-        du = ratio * u - sightings.rays[n, 0] - log_ratio * slope_u
-        dw = ratio * w - sightings.rays[n, 1] - log_ratio * slope_w
-        a0, a1, a2 = sightings.whitening[n, 0], sightings.whitening[n, 1], sightings.whitening[n, 2]
-        depth_weight = sightings.depths[n, 1]
-        residual[0], residual[1] = a0 * du + a1 * dw, a2 * dw
-        residual[2] = depth_weight * (z - sightings.depths[n, 0])
-        square = residual[0] ** 2 + residual[1] ** 2
-        part, root = loss_and_root(sightings.loss[n], sightings.loss_scale[n], square)
-        depth_part, depth_root = loss_and_root(
-            sightings.loss[n], sightings.loss_scale[n], residual[2] ** 2
-        )
+        # In pixels over the reference focal length; by its logarithm.
+        by_log_u, by_log_w = ratio * u - sightings.slopes[n, 0], ratio * w - sightings.slopes[n, 1]
+        du = ratio * u - sightings.rays[n, 0] - log_ratio * sightings.slopes[n, 0]
+        dw = ratio * w - sightings.rays[n, 1] - log_ratio * sightings.slopes[n, 1]
+        a, b, c = sightings.whitening[n, 0], sightings.whitening[n, 1], sightings.whitening[n, 2]
+        weight = sightings.depths[n, 1]
+        ru, rw, rz = a * du + b * dw, c * dw, weight * (depth - sightings.depths[n, 0])
+        loss, loss_scale = sightings.loss[n], sightings.loss_scale[n]
+        part, root = loss_and_root(loss, loss_scale, ru * ru + rw * rw)
+        depth_part, depth_root = loss_and_root(loss, loss_scale, rz * rz)
         cost += part + depth_part
-        a0, a1, a2 = root * a0, root * a1, root * a2
-        by_focal[0] = a0 * (ratio * u - slope_u) + a1 * (ratio * w - slope_w)
-        by_focal[1], by_focal[2] = a2 * (ratio * w - slope_w), 0.0
-        e, f, h = ratio * a0 / z, ratio * a1 / z, ratio * a2 / z
-        by_camera[0, 0], by_camera[0, 1], by_camera[0, 2] = e, f, -(e * u + f * w)
-        by_camera[1, 0], by_camera[1, 1], by_camera[1, 2] = 0.0, h, -h * w
-        by_camera[2, 0], by_camera[2, 1], by_camera[2, 2] = 0.0, 0.0, depth_root * depth_weight
-        residual[0] *= root
-        residual[1] *= root
-        residual[2] *= depth_root
+        by_u, by_w = ray_slopes(place, (ratio * root * a, ratio * root * b, ratio * root * c))
+        counts = True, c > 0.0, weight > 0.0
+        slopes = by_u, by_w, (0.0, 0.0, depth_root * weight)
+        residuals = root * ru, root * rw, depth_root * rz
+        by_focal = root * (a * by_log_u + b * by_log_w), root * c * by_log_w, 0.0
         for q in range(3):
-            if not _is_equation(sightings.whitening[n, 2], depth_weight, q):
+            if not counts[q]:
                 continue
-            for a in range(3):
-                by_rig[a] = (
-                    by_camera[q, 0] * camera[a]
-                    + by_camera[q, 1] * camera[3 + a]
-                    + by_camera[q, 2] * camera[6 + a]
-                )
-            for a in range(3):
-                by_model[a] = (
-                    by_rig[0] * pose[a] + by_rig[1] * pose[3 + a] + by_rig[2] * pose[6 + a]
-                )
-            rows[0, column] = rotated[1] * by_rig[2] - rotated[2] * by_rig[1]
-            rows[1, column] = rotated[2] * by_rig[0] - rotated[0] * by_rig[2]
-            rows[2, column] = rotated[0] * by_rig[1] - rotated[1] * by_rig[0]
+            by_rig = turn_back(camera, slopes[q])
+            by_model = turn_back(motion, by_rig)
+            write_motion(turned, by_rig, rows, column)
             if group >= 0:
                 rows[6 + group, column] = by_focal[q]
-            for a in range(3):
-                rows[3 + a, column] = by_rig[a]
-                rows[first + a, column] = by_model[a] * stretched[a] * evidence.scales.free[a]
-                by_model[a] *= scale[a]
-                rows[last + 1 + a, column] = by_model[a]
-                seen[a, first_seen + column] = by_rig[a]
+            for k in range(3):
+                rows[first + k, column] = by_model[k] * point[k] * evidence.scales.free[k]
+                rows[last + 1 + k, column] = by_model[k] * scale[k]
+                seen[k, first_seen + column] = by_rig[k]
                 # What lies farther is seen smaller; a depth is not.
-                seen[3 + a, first_seen + column] = camera[6 + a] / z if q < 2 else 0.0
-            for k in range(modes):
+                seen[3 + k, first_seen + column] = camera[6 + k] / depth if q < 2 else 0.0
+            for k in range(shape.modes.shape[0]):
                 rows[first + 3 + k, column] = (
-                    by_model[0] * shape.modes[k, i, 0]
-                    + by_model[1] * shape.modes[k, i, 1]
-                    + by_model[2] * shape.modes[k, i, 2]
+                    by_model[0] * scale[0] * shape.modes[k, i, 0]
+                    + by_model[1] * scale[1] * shape.modes[k, i, 1]
+                    + by_model[2] * scale[2] * shape.modes[k, i, 2]
                 )
-            rows[last, column] = residual[q]
+            rows[last, column] = residuals[q]
             column += 1
     return cost
-
-
-@inlined
-def _apply(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A point of the rig's frame in a camera's."""
-    return (
-        camera[0] * x + camera[1] * y + camera[2] * z + camera[9],
-        camera[3] * x + camera[4] * y + camera[5] * z + camera[10],
-        camera[6] * x + camera[7] * y + camera[8] * z + camera[11],
-    )

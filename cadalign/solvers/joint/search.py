@@ -11,7 +11,7 @@ from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
 from cadalign.solvers.refine import refine
-from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
+from cadalign.solvers.search import Effort, descend, room_for_minima, search
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
@@ -37,16 +37,19 @@ def search_joint(
     """
     reduction = reduce_modes(evidence)
     reduced, count = reduction.evidence, len(poses)
+    system = Joint(reduced, False)
     unmoved = np.zeros((count, len(reduced.shape.modes) + reduced.shape.mean.size))
     starts = np.concatenate([poses.reshape(count, -1), log_focals, log_scales, unmoved], axis=1)
     minima = room_for_minima(max(count, 1), starts.shape[1])
     if has_latent(reduced):
         effort = Effort(count, _FEW_ITERATIONS, 0, _UNLIKELY)
-        search(Joint(reduced, False), starts, effort, 0, 0.0, minima)
-        minima = _integrated(reduced, minima)
+        likely = room_for_minima(max(count, 1), starts.shape[1])
+        search(system, starts, effort, 0, 0.0, likely)
+        minima.counts[1] = likely.counts[1]
+        descend(system, likely, _MAX_ITERATIONS, _LESS_LIKELY, 0, 0.0, minima)
     else:
         effort = Effort(count, _PROBE_ITERATIONS, _MAX_ITERATIONS, _UNLIKELY)
-        search(Joint(reduced, False), starts, effort, 0, 0.0, minima)
+        search(system, starts, effort, 0, 0.0, minima)
     found = int(minima.counts[0])
     states = [
         whole_state(reduction, evidence.shape, unpacked(reduced, row))
@@ -60,27 +63,6 @@ def has_latent(evidence: Evidence) -> bool:
     """True if the evidence rests on a shape that may vary."""
     sighted = evidence.shape.spread[evidence.sightings.point]
     return bool(len(evidence.shape.modes) or sighted.any())
-
-
-def _integrated(evidence: Evidence, likely: Minima) -> Minima:
-    """The minima with the shape integrated out that states of a low cost lead to.
-
-    Minima of the plain cost are no starts: some lie too near the camera.
-    """
-    system = Joint(evidence, True)
-    count = int(likely.counts[0])
-    minima = room_for_minima(max(count, 1), likely.states.shape[1])
-    minima.counts[1] = likely.counts[1]
-    for k in range(count):
-        if not likely.scores[k] < minima.scores[0] + _LESS_LIKELY:
-            break
-        state = likely.states[k]
-        cost, used, _ = refine(system, _MAX_ITERATIONS, state)
-        minima.counts[1] += used
-        add_minimum(system, state, cost, 0, 0.0, minima)
-    for k in range(int(minima.counts[0])):
-        minima.costs[k] = joint_cost(Joint(evidence, False), minima.states[k])
-    return minima
 
 
 def refine_joint(

@@ -28,17 +28,33 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.compile import fast_sums, inlined, kernel
-from cadalign.solvers.alignment import Equations, accept_new, room_for, solve_damped
+from cadalign.compile import borrowing, fast_sums, inlined, kernel
+from cadalign.solvers.alignment import Equations, room_for, solve_damped
 from cadalign.solvers.constants import HUBER, LINEAR, POSE_SIZE
 from cadalign.solvers.evidence import Keypoints, keypoint_cost, loss_and_root
-from cadalign.solvers.linalg import cholesky, copy_into
+from cadalign.solvers.linalg import cholesky, copy_into, dot
+from cadalign.solvers.marginal.correlation import (
+    factorize_upper,
+    invert_upper,
+    unwhiten,
+    whiten,
+    write_covariance,
+)
 from cadalign.solvers.marginal.problem import GaussianTarget, Seen
+from cadalign.solvers.projection import (
+    motion_of,
+    ray_slopes,
+    see,
+    shift,
+    turn,
+    turn_back,
+    write_motion,
+)
 from cadalign.solvers.system import (
-    accept,
     are_same,
     cost_at,
     evaluate,
+    integrating,
     is_estimate,
     move,
     room_of,
@@ -66,36 +82,26 @@ class Posed(NamedTuple):
     integrates: bool
 
 
-class Whitened(NamedTuple):
-    """Equations of 2 n coordinates, whitened.
+class PosedEquations(NamedTuple):
+    """Equations of 2 n coordinates, whitened, and scratch space.
 
-    ``rows`` (7, 2 n) are the derivatives by the pose and the residuals e, less A S h where the
-    shape is integrated out; ``by_shape`` (2 n, 3) those by the own point, not whitened; ``factor``
-    (2 n, 2 n) the upper Cholesky factor of M, with the inverse of its diagonal. ``slope`` (3 n,) is
-    h and ``turned`` (6,) half the derivative of log det M by the pose, with the shape held.
-    ``sums`` (2,) holds the decrease of F that the least squares of the rows are subtracted from,
-    and log det M.
+    ``normal`` are those of the pose, ``gradient`` is theirs. ``rows`` (7, 2 n) are the derivatives
+    by the pose and the residuals e, less A S h where the shape is integrated out; ``by_shape``
+    (2 n, 3) those by the own point, not whitened; ``factor`` (2 n, 2 n) the upper Cholesky factor
+    of M, with the inverse of its diagonal. ``slope`` (3 n,) is h and ``turned`` (6,) half the
+    derivative of log det M by the pose, with the shape held. ``sums`` (2,) holds the decrease of F
+    that the least squares of the rows are subtracted from, and log det M. ``points`` (n, 3) hold
+    the depths and the derivatives of the loss's weight over those of the residuals.
     """
 
+    normal: Equations
+    gradient: FloatArray
     rows: FloatArray
     by_shape: FloatArray
     factor: FloatArray
     slope: FloatArray
     turned: FloatArray
     sums: FloatArray
-
-
-class MarginalEquations(NamedTuple):
-    """Equations that steps are from, those evaluated last, and scratch space.
-
-    ``normal`` are those of the pose, ``gradient`` is theirs. ``points`` (n, 3) hold the depths and
-    the derivatives of the loss's weight over those of the residuals.
-    """
-
-    normal: Equations
-    gradient: FloatArray
-    current: Whitened
-    new: Whitened
     points: FloatArray
     right: FloatArray
     inverse: FloatArray
@@ -104,36 +110,38 @@ class MarginalEquations(NamedTuple):
 
 
 @kernel
-def _room_for_whitened(keypoints: int) -> Whitened:
-    size = 2 * keypoints
-    return Whitened(
-        np.empty((POSE_UNKNOWNS + 1, size)),
-        np.empty((size, 3)),
-        np.empty((size, size)),
-        np.zeros(3 * keypoints),
-        np.zeros(POSE_UNKNOWNS),
-        np.empty(2),
-    )
-
-
-@room_of.of(Posed)
-@kernel
-def posed_room(system: Posed) -> MarginalEquations:
+def posed_room(system: Posed) -> PosedEquations:
     """Room for the equations."""
     n = system.seen.points.shape[0]
     size = 2 * n if system.integrates else 0
     normal = room_for(POSE_UNKNOWNS)
-    return MarginalEquations(
+    return PosedEquations(
         normal,
         normal.gradient,
-        _room_for_whitened(n),
-        _room_for_whitened(n),
+        np.empty((POSE_UNKNOWNS + 1, 2 * n)),
+        np.empty((2 * n, 3)),
+        np.empty((2 * n, 2 * n)),
+        np.zeros(3 * n),
+        np.zeros(POSE_UNKNOWNS),
+        np.empty(2),
         np.empty((n, 3)),
         np.empty(2 * n),
         np.empty((size, size)),
         np.empty((size, size)),
         np.empty((size, 3)),
     )
+
+
+@room_of.of(Posed)
+@kernel
+def _room_of(system: Posed) -> tuple[PosedEquations, PosedEquations]:
+    return posed_room(system), posed_room(system)
+
+
+@integrating.of(Posed)
+@kernel
+def _integrating(system: Posed, integrates: bool) -> Posed:
+    return Posed(system.target, system.seen, integrates)
 
 
 @kernel
@@ -152,75 +160,67 @@ def force_of(state: FloatArray) -> FloatArray:
 
 @evaluate.of(Posed)
 @kernel
-def evaluate_posed(system: Posed, state: FloatArray, equations: MarginalEquations) -> float:
-    """Write the new equations at a state; returns the cost, infinite behind the camera."""
-    new, normal = equations.new, equations.normal
+def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) -> float:
+    """Write the equations at a state; returns the cost, infinite behind the camera."""
     cost = _write_rows(system, state, equations)
     if not cost < np.inf:
         return np.inf
-    _widen(system.target.covariance, new.by_shape, new.factor)
-    if not _factorize(new):
+    write_covariance(system.target.covariance, equations.by_shape, equations.factor)
+    equations.sums[1] = factorize_upper(equations.factor)
+    if not equations.sums[1] < np.inf:
         return np.inf
     if system.integrates:
-        cost += new.sums[1]
-        _invert(new.factor, equations.inverse, equations.square)
+        cost += equations.sums[1]
+        invert_upper(equations.factor, equations.inverse, equations.square)
         _write_slopes(system, state, equations)
-        _shift_mean(system, state, new)
-    _whiten(new, normal.new_hessian, normal.new_gradient)
+        _shift_mean(system, state, equations)
+    whiten(equations.factor, equations.rows)
+    _write_products(equations.rows, equations.normal.hessian, equations.gradient)
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            normal.new_gradient[k] += new.turned[k]
+            equations.gradient[k] += equations.turned[k]
     return cost
 
 
-@kernel
-def _write_rows(system: Posed, state: FloatArray, equations: MarginalEquations) -> float:
+@borrowing
+def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> float:
     seen, mean = system.seen, system.target.mean
-    rows, by_shape, points = equations.new.rows, equations.new.by_shape, equations.points
+    rows, by_shape, points = equations.rows, equations.by_shape, equations.points
     n = mean.shape[0]
+    motion = motion_of(state)
     cost = 0.0
     square = 0.0
     prior = 0.0
     for i in range(n):
         o = POSE + 3 * i
-        dx, dy, dz = state[o], state[o + 1], state[o + 2]
         f = o + 3 * n
-        prior += state[f] * dx + state[f + 1] * dy + state[f + 2] * dz
-        px, py, pz = mean[i, 0] + dx, mean[i, 1] + dy, mean[i, 2] + dz
-        x = state[0] * px + state[1] * py + state[2] * pz
-        y = state[3] * px + state[4] * py + state[5] * pz
-        z = state[6] * px + state[7] * py + state[8] * pz
-        depth = z + state[11]
-        if not depth > 0:
+        offset = state[o], state[o + 1], state[o + 2]
+        prior += dot(offset, (state[f], state[f + 1], state[f + 2]))
+        turned = turn(
+            motion, (mean[i, 0] + offset[0], mean[i, 1] + offset[1], mean[i, 2] + offset[2])
+        )
+        place = see(shift(motion, turned))
+        if not place[2] > 0:
             return np.inf
-        u, v = (x + state[9]) / depth, (y + state[10]) / depth
         a, b, c = seen.whitening[i, 0], seen.whitening[i, 1], seen.whitening[i, 2]
-        du, dv = u - seen.rays[i, 0], v - seen.rays[i, 1]
+        du, dv = place[0] - seen.rays[i, 0], place[1] - seen.rays[i, 1]
         ru, rv = a * du + b * dv, c * dv
         part, root = loss_and_root(seen.loss, seen.loss_scale, ru * ru + rv * rv)
         cost += part
         own = root * root * (ru * ru + rv * rv)
         square += own
-        points[i, 0] = depth
+        points[i, 0] = place[2]
         fall = _fall_of_weight(seen.loss, seen.loss_scale, root, own)
         points[i, 1], points[i, 2] = fall * root * ru, fall * root * rv
+        slopes = ray_slopes(place, (root * a, root * b, root * c))
+        residuals = root * ru, root * rv
         for q in range(2):
             column = 2 * i + q
-            if q == 0:
-                bx, by, residual = root * a / depth, root * b / depth, root * ru
-            else:
-                bx, by, residual = 0.0, root * c / depth, root * rv
-            bz = -(bx * u + by * v)
-            rows[0, column] = y * bz - z * by
-            rows[1, column] = z * bx - x * bz
-            rows[2, column] = x * by - y * bx
-            rows[3, column], rows[4, column], rows[5, column] = bx, by, bz
-            for k in range(3):
-                by_shape[column, k] = bx * state[k] + by * state[3 + k] + bz * state[6 + k]
-            rows[_RESIDUAL, column] = residual - (
-                by_shape[column, 0] * dx + by_shape[column, 1] * dy + by_shape[column, 2] * dz
-            )
-    equations.new.sums[0] = square + prior
+            write_motion(turned, slopes[q], rows, column)
+            by_point = turn_back(motion, slopes[q])
+            by_shape[column, 0], by_shape[column, 1], by_shape[column, 2] = by_point
+            rows[_RESIDUAL, column] = residuals[q] - dot(by_point, offset)
+    equations.sums[0] = square + prior
     return cost + prior
 
 
@@ -233,76 +233,12 @@ def _fall_of_weight(loss: int, scale: float, root: float, square: float) -> floa
 
 
 @fast_sums
-def _widen(covariance: FloatArray, by_shape: FloatArray, matrix: FloatArray) -> None:
-    """Write the upper triangle of ``M = I + A S A'``."""
-    size = by_shape.shape[0]
-    row = np.empty(covariance.shape[0])
-    for c in range(size):
-        i = c // 2
-        p, q, r = by_shape[c, 0], by_shape[c, 1], by_shape[c, 2]
-        for k in range(3 * i + 3):
-            row[k] = (
-                p * covariance[3 * i, k]
-                + q * covariance[3 * i + 1, k]
-                + r * covariance[3 * i + 2, k]
-            )
-        for d in range(c + 1):
-            j = 3 * (d // 2)
-            matrix[d, c] = (
-                row[j] * by_shape[d, 0] + row[j + 1] * by_shape[d, 1] + row[j + 2] * by_shape[d, 2]
-            )
-        matrix[c, c] += 1.0
-
-
-@fast_sums
-def _factorize(new: Whitened) -> bool:
-    """Factorize M, two rows at a time; False if it is not positive."""
-    factor = new.factor
-    size = factor.shape[0]
-    log_determinant = 0.0
-    for k in range(0, size, 2):
-        one, two = factor[k], factor[k + 1]
-        first = one[k]
-        if not first > 0.0:
-            return False
-        scale = 1.0 / np.sqrt(first)
-        share = one[k + 1] * scale
-        second = two[k + 1] - share * share
-        if not second > 0.0:
-            return False
-        log_determinant += np.log(first * second)
-        scale_two = 1.0 / np.sqrt(second)
-        one[k], one[k + 1], two[k + 1] = scale, share, scale_two
-        for j in range(k + 2, size):
-            above = one[j] * scale
-            one[j] = above
-            two[j] = (two[j] - share * above) * scale_two
-        for i in range(k + 2, size):
-            row, p, q = factor[i], one[i], two[i]
-            for j in range(i, size):
-                row[j] -= p * one[j] + q * two[j]
-    new.sums[1] = log_determinant
-    return True
-
-
-@fast_sums
-def _whiten(new: Whitened, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Whiten the rows, and sum the normal equations."""
-    factor, rows = new.factor, new.rows
-    size = factor.shape[0]
-    for m in range(POSE_UNKNOWNS + 1):
-        row = rows[m]
-        for k in range(0, size, 2):
-            one, two = factor[k], factor[k + 1]
-            p = row[k] * one[k]
-            q = (row[k + 1] - p * one[k + 1]) * two[k + 1]
-            row[k], row[k + 1] = p, q
-            for j in range(k + 2, size):
-                row[j] -= p * one[j] + q * two[j]
+def _write_products(rows: FloatArray, hessian: FloatArray, gradient: FloatArray) -> None:
+    """Write the normal equations of whitened rows."""
     for k in range(POSE_UNKNOWNS):
         for m in range(k, POSE_UNKNOWNS + 1):
             total = 0.0
-            for c in range(size):
+            for c in range(rows.shape[1]):
                 total += rows[k, c] * rows[m, c]
             if m < POSE_UNKNOWNS:
                 hessian[k, m] = hessian[m, k] = total
@@ -311,38 +247,11 @@ def _whiten(new: Whitened, hessian: FloatArray, gradient: FloatArray) -> None:
 
 
 @fast_sums
-def _invert(factor: FloatArray, inverse: FloatArray, square: FloatArray) -> None:
-    """Write the transposed inverse of the factor, and the inverse of M."""
-    size = factor.shape[0]
-    for k in range(size):
-        for j in range(size):
-            inverse[k, j] = square[k, j] = 0.0
-    for k in range(0, size, 2):
-        one, two = inverse[k], inverse[k + 1]
-        for i in range(0, k, 2):
-            over, under = inverse[i], inverse[i + 1]
-            p, q = factor[i, k], factor[i + 1, k]
-            r, s = factor[i, k + 1], factor[i + 1, k + 1]
-            for j in range(i + 2):
-                one[j] -= p * over[j] + q * under[j]
-                two[j] -= r * over[j] + s * under[j]
-        share, scale, scale_two = factor[k, k + 1], factor[k, k], factor[k + 1, k + 1]
-        one[k], two[k + 1] = 1.0, 1.0
-        for j in range(k + 2):
-            one[j] *= scale
-            two[j] = (two[j] - share * one[j]) * scale_two
-        for i in range(k + 2):
-            row, p, q = square[i], one[i], two[i]
-            for j in range(k + 2):
-                row[j] += p * one[j] + q * two[j]
-
-
-@fast_sums
-def _write_slopes(system: Posed, state: FloatArray, equations: MarginalEquations) -> None:
+def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
     """Write half the derivatives of log det M by shape and pose."""
-    new, points, square, lever = equations.new, equations.points, equations.square, equations.lever
+    points, square, lever = equations.points, equations.square, equations.lever
     covariance, mean = system.target.covariance, system.target.mean
-    by_shape, slope, turned = new.by_shape, new.slope, new.turned
+    by_shape, slope, turned = equations.by_shape, equations.slope, equations.turned
     size = by_shape.shape[0]
     forced = np.empty(3 * mean.shape[0])
     for q in range(size):  # y_q = S A' M^-1, of the own point
@@ -386,17 +295,17 @@ def _write_slopes(system: Posed, state: FloatArray, equations: MarginalEquations
 
 
 @fast_sums
-def _shift_mean(system: Posed, state: FloatArray, new: Whitened) -> None:
+def _shift_mean(system: Posed, state: FloatArray, equations: PosedEquations) -> None:
     """Subtract A S h from the residuals, and what it changes from the decrease."""
-    covariance, slope, by_shape = system.target.covariance, new.slope, new.by_shape
+    covariance, slope, by_shape = system.target.covariance, equations.slope, equations.by_shape
     for i in range(slope.shape[0] // 3):
         for a in range(3):
             total = 0.0
             for k in range(slope.shape[0]):
                 total += covariance[3 * i + a, k] * slope[k]
-            new.rows[_RESIDUAL, 2 * i] -= by_shape[2 * i, a] * total
-            new.rows[_RESIDUAL, 2 * i + 1] -= by_shape[2 * i + 1, a] * total
-            new.sums[0] += slope[3 * i + a] * (total + 2.0 * state[POSE + 3 * i + a])
+            equations.rows[_RESIDUAL, 2 * i] -= by_shape[2 * i, a] * total
+            equations.rows[_RESIDUAL, 2 * i + 1] -= by_shape[2 * i + 1, a] * total
+            equations.sums[0] += slope[3 * i + a] * (total + 2.0 * state[POSE + 3 * i + a])
 
 
 @cost_at.of(Posed)
@@ -419,15 +328,15 @@ def posed_cost(system: Posed, state: FloatArray) -> float:
 
 @solve.of(Posed)
 @fast_sums
-def _solve(system: Posed, equations: MarginalEquations, damping: float, step: FloatArray) -> float:
+def _solve(system: Posed, equations: PosedEquations, damping: float, step: FloatArray) -> float:
     expected = solve_damped(equations.normal, POSE_UNKNOWNS, damping, step)
     if expected != expected:
         return np.nan
-    rows = equations.current.rows
-    expected = float(equations.current.sums[0])
+    rows = equations.rows
+    expected = float(equations.sums[0])
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            expected -= 2.0 * equations.current.turned[k] * step[k]
+            expected -= 2.0 * equations.turned[k] * step[k]
     for c in range(rows.shape[1]):
         total = rows[_RESIDUAL, c]
         for k in range(POSE_UNKNOWNS):
@@ -442,19 +351,16 @@ def _solve(system: Posed, equations: MarginalEquations, damping: float, step: Fl
 def _move(
     system: Posed,
     state: FloatArray,
-    equations: MarginalEquations,
+    equations: PosedEquations,
     damping: float,
     step: FloatArray,
     moved: FloatArray,
 ) -> None:
     move_rigid(state, step, moved)
-    factor, by_shape, right = equations.current.factor, equations.current.by_shape, equations.right
-    slope, covariance = equations.current.slope, system.target.covariance
-    for i in range(factor.shape[0] - 1, -1, -1):
-        total = right[i]
-        for k in range(i + 1, factor.shape[0]):
-            total -= factor[i, k] * right[k]
-        right[i] = total * factor[i, i]
+    orthonormalize(moved)
+    by_shape, right = equations.by_shape, equations.right
+    slope, covariance = equations.slope, system.target.covariance
+    unwhiten(equations.factor, right)
     size = covariance.shape[0]
     share = 1.0 / (1.0 + damping)
     force = np.empty(size)
@@ -473,23 +379,6 @@ def _move(
         moved[POSE + k] = state[POSE + k] + share * (total - state[POSE + k])
 
 
-@accept.of(Posed)
-@kernel
-def _accept(system: Posed, state: FloatArray, equations: MarginalEquations) -> None:
-    accept_new(equations.normal, POSE_UNKNOWNS)
-    new, current = equations.new, equations.current
-    for k in range(POSE_UNKNOWNS + 1):
-        copy_into(current.rows[k], new.rows[k])
-    for c in range(new.factor.shape[0]):
-        copy_into(current.by_shape[c], new.by_shape[c])
-        for d in range(c, new.factor.shape[0]):
-            current.factor[c, d] = new.factor[c, d]
-    copy_into(current.slope, new.slope)
-    copy_into(current.turned, new.turned)
-    copy_into(current.sums, new.sums)
-    orthonormalize(state)
-
-
 @score_of.of(Posed)
 @kernel
 def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
@@ -497,7 +386,7 @@ def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
         return cost
     equations = posed_room(system)
     score = evaluate_posed(system, state, equations)
-    factor = equations.normal.new_hessian
+    factor = equations.normal.hessian
     for k in range(3):
         factor[k, k] += _LEAST_INFORMATION
     if not score < np.inf or not cholesky(factor, POSE_UNKNOWNS, 0.0):

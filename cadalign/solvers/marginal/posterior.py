@@ -9,11 +9,12 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.linalg import cholesky, multiply_3, solve_cholesky
+from cadalign.solvers.marginal.correlation import whiten
 from cadalign.solvers.marginal.equations import (
     POSE,
     POSE_UNKNOWNS,
     Posed,
-    Whitened,
+    PosedEquations,
     evaluate_posed,
     force_of,
     posed_room,
@@ -52,7 +53,7 @@ def posterior_of(
     wide = Posed(GaussianTarget(target.mean, square * target.covariance), seen, False)
     room = posed_room(wide)
     cost = evaluate_posed(wide, state, room)
-    equations, factor = room.new, room.normal.new_hessian
+    factor = room.normal.hessian
     if not cost < np.inf or not cholesky(factor, POSE_UNKNOWNS, 0.0):
         unknown = np.full((m, 3, 3), np.inf)
         return Posterior(points, np.full((9, 9), np.inf), unknown, unknown.copy())
@@ -60,8 +61,8 @@ def posterior_of(
     for k in range(POSE_UNKNOWNS):
         solve_cholesky(factor, POSE_UNKNOWNS, pose[k])
     whole = mixture.covariances[component]
-    told = _whitened_by_points(whole, seen, equations, square)
-    by_pose = _points_by_pose(told, equations)
+    told = _whitened_by_points(whole, seen, room, square)
+    by_pose = _points_by_pose(told, room.rows)
     rotation = state[:9].copy().reshape((3, 3))
     turned_back = rotation.T.copy()
     of_points, of_seen = np.empty((m, 3, 3)), np.empty((m, 3, 3))
@@ -163,11 +164,11 @@ def posteriors_of(
 
 @fast_sums
 def _whitened_by_points(
-    whole: FloatArray, seen: Seen, equations: Whitened, square: float
+    whole: FloatArray, seen: Seen, equations: PosedEquations, square: float
 ) -> FloatArray:
     """Whitened covariance (3 m, 2 n) of all points with the keypoints' residuals."""
-    size, count = equations.factor.shape[0], whole.shape[0]
-    factor, by_shape = equations.factor, equations.by_shape
+    by_shape, count = equations.by_shape, whole.shape[0]
+    size = by_shape.shape[0]
     told = np.empty((count, size))
     for p in range(count):
         for c in range(size):
@@ -177,22 +178,19 @@ def _whitened_by_points(
                 + by_shape[c, 1] * whole[p, first + 1]
                 + by_shape[c, 2] * whole[p, first + 2]
             )
-        for c in range(size):
-            told[p, c] *= factor[c, c]
-            for k in range(c + 1, size):
-                told[p, k] -= factor[c, k] * told[p, c]
+    whiten(equations.factor, told)
     return told
 
 
 @fast_sums
-def _points_by_pose(told: FloatArray, equations: Whitened) -> FloatArray:
+def _points_by_pose(told: FloatArray, rows: FloatArray) -> FloatArray:
     """Derivatives (3 m, 6) of the likeliest points by the pose."""
     found = np.empty((told.shape[0], POSE_UNKNOWNS))
     for p in range(told.shape[0]):
         for k in range(POSE_UNKNOWNS):
             total = 0.0
             for c in range(told.shape[1]):
-                total -= told[p, c] * equations.rows[k, c]
+                total -= told[p, c] * rows[k, c]
             found[p, k] = total
     return found
 

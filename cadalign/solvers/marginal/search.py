@@ -1,9 +1,7 @@
 """Search for the poses of one view's keypoints under a mixture of Gaussian shapes.
 
 It starts from poses that the keypoints suggest for the means. Few steps on the plain cost tell the
-promising ones; from these it descends on the objective that the shape is integrated out of. Minima
-of the cost are no starts for that: some lie so near the camera that the descent ends in another
-minimum.
+promising ones; from these it descends on the objective that the shape is integrated out of.
 """
 
 from __future__ import annotations
@@ -20,9 +18,8 @@ from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import Posed, state_at
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
 from cadalign.solvers.refine import refine
-from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
+from cadalign.solvers.search import Effort, Minima, descend, room_for_minima, search
 from cadalign.solvers.starts import rotation_starts, widen_by_shape
-from cadalign.solvers.system import are_same, cost_at, score_of
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 2
@@ -66,38 +63,17 @@ def search_view(mixture: Mixture, seen: Seen, given: FloatArray) -> tuple[Minima
             states[s] = state_at(starts[chosen[s]], n)
         effort = Effort(chosen.shape[0], _PROBE_ITERATIONS, 0, _UNLIKELY)
         search(Posed(targets[g], seen, False), states, effort, g, mixture.penalties[g], likely)
-    return _integrated(mixture, targets, seen, likely), count
-
-
-@kernel
-def _integrated(
-    mixture: Mixture, targets: list[GaussianTarget], seen: Seen, likely: Minima
-) -> Minima:
-    """The minima of F that states of a low cost lead to, the most promising first."""
-    count = likely.counts[0]
-    minima = room_for_minima(max(count, 1), likely.states.shape[1])
+    found = likely.counts[0]
+    minima = room_for_minima(max(found, 1), 12 + 6 * n)
     minima.counts[1] = likely.counts[1]
-    scores = np.empty(count)
-    for k in range(count):
-        system = Posed(targets[likely.label[k]], seen, True)
-        scores[k] = score_of(system, likely.states[k], 0.0) + mixture.penalties[likely.label[k]]
-    for k in np.argsort(scores):
-        if not scores[k] < minima.scores[0] + _LESS_LIKELY:
-            break
-        g, state = likely.label[k], likely.states[k]
-        system = Posed(targets[g], seen, True)
-        is_new = True
-        for j in range(minima.counts[0]):
-            if minima.label[j] == g and are_same(system, state, minima.states[j]):
-                is_new = False
-        if is_new:
-            cost, used, _ = refine(system, _MAX_ITERATIONS, state)
-            minima.counts[1] += used
-            add_minimum(system, state, cost, g, mixture.penalties[g], minima)
-    for k in range(minima.counts[0]):
-        system = Posed(targets[minima.label[k]], seen, False)
-        minima.costs[k] = cost_at(system, minima.states[k])
-    return minima
+    is_left = np.ones(components, dtype=np.bool_)
+    for k in range(found):  # the most promising component first
+        g = likely.label[k]
+        if is_left[g]:
+            is_left[g] = False
+            system, penalty = Posed(targets[g], seen, False), mixture.penalties[g]
+            descend(system, likely, _MAX_ITERATIONS, _LESS_LIKELY, g, penalty, minima)
+    return minima, count
 
 
 @kernel

@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 import trimesh
 from support.pages import embedded_payload
+from support.photo_sets import write_kitti
 
 from cadalign import Alignment
 from cadalign.cli import main
 from cadalign.datasets import Bop, Scan2CAD
+from cadalign.datasets.photos.bop_files import write_bop_results, write_scene_gt
+from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.estimates.files import match_estimates, method_names, open_estimates
+from cadalign.evaluation.estimates.files import match_estimates, method_names
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.spec import Spec
-from cadalign.export.bop import write_bop_results, write_scene_gt
-from cadalign.export.estimates import PoseEstimate
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = {"fx": 500.0, "fy": 500.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
@@ -143,7 +144,7 @@ def test_poses_of_another_scene_are_not_taken(tmp_path: Path, scene: Path) -> No
     path = tmp_path / "results.csv"
     write_bop_results(path, [replace(each, scene="5") for each in TRUTH])
     dataset = Bop(scene)
-    file = open_estimates(path, dataset)
+    file = dataset.open_poses(path)
     assert file.poses_in(dataset[0]) == ()
     assert file.strays(dataset.names) == 4
 
@@ -176,7 +177,11 @@ def test_refusals_name_the_file_or_the_option(
     other = tmp_path / "annotations.json"
     other.write_text("[]")
     said = refusal("--estimates", other, "--data", scene, *run)
-    assert f"poses for Scan2CAD, but {scene} holds BOP" in said
+    assert f"not a file of poses for BOP, which {scene} holds" in said
+    assert "give a CSV file of results, or one as scene_gt.json" in said
+    kitti = write_kitti(tmp_path / "kitti")
+    said = refusal("--estimates", other, "--data", kitti, *run)
+    assert f"not a file of poses for KITTI, which {kitti} holds" in said
 
 
 @pytest.fixture
@@ -214,7 +219,7 @@ def test_scan2cad_poses_of_another_scan_are_refused(tmp_path: Path, scan2cad: Pa
     path = tmp_path / "mine.json"
     path.write_text(json.dumps(mine))
     with pytest.raises(DataError, match="no frame of the 1 annotated scans is here"):
-        open_estimates(path, Scan2CAD(scan2cad))
+        Scan2CAD(scan2cad).open_poses(path)
 
 
 @pytest.mark.long

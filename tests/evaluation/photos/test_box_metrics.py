@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import cadalign.datasets
-from cadalign.datasets.photos.kitti_files import car_box
+from cadalign.datasets.photos.kitti_keypoints import car_box
 from cadalign.errors import InputError
 from cadalign.evaluation.metrics.kitti import kitti_errors
 from cadalign.evaluation.metrics.nine_dof import (

@@ -1,32 +1,29 @@
-"""The aligned mesh as OBJ, with materials and textures, or PLY."""
+"""Meshes as OBJ, with materials and textures, and as PLY."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.export.aligned_object import AlignedObject, Frame
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_text, write_whole
+from cadalign.io.files import write_text, write_whole, writing
 from cadalign.io.images import write_image
 
 
-def write_obj(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
-    """Write the mesh, stretched and placed, as OBJ, with its materials as MTL and PNG beside it.
+def write_obj_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as OBJ, with its materials as MTL and PNG beside it; folders are made.
 
     Faces keep their order and polygons their corners' texture coordinates; vertex colours follow
-    the coordinates, as MeshLab reads them. Lengths are metres by `AlignedObject.metres`.
+    the coordinates, as MeshLab reads them.
 
     Raises
     ------
-    InputError
-        If there is no mesh, or the frame is not known.
+    DataError
+        If a file cannot be written.
     """
-    mesh = mesh_in_metres(exported, frame)
+    _make_folder(path)
     library = path.with_suffix(".mtl")
     names = [f"material_{number}" for number in range(len(mesh.materials))]
     lines = [f"mtllib {library.name}", *_vertex_lines(mesh)]
@@ -40,31 +37,28 @@ def write_obj(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     write_text(path, "\n".join(lines) + "\n")
 
 
-def write_ply(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
-    """Write the mesh, stretched and placed, as binary PLY with colours of its vertices.
+def write_ply_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as binary PLY, its faces in their order, with colours of its vertices.
 
-    A surface without vertex colours has its materials'; PLY has no textures.
+    A surface without vertex colours has its materials'; PLY has no textures. Folders are made.
 
     Raises
     ------
-    InputError
-        If there is no mesh, or the frame is not known.
+    DataError
+        If the file cannot be written.
     """
-    write_mesh_as_ply(path, mesh_in_metres(exported, frame))
+    import trimesh  # takes long to import, which OBJ files need not
 
-
-def write_mesh_as_ply(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary PLY, its faces in their order."""
+    _make_folder(path)
     colors = np.round(255 * _vertex_colors(mesh)).astype(np.uint8)
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     data = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
     write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
 
-def mesh_in_metres(exported: AlignedObject, frame: Frame) -> Mesh:
-    """The mesh, stretched and placed in a frame [m]."""
-    placed = exported.placed_mesh(frame)
-    return replace(placed, vertices=placed.vertices * exported.metres)
+def _make_folder(path: Path) -> None:
+    with writing(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _vertex_colors(mesh: Mesh) -> FloatArray:

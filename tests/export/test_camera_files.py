@@ -11,20 +11,16 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera
+from cadalign.datasets.sfm.colmap import write_colmap
+from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError
+from cadalign.export.camera_files import read_camera_views, write_nerf, write_open3d
 from cadalign.geometry.conventions import (
     alignment_from_opengl,
     opengl_from_model,
     opengl_projection,
 )
 from cadalign.render import look_at
-from cadalign.render.views.camera_files import (
-    CameraView,
-    read_camera_views,
-    write_colmap,
-    write_nerf,
-    write_open3d,
-)
 
 PLAIN = Camera(width=641, height=480, fx=510.25, fy=498.5, cx=321.75, cy=236.125)
 BENT = replace(PLAIN, distortion=(-0.2, 0.05, 0.003, -0.001))

@@ -12,15 +12,15 @@ from support.exported import POSE, aligned, wedge
 
 from cadalign import Alignment
 from cadalign.datasets import Bop, load_mesh
-from cadalign.errors import DataError, InputError
-from cadalign.export import export_object
-from cadalign.export.bop import (
+from cadalign.datasets.photos.bop_files import (
     read_bop_results,
     read_scene_gt,
     write_bop_results,
     write_scene_gt,
 )
-from cadalign.export.estimates import PoseEstimate
+from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.errors import DataError, InputError
+from cadalign.export import export_object
 from cadalign.geometry.rotations import rotation_from_vector
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"

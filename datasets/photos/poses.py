@@ -1,10 +1,13 @@
-"""Estimated poses of models in photos or scenes, as result files of benchmarks hold them."""
+"""Estimated poses of models in photos, as result files hold them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from cadalign.datasets.photos.photo import Photo
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 
@@ -50,9 +53,24 @@ class Estimates:
 
     path: Path
     poses: tuple[PoseEstimate, ...]
-    problems: tuple[DataError, ...] = field(default=())
+    problems: tuple[DataError, ...] = ()
 
-    @property
-    def name(self) -> str:
-        """The method's name: the file's, or that of its folder for ``scene_gt.json``."""
-        return self.path.parent.name if self.path.name == "scene_gt.json" else self.path.stem
+
+class PoseFile(ABC):
+    """The poses of a file that was opened on a data set, by photo.
+
+    Attributes
+    ----------
+    problems : tuple of DataError
+        Why some of its records could not be read.
+    """
+
+    problems: tuple[DataError, ...] = ()
+
+    @abstractmethod
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        """The estimates of a photo's objects, in the unit of the data set."""
+
+    @abstractmethod
+    def strays(self, names: Sequence[str]) -> int:
+        """Number of estimates, or scans, of photos that are not among these."""

@@ -1,4 +1,4 @@
-"""A photo as a rectangle that stands before a camera without distortion and off-centre shift.
+"""Parts of a scene for viewers: a photo as a rectangle before its camera, meshes of one material.
 
 glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
 becomes a textured rectangle at the place where the camera sees it, and the camera's field of view
@@ -8,13 +8,15 @@ photo with a margin at one side. A distorted photo is resampled to a pinhole cam
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.images import ByteImage
 
 _BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
@@ -121,3 +123,43 @@ def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage
     )
     drawn[~inside.reshape(drawn.shape[:2])] = 0
     return np.asarray(drawn, dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles of one material.
+
+    Parameters
+    ----------
+    material : Material
+    vertices : (n, 3) float
+    faces : (m, 3) int
+    uv : (n, 2) float or None
+        Texture coordinates from the bottom left, where the material has a texture.
+    colors : (n, 4) float or None
+        Vertex colours.
+    """
+
+    material: Material
+    vertices: FloatArray
+    faces: IntArray
+    uv: FloatArray | None
+    colors: FloatArray | None
+
+
+def parts_of(mesh: Mesh) -> Iterator[MeshPart]:
+    """List the parts of a mesh; vertices with several texture coordinates are repeated."""
+    for number in np.unique(mesh.face_material):
+        material = mesh.materials[number]
+        rows = mesh.face_material == number
+        corners = mesh.faces[rows].ravel()
+        uv = None
+        if material.texture is not None and mesh.corner_uv is not None:
+            keys = np.column_stack([corners, mesh.corner_uv[rows].reshape(-1, 2)])
+            kept, inverse = np.unique(keys, axis=0, return_inverse=True)
+            used, uv = kept[:, 0].astype(np.int64), kept[:, 1:]
+        else:
+            used, inverse = np.unique(corners, return_inverse=True)
+        colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
+        faces = inverse.reshape(-1, 3).astype(np.int64)
+        yield MeshPart(material, mesh.vertices[used], faces, uv, colors)

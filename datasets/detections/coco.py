@@ -1,4 +1,4 @@
-"""Keypoints in images from COCO's JSON and what detectors make of it.
+"""COCO: keypoints in images, read from its JSON and what detectors make of it, and written.
 
 Four forms are read:
 
@@ -15,27 +15,33 @@ ultralytics' ``results.to_json()``
 
 The third number of a keypoint is its visibility flag where all of an object's are 0, 1 or 2 and one
 is 2: 0 for not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in
-COCO, integer coordinates are pixel centres. A ``segmentation`` beside the keypoints is kept as it
-is, for `cadalign.datasets.detections.coco_masks`.
+COCO, integer coordinates are pixel centres.
+
+A ``segmentation`` beside the keypoints is kept as it is, for
+`cadalign.datasets.detections.coco_masks`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.photos.photo import Photo
+from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
+from cadalign.io.files import write_json
 
-_FIX = (
-    "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco_keypoints"
-)
+_FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco"
+_OUTSIDE, _INFERRED, _OBSERVED = 0, 1, 2  # visibility flags
 _Id = int | str
 _Size = Annotated[float, Meta(ge=1, le=2**31)]
 
@@ -223,3 +229,112 @@ def _scores(third: FloatArray) -> FloatArray:
     if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
         return np.choose(third.astype(int), list(VISIBILITY_SCORES))
     return third
+
+
+# Writing ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CocoObject:
+    """One object's keypoints, as an annotation of COCO.
+
+    Parameters
+    ----------
+    image, category : int
+        Rows of its image and its category in the document.
+    points_2d : (k, 2) float
+        Pixels of all keypoints of the category.
+    flags : (k,) int
+        2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels don't
+        count.
+    rectangle : (4,) float
+        Left, top, right and bottom.
+    """
+
+    image: int
+    category: int
+    points_2d: FloatArray
+    flags: IntArray
+    rectangle: FloatArray
+
+    def annotation(self, number: int) -> dict[str, Any]:
+        """The annotation of a number."""
+        left, top, right, bottom = self.rectangle.tolist()
+        pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
+        rows = zip(pixels, self.flags.tolist(), strict=True)
+        return {
+            "id": number,
+            "image_id": self.image,
+            "category_id": 1 + self.category,
+            "keypoints": [value for (x, y), flag in rows for value in (x, y, flag)],
+            "num_keypoints": int(np.count_nonzero(self.flags)),
+            "bbox": [left, top, right - left, bottom - top],
+            "area": (right - left) * (bottom - top),
+            "iscrowd": 0,
+        }
+
+
+def coco_document(
+    images: Iterable[tuple[str, int, int]],
+    categories: Iterable[tuple[str, Sequence[str]]],
+    objects: Iterable[CocoObject],
+) -> dict[str, Any]:
+    """Keypoints as COCO's JSON.
+
+    Parameters
+    ----------
+    images : iterable of (str, int, int)
+        File name, width and height.
+    categories : iterable of (str, sequence of str)
+        Name, and names of the keypoints.
+    objects : iterable of CocoObject
+    """
+    return {
+        "images": [
+            {"id": row, "file_name": name, "width": width, "height": height}
+            for row, (name, width, height) in enumerate(images)
+        ],
+        "categories": [
+            {"id": number, "name": name, "keypoints": list(points), "skeleton": []}
+            for number, (name, points) in enumerate(categories, start=1)
+        ],
+        "annotations": [each.annotation(number) for number, each in enumerate(objects, start=1)],
+    }
+
+
+def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
+    """Write the keypoints of aligned objects as COCO annotations, one category for each model.
+
+    All keypoints of a model are projected. The visibility flag is 2 for those that are marked in
+    the photo, 1 for those that the alignment adds, and 0, with the coordinates 0, for those outside
+    the image. ``bbox`` is that of the mesh, or else of the keypoints, in the image.
+
+    Raises
+    ------
+    InputError
+        If the camera, a pose or a model is not known.
+    """
+    placed = [
+        (row, PlacedObject(photo, found))
+        for row, photo in enumerate(photos)
+        for found in photo.objects
+    ]
+    models = {each.model.model_id: each.names for _, each in placed}
+    rows = {model_id: row for row, model_id in enumerate(models)}
+    cameras = [photo.known_camera for photo in photos]
+    images = [(p.name, c.width, c.height) for p, c in zip(photos, cameras, strict=True)]
+    objects = (_projected(each, row, rows[each.model.model_id]) for row, each in placed)
+    write_json(path, coco_document(images, models.items(), objects))
+
+
+def _projected(placed: PlacedObject, image: int, category: int) -> CocoObject:
+    pixels = placed.camera.project_where_ahead(placed.pose.apply(placed.points))
+    inside: BoolArray = np.asarray(np.isfinite(pixels).all(axis=1))
+    inside[inside] = placed.camera.contains(pixels[inside])
+    observed = [name in placed.marked for name in placed.names]
+    flags = np.where(inside, np.where(observed, _OBSERVED, _INFERRED), _OUTSIDE)
+    try:
+        rectangle = placed.bbox + PIXEL_CENTRE
+    except InputError:  # an object behind the camera
+        rectangle = np.zeros(4)
+    return CocoObject(image, category, np.round(pixels, 4), flags, rectangle)

@@ -1,0 +1,392 @@
+"""BOP's files: poses as ``scene_gt.json`` and as result CSV, and models with ``models_info.json``.
+
+The format is that of bop_toolkit's ``docs/bop_datasets_format.md`` and of the BOP challenge's
+results: rotations row by row, lengths in millimetres, integer pixels at pixel centres. Poses have
+no stretch.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.photo import CadModel, ModelFiles, existing
+from cadalign.datasets.photos.poses import Estimates, PoseEstimate
+from cadalign.errors import CadalignError, DataError, InputError, brief, quote
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import nearest_rotation
+from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
+from cadalign.io.documents import (
+    Finite,
+    ForeignDocument,
+    Point3,
+    Positive,
+    convert,
+    in_file,
+    read_json,
+    within,
+)
+from cadalign.io.files import read_text, write_json, write_text, writing
+from cadalign.io.meshes.write import write_ply_mesh
+
+TRUTH = "scene_gt.json"
+RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+_UNKNOWN_TIME = -1.0
+_MAX_ID = 10**9
+_MODELS_INFO = "models_info.json"
+_MODEL_FOLDERS = ("models", "models_eval", "models_cad")
+# Model folders may lie beside the scene's tables or up to three folders above them.
+_LEVELS = 3
+_HULL_POINTS = 2000  # of more the diameter is computed from every k-th
+Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
+_Sixteen = Annotated[list[Finite], Meta(min_length=16, max_length=16)]
+
+
+class ScenePose(ForeignDocument):
+    """The pose of one object in ``scene_gt.json`` [mm]."""
+
+    cam_R_m2c: Nine
+    cam_t_m2c: Point3
+    obj_id: Annotated[int, Meta(ge=0, le=_MAX_ID)]
+
+    def alignment(self) -> Alignment:
+        """The pose; a rotation of few digits becomes the nearest one."""
+        return _alignment(np.array(self.cam_R_m2c), np.array(self.cam_t_m2c))
+
+
+# Poses -----------------------------------------------------------------------------------------
+
+
+def object_name(number: int) -> str:
+    """The name of a model's files, as ``obj_000001``."""
+    return f"obj_{number:06d}"
+
+
+def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:
+    """Write poses as the CSV file of results that the BOP challenge takes.
+
+    Parameters
+    ----------
+    path : Path
+    poses : iterable of PoseEstimate
+        Their ids are numbers; models may be called ``obj_000001``. Translations are millimetres.
+
+    Raises
+    ------
+    InputError
+        If an id is not a number, or a pose has a stretch.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(RESULT_COLUMNS)
+    for number, each in enumerate(poses):
+        rotation, translation = _rigid(each, number)
+        writer.writerow(
+            [
+                _number(each.scene or "0", f"poses[{number}].scene"),
+                _number(each.image, f"poses[{number}].image"),
+                _object_number(each.model_id, f"poses[{number}].model_id"),
+                f"{each.score:.17g}",
+                _blank_separated(rotation),
+                _blank_separated(translation),
+                f"{_UNKNOWN_TIME if each.seconds is None else each.seconds:.17g}",
+            ]
+        )
+    write_text(path, text.getvalue())
+
+
+def write_scene_gt(path: Path, poses: Iterable[PoseEstimate]) -> None:
+    """Write poses of one scene as ``scene_gt.json``; see `write_bop_results`."""
+    table: dict[str, list[dict[str, Any]]] = {}
+    for number, each in enumerate(poses):
+        rotation, translation = _rigid(each, number)
+        entry = {
+            "cam_R_m2c": rotation.tolist(),
+            "cam_t_m2c": translation.tolist(),
+            "obj_id": _object_number(each.model_id, f"poses[{number}].model_id"),
+        }
+        image = str(_number(each.image, f"poses[{number}].image"))
+        table.setdefault(image, []).append(entry)
+    write_json(path, dict(sorted(table.items(), key=lambda item: int(item[0]))))
+
+
+def read_bop_results(path: Path) -> Estimates:
+    """Read a CSV file of results of the BOP challenge; lines that cannot be read are told of.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or is not such a file.
+    """
+    text = read_text(path)
+    rows = list(csv.reader(io.StringIO(text)))
+    if not rows or tuple(cell.strip() for cell in rows[0]) != RESULT_COLUMNS:
+        what = f"the first line is not {','.join(RESULT_COLUMNS)}"
+        fix = "give a CSV file of results as the BOP challenge takes it"
+        raise DataError(what, where=str(path), fix=fix)
+    poses, problems = [], []
+    for line, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        try:
+            poses.append(_pose_of_row(row))
+        except (CadalignError, ValueError) as error:
+            what = error.what if isinstance(error, CadalignError) else brief(error)
+            problems.append(DataError(what, where=f"{path}, line {line}"))
+    if problems and not poses:
+        raise problems[0]
+    return Estimates(path, tuple(poses), tuple(problems))
+
+
+def read_scene_gt(path: Path) -> Estimates:
+    """Read a file in the form of ``scene_gt.json``; poses that cannot be read are told of.
+
+    The scene's id is the name of the file's folder, where that is a number.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or is not such a file.
+    """
+    table = read_json(path)
+    is_table = isinstance(table, dict) and all(isinstance(each, list) for each in table.values())
+    if not is_table:
+        what = "is not a table of lists of poses by the images' numbers"
+        raise DataError(what, where=str(path), fix=f"give a file such as BOP's {TRUTH}")
+    scene = str(int(path.parent.name)) if path.parent.name.isdecimal() else ""
+    poses, problems = [], []
+    entries = [(image, *each) for image, found in table.items() for each in enumerate(found)]
+    for image, row, entry in entries:
+        try:
+            with in_file(path):
+                poses.append(_pose_of_entry(entry, scene, image, f"{image}[{row}]"))
+        except CadalignError as error:
+            problems.append(DataError(error.what, where=error.where, fix=error.fix))
+    if problems and not poses:
+        raise problems[0]
+    return Estimates(path, tuple(poses), tuple(problems))
+
+
+def _pose_of_entry(entry: Any, scene: str, image: str, where: str) -> PoseEstimate:
+    if not image.isdecimal():
+        raise InputError(f"{quote(image)} is not the number of an image", where=image)
+    pose: ScenePose = convert(entry, ScenePose, where)
+    with within(where):
+        return PoseEstimate(scene, str(int(image)), object_name(pose.obj_id), pose.alignment())
+
+
+def _pose_of_row(row: list[str]) -> PoseEstimate:
+    if len(row) != len(RESULT_COLUMNS):
+        raise InputError(f"{len(row)} cells, expected {len(RESULT_COLUMNS)}")
+    cells = dict(zip(RESULT_COLUMNS, (cell.strip() for cell in row), strict=True))
+    ids = [_number(cells[name], name) for name in ("scene_id", "im_id", "obj_id")]
+    score, seconds = _floats(cells["score"], 1, "score")[0], _floats(cells["time"], 1, "time")[0]
+    alignment = _alignment(_floats(cells["R"], 9, "R"), _floats(cells["t"], 3, "t"))
+    return PoseEstimate(
+        scene=str(ids[0]),
+        image=str(ids[1]),
+        model_id=object_name(ids[2]),
+        cam_from_model=alignment,
+        score=float(score),
+        seconds=None if seconds < 0 else float(seconds),
+    )
+
+
+def _floats(text: str, count: int, name: str) -> FloatArray:
+    try:
+        values = np.array(text.split(), dtype=float)
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{name} {quote(text)} is not {count} finite numbers")
+    return values
+
+
+def _alignment(rotation: FloatArray, translation: FloatArray) -> Alignment:
+    turn = nearest_rotation(rotation.reshape(3, 3).astype(float))
+    return Alignment(turn, translation, np.ones(3), is_valid=True)
+
+
+def _rigid(each: PoseEstimate, number: int) -> tuple[FloatArray, FloatArray]:
+    pose = each.cam_from_model
+    if np.abs(pose.scale - 1).max() > 1e-12:
+        what = (
+            f"the pose has the stretch {pose.scale.tolist()}, which BOP's files have no place for"
+        )
+        fix = "stretch the mesh, write that, and give the pose with scale 1"
+        raise InputError(what, where=f"poses[{number}]", fix=fix)
+    return pose.rotation.ravel(), pose.translation
+
+
+def _blank_separated(values: FloatArray) -> str:
+    return " ".join(f"{value:.17g}" for value in values)
+
+
+def _number(text: str, where: str) -> int:
+    if not (text.isdecimal() and int(text) <= _MAX_ID):
+        what = f"{where} {quote(text)} is not a whole number from 0 to {_MAX_ID}"
+        raise InputError(what, where=where, fix="BOP's files number scenes, images and models")
+    return int(text)
+
+
+def _object_number(name: str, where: str) -> int:
+    return _number(name.removeprefix("obj_"), where)
+
+
+# Models ----------------------------------------------------------------------------------------
+
+
+class _Axis(ForeignDocument):
+    axis: Point3
+    offset: Point3 = (0.0, 0.0, 0.0)
+
+
+class ModelInfo(ForeignDocument):
+    """One model's entry: bounding box, diameter and symmetries [mm]."""
+
+    diameter: Positive | None = None
+    min_x: Finite | None = None
+    min_y: Finite | None = None
+    min_z: Finite | None = None
+    size_x: Finite | None = None
+    size_y: Finite | None = None
+    size_z: Finite | None = None
+    symmetries_discrete: list[_Sixteen] = msgspec.field(default_factory=list)
+    symmetries_continuous: list[_Axis] = msgspec.field(default_factory=list)
+
+    def symmetry(self) -> Symmetry:
+        """The symmetries; discrete ones are 4 x 4 matrices, row by row."""
+        motions = np.reshape(self.symmetries_discrete, (-1, 4, 4)).astype(float)
+        axes = [
+            SymmetryAxis(np.array(each.axis), np.array(each.offset))
+            for each in self.symmetries_continuous
+        ]
+        return Symmetry(motions, tuple(axes))
+
+    def bounds(self) -> FloatArray | None:
+        """The bounding box's corners, (2, 3) float; None where it is not given."""
+        low = (self.min_x, self.min_y, self.min_z)
+        size = (self.size_x, self.size_y, self.size_z)
+        if None in low or None in size:
+            return None
+        corner = np.array(low, dtype=float)
+        return np.array([corner, corner + np.array(size, dtype=float)])
+
+
+@dataclass(frozen=True)
+class BopModels:
+    """The models' folder of a data set.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of ``obj_000001.ply`` and ``models_info.json``.
+    info : dict
+        The parsed entries of ``models_info.json`` by the models' ids; empty where it is missing.
+    """
+
+    folder: Path
+    info: dict[str, Any]
+
+    @classmethod
+    def find(cls, scene: Path) -> BopModels | None:
+        """Find the models of a scene: beside it, or in one of the three folders above it.
+
+        Raises
+        ------
+        DataError
+            If ``models_info.json`` cannot be read.
+        """
+        for place in (scene, *scene.parents[:_LEVELS]):
+            for name in _MODEL_FOLDERS:
+                folder = place / name
+                if not folder.is_dir():
+                    continue
+                path = folder / _MODELS_INFO
+                if not path.is_file():
+                    return cls(folder, {})
+                with in_file(path):
+                    return cls(folder, convert(read_json(path), dict[str, Any]))
+        return None
+
+    def model(self, obj_id: int) -> CadModel:
+        """The CAD model of an id; its mesh is None where the file is missing."""
+        name = object_name(obj_id)
+        info = self._entry(obj_id)
+        return CadModel(
+            name,
+            ModelFiles(existing(self.folder / f"{name}.ply")),
+            bounds=info.bounds(),
+            diameter=info.diameter,
+        )
+
+    def symmetry(self, obj_id: int) -> Symmetry:
+        """The symmetries of a model.
+
+        Raises
+        ------
+        DataError
+            If a motion is not rigid, or an axis has no direction.
+        """
+        with in_file(self.folder / _MODELS_INFO), within(str(obj_id)):
+            return self._entry(obj_id).symmetry()
+
+    def _entry(self, obj_id: int) -> ModelInfo:
+        if str(obj_id) not in self.info:
+            return ModelInfo()
+        with in_file(self.folder / _MODELS_INFO):
+            found = convert(self.info[str(obj_id)], ModelInfo, str(obj_id))
+        if not isinstance(found, ModelInfo):
+            raise InputError("not a model's entry", where=str(obj_id))
+        return found
+
+
+def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
+    """Write a mesh [mm] into ``models``; returns its entry for `write_models_info`."""
+    write_ply_mesh(folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply", mesh)
+    low, high = mesh.bounds
+    info = {"diameter": _diameter(mesh)}
+    for axis, least, size in zip("xyz", low.tolist(), (high - low).tolist(), strict=True):
+        info |= {f"min_{axis}": least, f"size_{axis}": size}
+    return info
+
+
+def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> None:
+    """Add entries of models to ``models/models_info.json``; those of others are kept.
+
+    Raises
+    ------
+    DataError
+        If the file with the other models cannot be read.
+    """
+    path = folder / _MODEL_FOLDERS[0] / _MODELS_INFO
+    table = read_json(path) if path.exists() else {}
+    if not isinstance(table, dict):
+        raise DataError("is not a table of models", where=str(path))
+    with writing(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, table | {str(number): each for number, each in entries.items()})
+
+
+def _diameter(mesh: Mesh) -> float:
+    """The largest distance of two vertices."""
+    from scipy.spatial import ConvexHull, QhullError  # only writing needs SciPy
+    from scipy.spatial.distance import pdist
+
+    points = mesh.vertices[mesh.is_used]
+    try:
+        points = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # a flat mesh
+        points = np.unique(points, axis=0)
+    points = points[:: max(1, -(-len(points) // _HULL_POINTS))]
+    return float(pdist(points).max(initial=0.0))

@@ -1,0 +1,264 @@
+"""One posed object of a photo, in metres, as the writers of data sets take it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import writing
+from cadalign.io.images import open_photo, write_image
+from cadalign.io.meshes.write import write_obj_mesh
+
+LEVEL_UP = (0.0, -1.0, 0.0)
+"""Direction in a level camera that is up in the scene."""
+_COPIED = {"JPEG": ".jpg", "PNG": ".png"}
+_ORIENTATION = 0x0112  # the EXIF tag
+_LEAST = 0.9  # of the cosine between an axis and up that another axis is taken
+
+_Entry = TypeVar("_Entry")
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedObject:
+    """An object of a photo whose camera, pose and model are known.
+
+    Parameters
+    ----------
+    photo : Photo
+    found : PhotoObject
+
+    Raises
+    ------
+    InputError
+        If the photo has no camera, or the object no pose or no model.
+    """
+
+    photo: Photo
+    found: PhotoObject
+
+    def __post_init__(self) -> None:
+        for name, is_missing in (
+            ("pose with all scales", self.found.truth.cam_from_model is None),
+            ("CAD model", self.found.model is None),
+        ):
+            if is_missing:
+                what = f"object {self.found.object_id} has no {name}, which a data set needs"
+                raise InputError(what, where=self.photo.name)
+        self.camera.require_focal()
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the pose fits the photo with."""
+        return self.found.truth.camera or self.photo.known_camera
+
+    @property
+    def model(self) -> CadModel:
+        """The CAD model."""
+        assert self.found.model is not None
+        return self.found.model
+
+    @property
+    def category(self) -> str:
+        """The category as the name of a folder."""
+        return _file_name(self.found.category)
+
+    @property
+    def model_id(self) -> str:
+        """The model's id as the name of a folder."""
+        return _file_name(self.model.model_id)
+
+    @property
+    def _aligned(self) -> Alignment:
+        assert self.found.truth.cam_from_model is not None
+        return self.found.truth.cam_from_model
+
+    @property
+    def _metres(self) -> float:
+        return self.found.truth.metres or 1.0
+
+    @property
+    def pose(self) -> Alignment:
+        """The pose of the stretched model, without stretch [m]."""
+        return Alignment(
+            self._aligned.rotation, self._aligned.translation * self._metres, np.ones(3)
+        )
+
+    @property
+    def scale(self) -> FloatArray:
+        """Metres per model unit along the model's axes, (3,) float."""
+        return self._aligned.scale * self._metres
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the model's keypoints."""
+        return self._keypoints.names
+
+    @property
+    def points(self) -> FloatArray:
+        """The keypoints on the stretched model, (k, 3) float [m]."""
+        return self._keypoints.xyz * self.scale
+
+    @cached_property
+    def _keypoints(self) -> NamedPoints:
+        with _left_out():
+            return self.model.load_keypoints() or NamedPoints((), np.empty((0, 3)))
+
+    @property
+    def marked(self) -> dict[str, FloatArray]:
+        """The pixels (2,) of the marked keypoints by their names."""
+        marks = self.found.keypoints
+        return {} if marks is None else dict(zip(marks.names, marks.points_2d, strict=True))
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest coordinates of the model before the stretch, (2, 3) float."""
+        return self.mesh.bounds if self.model.bounds is None else self.model.bounds
+
+    @property
+    def sides(self) -> FloatArray:
+        """Extents of the stretched model along its axes, (3,) float [m]."""
+        return np.asarray(np.ptp(self.bounds, axis=0) * self.scale)
+
+    @property
+    def center(self) -> FloatArray:
+        """The centre of the model's box in the camera, (3,) float [m]."""
+        middle: FloatArray = self.bounds.mean(axis=0) * self.scale
+        return np.asarray(self.pose.apply(middle[None])[0])
+
+    @property
+    def up(self) -> FloatArray:
+        """The direction in the camera that is up in the scene, of length 1."""
+        up = np.array(LEVEL_UP) if self.photo.up is None else self.photo.up
+        return np.asarray(up / np.linalg.norm(up))
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The model's mesh; raises InputError where there is none that can be read."""
+        with _left_out():
+            return self.model.load_mesh()
+
+    @property
+    def bbox(self) -> FloatArray:
+        """Left, top, right and bottom of the object in the image, (4,) float [px]."""
+        if self.found.bbox is not None:
+            return self.found.bbox
+        with _left_out():
+            mesh = self.model.source.load_mesh()
+        points = self.points if mesh is None else mesh.vertices * self.scale
+        pixels = self.camera.project_where_ahead(self.pose.apply(points))
+        pixels = pixels[np.isfinite(pixels).all(axis=1)]
+        if not len(pixels):
+            raise InputError("the object lies behind the camera", where=self.photo.name)
+        size = np.array([self.camera.width, self.camera.height])
+        low, high = (np.clip(f(axis=0), -0.5, size - 0.5) for f in (pixels.min, pixels.max))
+        return np.concatenate([low, high])
+
+    def require_plain_camera(self, format: str) -> None:
+        """Refuse lens distortion, for which a format has no place."""
+        if any(self.camera.distortion):
+            raise InputError(
+                f"{format} has no place for lens distortion",
+                where=self.photo.name,
+                fix="undistort the photo and annotate it again",
+            )
+
+    def copy_image(self, stem: Path) -> Path:
+        """Copy the photo, upright; a file that is so already is copied as it is."""
+        with writing(stem):
+            stem.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(self.photo.image, Path):
+            with _left_out(), open_photo(self.photo.image) as image:
+                ending = _COPIED.get(image.format or "")
+                is_upright = image.getexif().get(_ORIENTATION, 1) == 1
+            if ending is not None and is_upright:
+                path = stem.with_name(f"{stem.name}{ending}")
+                with writing(path):
+                    shutil.copyfile(self.photo.image, path)
+                return path
+        path = stem.with_name(f"{stem.name}.png")
+        with _left_out():
+            pixels = self.photo.read_image()
+        write_image(path, pixels)
+        return path
+
+    def write_mask(self, path: Path) -> Path | None:
+        """Write the mask as a PNG, 255 on the object; None without one."""
+        if self.found.mask_path is None:
+            return None
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with _left_out():
+            mask = self.found.read_mask()
+        write_image(path, np.where(mask, 255, 0).astype(np.uint8))
+        return path
+
+    def write_model(self, path: Path, *, is_stretched: bool) -> None:
+        """Write the mesh as OBJ in its own frame: stretched [m], or as it is."""
+        mesh = self.mesh
+        write_obj_mesh(path, mesh.stretched(self.scale) if is_stretched else mesh)
+
+
+def placed_objects(
+    photos: Iterable[Photo], problems: list[InputError]
+) -> Iterator[tuple[int, PlacedObject]]:
+    """Objects of photos with their numbers; why others cannot be written is added to problems."""
+    for number, (photo, found) in enumerate((p, each) for p in photos for each in p.objects):
+        try:
+            if photo.image is None:
+                raise InputError("the image of this photo is not there", where=photo.name)
+            placed = PlacedObject(photo, found)
+        except InputError as error:
+            problems.append(error)
+        else:
+            yield number, placed
+
+
+def converted(
+    numbered: Iterable[tuple[int, PlacedObject]],
+    convert: Callable[[int, PlacedObject], _Entry],
+) -> tuple[list[_Entry], list[InputError]]:
+    """Entries of the objects that a format can hold, and why the others are left out."""
+    entries, problems = [], []
+    for number, placed in numbered:
+        try:
+            entries.append(convert(number, placed))
+        except InputError as error:
+            problems.append(error)
+    return entries, problems
+
+
+@contextmanager
+def _left_out() -> Iterator[None]:
+    """Let what cannot be read of an object be the reason why it is left out."""
+    try:
+        yield
+    except DataError as error:
+        raise InputError(error.what, where=error.where, fix=error.fix) from None
+
+
+def _file_name(text: str) -> str:
+    """A text as a name that does not leave its folder."""
+    name = re.sub(r"[/\\\0]", "_", text)
+    return name if name.strip(".") else f"_{name}"
+
+
+def upright_rotation(up: FloatArray) -> FloatArray:
+    """A rotation (3, 3) that takes a direction of length 1 to z."""
+    beside = np.eye(3)[0 if abs(up[0]) < _LEAST else 1]
+    x = beside - (beside @ up) * up
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(up, x), up])

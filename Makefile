@@ -33,24 +33,9 @@ fuzz: $(VENV)/.installed-dev  ## call fit, every reader and the commands with ra
 	for what in fits batches readers; do PYTHONPATH=tests $(BIN)/python -m fuzz $$what $(or $(COUNT),20000) || exit 1; done
 	PYTHONPATH=tests $(BIN)/python -m fuzz commands $$(($(or $(COUNT),20000) / 20))
 
-bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored
-	$(BIN)/python scripts/benchmark_solvers.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
+bench: $(VENV)/.installed-dev  ## measure accuracy and speed; fail where a ratio is 20 % worse than stored (SECTIONS="cold calls")
 	$(BIN)/python -m pytest tests/estimation/test_benchmarks.py --benchmark-enable --benchmark-columns=median,iqr
-	$(BIN)/python scripts/benchmark_cold.py --json bench/cold.ratios.json
-	$(BIN)/python scripts/benchmark_calls.py --json bench/calls.ratios.json
-	$(BIN)/python scripts/benchmark_focal.py
-	$(BIN)/python scripts/benchmark_focal_shapes.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
-	$(BIN)/python scripts/benchmark_calibration.py
-	$(BIN)/python scripts/benchmark_render.py
-	$(BIN)/python scripts/benchmark_annotator.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
-	$(BIN)/python scripts/benchmark_masks.py $(if $(CADALIGN_DATA),--keypointnet $(CADALIGN_DATA)/keypointnet)
-ifneq ($(CADALIGN_DATA),)
-	$(BIN)/python scripts/benchmark_align.py $(CADALIGN_DATA)/keypointnet
-	$(BIN)/python scripts/benchmark_retrieval.py $(CADALIGN_DATA)/keypointnet --json bench/retrieval.ratios.json
-	$(BIN)/python scripts/benchmark_evaluation.py $(CADALIGN_DATA)/keypointnet --json bench/evaluation.ratios.json
-	$(BIN)/python scripts/benchmark_ransac.py --colmap $(CADALIGN_DATA)/sfm/maupertuis_colmap --bundler $(CADALIGN_DATA)/sfm/balbianello --json bench/ransac.ratios.json
-endif
-	$(BIN)/python scripts/compare_ratios.py bench/*.ratios.json
+	$(BIN)/python scripts/bench.py $(SECTIONS)
 
 lint: $(VENV)/.installed-dev  ## check style (ruff) and types (mypy)
 	$(BIN)/ruff check .

@@ -57,19 +57,33 @@ def test_the_worked_photo_aligns_as_its_page_says(
 
 
 class TestComparingRatios:
-    FIGURES = (
-        '{"fit": {"value": 9.0, "unit": "us", "ratio": 1.19}, "size": {"value": 3, "unit": "MB"}}'
-    )
+    """`bench.py` with a section whose one ratio is 1.19."""
 
-    def compare(self, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-        (folder / "measured.json").write_text(self.FIGURES)
-        script = ROOT / "scripts" / "compare_ratios.py"
-        named = ["--stored", str(folder / "stored.json"), *options]
+    BENCH = """
+import sys
+from dataclasses import dataclass
+
+import bench
+from benchmarks.section import Table, figure
+
+@dataclass
+class Toy:
+    def run(self, given):
+        yield Table("sizes", [{"points": 7, "R": (0.5, 1.25)}])
+        yield Table("times", [figure("fit", 9.0, "us", 1.19)])
+
+bench.SECTIONS = {"toy": Toy}
+sys.exit(bench.main(sys.argv[1:]))
+"""
+
+    def bench(self, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+        named = ["--stored", str(folder / "stored.json"), "--out", str(folder), *options]
         return subprocess.run(
-            [sys.executable, str(script), str(folder / "measured.json"), *named],
+            [sys.executable, "-c", self.BENCH, *named],
             capture_output=True,
             text=True,
             check=False,
+            cwd=ROOT / "scripts",  # a program given by -c imports from there
         )
 
     @pytest.mark.parametrize(("stored", "status"), [(1.0, 0), (0.98, 1)])
@@ -77,12 +91,18 @@ class TestComparingRatios:
         self, stored: float, status: int, tmp_path: Path
     ) -> None:
         (tmp_path / "stored.json").write_text(f'{{"fit": {stored}}}')
-        done = self.compare(tmp_path)
-        assert done.returncode == status
+        done = self.bench(tmp_path)
+        assert done.returncode == status, done.stderr
         assert ("more than 20% worse than stored: fit" in done.stdout) == bool(status)
+        assert "0.5 (1.25)" in done.stdout
+        assert json.loads((tmp_path / "toy.json").read_text())["times"][0]["ratio"] == 1.19
 
     def test_stored_ratios_are_compared_with_next_time(self, tmp_path: Path) -> None:
         (tmp_path / "stored.json").write_text('{"other": 2.0}')
-        assert self.compare(tmp_path, "--store").returncode == 0
+        assert self.bench(tmp_path, "--store").returncode == 0
         assert json.loads((tmp_path / "stored.json").read_text()) == {"fit": 1.19, "other": 2.0}
-        assert "(stored 1.19)" in self.compare(tmp_path).stdout
+        (line,) = (line for line in self.bench(tmp_path).stdout.splitlines() if " fit " in line)
+        assert line.split()[-2] == "1.19"
+
+    def test_an_unknown_section_is_refused(self, tmp_path: Path) -> None:
+        assert "no section nothing; known are toy" in self.bench(tmp_path, "nothing").stderr

@@ -336,7 +336,7 @@ def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> lis
 
 
 class _Written(NamedTuple):
-    """What the tables of a scene say of a written object."""
+    """A written object in the tables of a scene."""
 
     pose: PoseEstimate
     camera: Camera

@@ -9,21 +9,18 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.model import Draft
-from cadalign.datasets.sample.solids import Color, Point, Solid, lathe, smooth_curve
+from cadalign.datasets.sample.solids import Color, Point, Solid, lathe
 
-_AZIMUTHS = np.radians([135.0, 45.0, -45.0, -135.0])
-# KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).
-_ROUND = (2.0, 1.0)
-_Profile = list[tuple[float, float]]
+_EDGE = 0.022  # radius of the rounded edge of the bottom
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """A kind of bottle; lengths are shares of its height.
+class _Bottle:
+    """Proportions of a bottle, as shares of its height, its cap, and the colours of its glass.
 
     ``shoulder`` is the end of the body, ``neck`` the beginning of the neck; ``curve`` shapes the
-    part between them: less than 1 is full, more is slender. ``shape`` is
-    the superellipse's exponent and the extent along z relative to x.
+    part between them: less than 1 is full, more is slender. ``exponent`` and ``depth``, the extent
+    along z relative to x, are those of the body's superellipse.
     """
 
     radius: float
@@ -34,33 +31,81 @@ class _Kind:
     cap: str
     label: tuple[float, float]
     glass: tuple[Color, ...]
-    shape: tuple[float, float] = _ROUND
+    exponent: float = 2.0
+    depth: float = 1.0
     ribs: int = 0
     waist: float = 0.0
 
+    @property
+    def round(self) -> bool:
+        return (self.exponent, self.depth) == (2.0, 1.0)
 
-_GREEN: tuple[Color, ...] = ((40, 74, 44), (58, 92, 40), (28, 56, 40))
-_BROWN: tuple[Color, ...] = ((98, 54, 22), (116, 68, 26), (78, 42, 22))
-_CLEAR: tuple[Color, ...] = ((168, 208, 226), (150, 200, 216), (186, 220, 214))
-_AMBER: tuple[Color, ...] = ((186, 112, 36), (168, 92, 30), (200, 136, 60))
-_PAINT: tuple[Color, ...] = ((206, 52, 44), (40, 96, 168), (236, 186, 52), (64, 140, 84))
-_MILK: tuple[Color, ...] = ((238, 236, 226), (226, 232, 236), (240, 226, 214))
+    def radius_at(self, height: npt.ArrayLike) -> FloatArray:
+        """Radii of the glass at heights."""
+        y = np.asarray(height)
+        body = np.clip((y - _EDGE) / (self.shoulder - _EDGE), 0, 1)
+        above = np.clip((y - self.shoulder) / (self.neck - self.shoulder), 0, 1)
+        # A smooth step from body to neck; the power moves it down (slender) or up (full).
+        step = 0.5 - 0.5 * np.cos(np.pi * above ** (1 / self.curve))
+        ribs = 0.035 * (0.5 - 0.5 * np.cos(2 * np.pi * self.ribs * body))
+        radius = self.radius * (1 - self.waist * np.sin(np.pi * body) ** 4) * (1 - ribs)
+        under = np.clip(_EDGE - y, 0, _EDGE)
+        radius = radius - _EDGE + np.sqrt(_EDGE**2 - under**2)
+        return np.asarray(radius + (self.neck_radius - self.radius) * step)
 
+    def section(self, height: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """The superellipse's depths and exponents at heights, round at the neck."""
+        below = np.clip((self.neck - np.asarray(height)) / (self.neck - self.shoulder), 0, 1)
+        return 1 + (self.depth - 1) * below, 2 + (self.exponent - 2) * below**0.7
+
+    def turned(self, heights: FloatArray, color: Color, *, grow: float = 1.0) -> Solid:
+        """The part of the bottle between the first and the last of some heights."""
+        low, high = heights[[0, -1]]
+        profile = np.stack([grow * self.radius_at(heights), heights], axis=1)
+        closed = np.concatenate([[(0, low)], profile, [(0, high)]])
+        depth, exponent = self.section(closed[:, 1])
+        return lathe(closed, color, count=40, depth=depth, exponent=exponent)
+
+    def ring(self, first: int, height: float, radius: float | None = None) -> dict[int, Point]:
+        """Four places around the axis, by semantic id; on the glass, or on a round cap."""
+        depth, exponent = (1.0, 2.0) if radius else map(float, self.section(height))
+        # KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).
+        reach = (radius or float(self.radius_at(height))) * 2 ** (-1 / exponent)
+        corners = ((1, -1), (1, 1), (-1, 1), (-1, -1))
+        return {
+            first + i: (x * reach, height, z * reach * depth) for i, (x, z) in enumerate(corners)
+        }
+
+
+_GREEN, _BROWN, _CLEAR = ((40, 74, 44), (28, 56, 40)), ((98, 54, 22),), ((168, 208, 226),)
+_AMBER, _MILK = ((186, 112, 36), (200, 136, 60)), ((238, 236, 226), (226, 232, 236))
+_PAINT = ((206, 52, 44), (40, 96, 168), (236, 186, 52), (64, 140, 84))
 _KINDS = (
-    _Kind(0.125, 0.6, 0.72, 0.047, 0.55, "foil", (0.14, 0.46), _GREEN),  # Bordeaux wine
-    _Kind(0.155, 0.68, 0.88, 0.058, 0.8, "screw", (0.38, 0.6), _CLEAR, ribs=7),  # water
-    _Kind(0.15, 0.42, 0.74, 0.048, 1.35, "foil", (0.1, 0.34), _GREEN),  # Burgundy wine
-    _Kind(0.134, 0.55, 0.78, 0.052, 1.0, "crown", (0.16, 0.44), _BROWN),  # beer
-    _Kind(0.2, 0.56, 0.76, 0.062, 0.45, "stopper", (0.14, 0.42), _AMBER, shape=(6.0, 1)),  # spirit
-    _Kind(0.155, 0.66, 0.87, 0.056, 0.9, "screw", (0.36, 0.54), _PAINT, waist=0.16),  # soda
-    _Kind(0.25, 0.66, 0.83, 0.07, 0.5, "stopper", (0.2, 0.5), _CLEAR, shape=(2.4, 0.42)),
-    _Kind(0.178, 0.5, 0.78, 0.1, 1.2, "screw", (0.12, 0.36), _MILK),  # milk
-    _Kind(0.15, 0.6, 0.74, 0.075, 0.6, "nozzle", (0.14, 0.5), _PAINT),  # sauce
-    _Kind(0.2, 0.7, 0.78, 0.13, 0.5, "lid", (0.16, 0.56), _AMBER),  # medicine
-    _Kind(0.165, 0.36, 0.74, 0.05, 1.1, "foil", (0.1, 0.3), _GREEN),  # champagne
-    _Kind(0.19, 0.62, 0.8, 0.085, 0.55, "lid", (0.12, 0.48), _PAINT, shape=(3.2, 0.5)),
+    _Bottle(0.125, 0.6, 0.72, 0.047, 0.55, "foil", (0.14, 0.46), _GREEN),  # Bordeaux wine
+    _Bottle(0.155, 0.68, 0.88, 0.058, 0.8, "screw", (0.38, 0.6), _CLEAR, ribs=7),  # water
+    _Bottle(0.15, 0.42, 0.74, 0.048, 1.35, "foil", (0.1, 0.34), _GREEN),  # Burgundy wine
+    _Bottle(0.134, 0.55, 0.78, 0.052, 1.0, "crown", (0.16, 0.44), _BROWN),  # beer
+    _Bottle(0.2, 0.56, 0.76, 0.062, 0.45, "stopper", (0.14, 0.42), _AMBER, 6.0),  # spirit
+    _Bottle(0.155, 0.66, 0.87, 0.056, 0.9, "screw", (0.36, 0.54), _PAINT, waist=0.16),  # soda
+    _Bottle(0.25, 0.66, 0.83, 0.07, 0.5, "stopper", (0.2, 0.5), _CLEAR, 2.4, 0.42),
+    _Bottle(0.178, 0.5, 0.78, 0.1, 1.2, "screw", (0.12, 0.36), _MILK),  # milk
+    _Bottle(0.15, 0.6, 0.74, 0.075, 0.6, "nozzle", (0.14, 0.5), _PAINT),  # sauce
+    _Bottle(0.2, 0.7, 0.78, 0.13, 0.5, "lid", (0.16, 0.56), _AMBER),  # medicine
+    _Bottle(0.165, 0.36, 0.74, 0.05, 1.1, "foil", (0.1, 0.3), _GREEN),  # champagne
+    _Bottle(0.19, 0.62, 0.8, 0.085, 0.55, "lid", (0.12, 0.48), _PAINT, 3.2, 0.5),
 )
-_CAPS: tuple[Color, ...] = (
+# Radius, relative to the neck's, and height from the cap's lower end to the rim of its top.
+_CAPS = {
+    "foil": [(1, 0.82), (1.03, 0.824), (1.03, 0.93), (1.13, 0.934), (1.13, 0.962), (1.05, 0.97)],
+    "crown": [(1.28, 0.942), (1.2, 0.958), (1.02, 0.972)],
+    "stopper": [(0.8, 0.93), (0.8, 0.965), (1.1, 0.972), (1.28, 0.99), (1.32, 1.005),
+                (1.26, 1.025), (1.1, 1.038), (1.0, 1.042)],
+    "nozzle": [(1.1, 0.76), (1.1, 0.83), (0.75, 0.85), (0.28, 1.0), (0.22, 1.005)],
+    "screw": [(1.16, 0.905), (1.16, 0.977), (1.1, 0.985)],
+    "lid": [(1.12, 0.85), (1.12, 0.977), (1.06, 0.985)],
+}  # fmt: skip
+_GROOVED = ("screw", "lid")
+_CAP_COLORS: tuple[Color, ...] = (
     (176, 36, 40), (32, 34, 40), (206, 170, 84), (36, 82, 150), (240, 240, 236),
 )  # fmt: skip
 _CORK = (96, 66, 42)
@@ -72,29 +117,6 @@ _STRIPES: tuple[Color, ...] = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Bottle:
-    """A bottle: its kind with the lengths as drawn, and the colours of its parts."""
-
-    kind: _Kind
-    glass: Color
-    cap: Color
-    label: Color
-    stripe: Color
-
-    def shape(self, height: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """The superellipse's exponents and extents along z at heights, round at the neck."""
-        kind, (exponent, depth) = self.kind, self.kind.shape
-        share = (kind.neck - np.asarray(height)) / (kind.neck - kind.shoulder)
-        below = np.asarray(np.clip(share, 0, 1))
-        return 2.0 + (exponent - 2.0) * below**0.7, 1.0 + (depth - 1.0) * below
-
-    def turned(self, profile: FloatArray, color: Color) -> Solid:
-        """A profile turned around the bottle's axis, as round as the bottle is at each height."""
-        exponent, depth = self.shape(profile[:, 1])
-        return lathe(profile, color, count=40, exponent=exponent, depth=depth)
-
-
 def bottle(rng: np.random.Generator, index: int) -> Draft:
     """Draw and build a bottle.
 
@@ -102,143 +124,51 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     shoulder, 8 the middle of the top, 9 to 12 around the top's rim, 13 to 16 around the beginning
     of the neck.
     """
-    drawn = _draw(rng, index)
-    kind, profile = drawn.kind, _profile(drawn.kind)
-    cap, top, rim = _cap(drawn)
-    places = {8: (0.0, top + 0.1, 0.0)}
-    rings = ((0, 0.02), (4, kind.shoulder), (13, kind.neck))
-    for first, height in rings:
-        exponent, depth = map(float, drawn.shape(height))
-        places |= _ring(first, _radius_at(profile, height), height, exponent, depth)
-    places |= _ring(9, rim, top - 0.004, *_ROUND)
-    groups = tuple(tuple(range(first, first + 4)) for first in (0, 4, 9, 13))
-    is_round = kind.shape == _ROUND
-    return Draft(
-        solids=(drawn.turned(profile, drawn.glass), *cap, *_label(drawn, profile)),
-        places=places,
-        mirrored=tuple((group[i], group[(i + 1) % 4]) for group in groups for i in range(4)),
-        turned=groups if is_round else (),
-        round=is_round,
-    )
-
-
-def _draw(rng: np.random.Generator, index: int) -> _Bottle:
     kind = _KINDS[index % len(_KINDS)]
-    cap = _CAPS[int(rng.integers(len(_CAPS)))]
-    kind = replace(
+    color = _CAP_COLORS[int(rng.integers(len(_CAP_COLORS)))]
+    b = replace(
         kind,
         radius=kind.radius * rng.uniform(0.9, 1.14),
         shoulder=kind.shoulder + rng.uniform(-0.03, 0.03),
         neck=kind.neck + rng.uniform(-0.02, 0.02),
         neck_radius=kind.neck_radius * rng.uniform(0.92, 1.1),
     )
-    return _Bottle(
-        kind=kind,
-        glass=kind.glass[int(rng.integers(len(kind.glass)))],
-        cap=_CORK if kind.cap == "stopper" and rng.random() < 0.5 else cap,
-        label=_LABELS[int(rng.integers(len(_LABELS)))],
-        stripe=_STRIPES[int(rng.integers(len(_STRIPES)))],
+    glass = b.glass[int(rng.integers(len(b.glass)))]
+    color = _CORK if b.cap == "stopper" and rng.random() < 0.5 else color
+    label, stripe = (many[int(rng.integers(len(many)))] for many in (_LABELS, _STRIPES))
+
+    cap = np.array(_CAPS[b.cap]) * (b.neck_radius, 1)
+    cap[:, 1] = np.maximum(cap[:, 1], b.neck + 0.025)
+    rim, top = cap[-1].tolist()
+    mouth = b.neck + 0.06 if b.cap == "nozzle" else 0.96
+    foot = _EDGE * (1 - np.cos(np.linspace(0, np.pi / 2, 5)))
+    body = np.linspace(_EDGE, b.shoulder, 36 if b.ribs else 20 if b.waist else 7)[1:]
+    shoulder, neck = np.linspace(b.shoulder, b.neck, 15)[1:], np.linspace(b.neck, mouth, 4)[1:]
+    collar = np.array([(0, -0.018), (1.15, -0.018), (1.15, -0.006), (0, -0.006)])
+    grooved = b.cap in _GROOVED
+    solids = [
+        b.turned(np.concatenate([foot, body, shoulder, neck]), glass),
+        lathe(collar * (b.neck_radius, 1) + (0, cap[0, 1]), color if grooved else glass, count=40),
+        lathe(
+            np.concatenate([cap[:1] * (0, 1), cap, cap[-1:] * (0, 1)]), color,
+            count=80 if grooved else 40, grooves=0.05 * grooved,
+        ),
+    ]  # fmt: skip
+    low, tall = b.label[0], min(b.label[1], b.shoulder - 0.04) - b.label[0]
+    paper = replace(b, ribs=0)  # it spans the grooves of the glass
+    for start, end, grow, tint in (
+        (0, 1, 1.012, label), (0.62, 0.86, 1.02, stripe), (0.1, 0.15, 1.02, stripe)
+    ):  # fmt: skip
+        solids.append(paper.turned(low + tall * np.linspace(start, end, 7), tint, grow=grow))
+
+    places: dict[int, Point] = {8: (0.0, top + 0.1, 0.0)}
+    places |= b.ring(0, 0.02) | b.ring(4, b.shoulder) | b.ring(13, b.neck)
+    places |= b.ring(9, top - 0.004, rim)
+    groups = tuple(tuple(range(first, first + 4)) for first in (0, 4, 9, 13))
+    return Draft(
+        solids=tuple(solids),
+        places=places,
+        mirrored=tuple((group[i], group[(i + 1) % 4]) for group in groups for i in range(4)),
+        turned=groups if b.round else (),
+        round=b.round,
     )
-
-
-def _profile(kind: _Kind) -> FloatArray:
-    """Radius and height of the glass, from the middle of the bottom to the mouth."""
-    r, edge = kind.radius, 0.022
-    corner = np.linspace(0, np.pi / 2, 5)
-    foot = np.stack([r - edge + edge * np.sin(corner), edge - edge * np.cos(corner)], axis=1)
-    rings = 36 if kind.ribs else 20 if kind.waist else 7
-    body_y = np.linspace(edge, kind.shoulder, rings)[1:]
-    share = (body_y - edge) / (kind.shoulder - edge)
-    body_r = r * (1 - kind.waist * np.sin(np.pi * share) ** 4)
-    if kind.ribs:
-        body_r = body_r * (1 - 0.035 * (0.5 - 0.5 * np.cos(2 * np.pi * kind.ribs * share)))
-        body_r[-1] = r
-    t = np.linspace(0, 1, 15)[1:]
-    # A smooth step from body to neck; the power moves it down (slender) or up (full).
-    blend = 0.5 - 0.5 * np.cos(np.pi * t ** (1 / kind.curve))
-    shoulder_r = r + (kind.neck_radius - r) * blend
-    shoulder = np.stack([shoulder_r, kind.shoulder + (kind.neck - kind.shoulder) * t], axis=1)
-    mouth = kind.neck + 0.06 if kind.cap == "nozzle" else 0.96
-    neck_y = np.linspace(kind.neck, mouth, 4)[1:]
-    neck = np.stack([np.full(3, 0.96 * kind.neck_radius), neck_y], axis=1)
-    body = np.stack([body_r, body_y], axis=1)
-    bottom, closed = [[0.0, 0.012], [0.7 * r, 0.006]], [[0.0, mouth]]
-    return np.concatenate([bottom, foot, body, shoulder, neck, closed])
-
-
-def _radius_at(profile: FloatArray, height: float) -> float:
-    outside = profile[2:-1]
-    return float(np.interp(height, outside[:, 1], outside[:, 0]))
-
-
-def _cap(bottle: _Bottle) -> tuple[list[Solid], float, float]:
-    """The closure of a bottle, the height of its top, and its radius there."""
-    kind, r, neck = bottle.kind.cap, bottle.kind.neck_radius, bottle.kind.neck
-    lip: _Profile = []
-    if kind == "foil":
-        low, top, rim = neck + 0.4 * (0.96 - neck), 0.97, 1.05
-        profile = [(0, low), (1, low), (1.03, low + 0.004), (1.03, 0.93), (1.13, 0.934),
-                   (1.13, 0.962), (rim, top), (0, top)]  # fmt: skip
-    elif kind == "crown":
-        top, rim = 0.972, 1.02
-        profile = [(0, 0.942), (1.28, 0.942), (1.2, 0.958), (rim, top), (0, 0.974)]
-        lip = [(0, 0.925), (1.08, 0.925), (1.08, 0.943), (0, 0.943)]
-    elif kind == "stopper":
-        top, rim = 1.042, 1.0
-        knob = smooth_curve([(0.8, 0.965), (1.25, 0.985), (1.3, 1.02), (1.0, 1.04)], 12)
-        profile = [(0, 0.93), (0.8, 0.93), *map(tuple, knob.tolist()), (0, top)]
-        lip = [(0, 0.93), (1.15, 0.93), (1.15, 0.962), (0, 0.962)]
-    elif kind == "nozzle":
-        top, rim, low = 1.005, 0.22, neck + 0.02
-        profile = [(0, low), (1.1, low), (1.1, neck + 0.09), (0.75, neck + 0.11), (0.28, 1.0),
-                   (rim, top), (0, top)]  # fmt: skip
-    else:
-        low, grow = (0.85, 1.12) if kind == "lid" else (0.905, 1.16)
-        solids = _screw_cap(r * grow, max(low, neck + 0.015), 0.985, bottle.cap)
-        return solids, 0.985, 0.95 * r * grow
-    parts = ((profile, bottle.cap), (lip, bottle.glass))
-    return [lathe(np.array(p) * (r, 1), color, count=40) for p, color in parts if p], top, rim * r
-
-
-def _screw_cap(radius: float, low: float, high: float, color: Color) -> list[Solid]:
-    """A cap with grooves around it, and the ring it breaks from."""
-    count = 80
-    profile = [(0, low), (radius, low), (radius, high - 0.008), (0.95 * radius, high), (0, high)]
-    cap = lathe(profile, color, count=count)
-    x, _, z = cap.vertices.T
-    turn = np.round(np.arctan2(x, z) / (2 * np.pi) * count)
-    grooved = (np.hypot(x, z) > 0.97 * radius) & (turn % 2 == 1)
-    shrink = np.where(grooved[:, None], (0.95, 1, 0.95), 1.0)
-    band = [(0, low - 0.018), (radius, low - 0.018), (radius, low - 0.006), (0, low - 0.006)]
-    return [cap.with_vertices(cap.vertices * shrink), lathe(band, color, count=40)]
-
-
-def _label(bottle: _Bottle, profile: FloatArray) -> list[Solid]:
-    """A band of paper around the body, with two stripes."""
-    low, high = bottle.kind.label
-    tall = min(high, bottle.kind.shoulder - 0.04) - low
-    bands = (
-        (0, 1, 1.012, bottle.label),
-        (0.62, 0.86, 1.02, bottle.stripe),
-        (0.1, 0.15, 1.02, bottle.stripe),
-    )
-    solids = []
-    for start, end, grow, color in bands:
-        heights = np.linspace(low + start * tall, low + end * tall, 7)
-        radii = [
-            bottle.kind.radius if bottle.kind.ribs else _radius_at(profile, y) for y in heights
-        ]
-        outline = np.stack([grow * np.array(radii), heights], axis=1)
-        closed = np.concatenate([outline[:1] * (0.9, 1), outline, outline[-1:] * (0.9, 1)])
-        solids.append(bottle.turned(closed, color))
-    return solids
-
-
-def _ring(
-    first: int, radius: float, height: float, exponent: float, depth: float
-) -> dict[int, Point]:
-    """Four places around the axis at one height, by semantic id."""
-    x, z = np.sin(_AZIMUTHS), np.cos(_AZIMUTHS)
-    reach = radius / (np.abs(x) ** exponent + np.abs(z) ** exponent) ** (1 / exponent)
-    xz = np.stack([reach * x, reach * z * depth], axis=1).tolist()
-    return {first + i: (x, height, z) for i, (x, z) in enumerate(xz)}

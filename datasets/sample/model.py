@@ -117,43 +117,24 @@ def split_creases(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, In
 
 def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKeypoint, ...]:
     """Keypoints at the surface's nearest points to places (3,)."""
-    triangles = mesh.triangles
-    centroid = triangles.mean(axis=1)
-    radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
     keypoints = []
     for semantic_id, place in sorted(places.items()):
-        distance = np.linalg.norm(centroid - place, axis=1)
-        near = np.flatnonzero(distance - radius <= distance.min())
-        weights = closest_barycentric(triangles[near], place)
-        points = np.einsum("mc,mcd->md", weights, triangles[near])
-        best = int(np.argmin(np.linalg.norm(points - place, axis=1)))
-        face = int(near[best])
-        xyz = weights[best] @ triangles[face]
+        face, weights = closest_barycentric(mesh.triangles, place)
+        xyz = weights @ mesh.triangles[face]
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
-        keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights[best], vertex))
+        keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights, vertex))
     return tuple(keypoints)
 
 
-def closest_barycentric(triangles: FloatArray, point: FloatArray) -> FloatArray:
-    """Barycentric coordinates (m, 3) of the point nearest to ``point`` (3,) in each triangle.
-
-    That is the foot of the perpendicular where it lies inside, otherwise the nearest of the points
-    nearest on the three edges.
-    """
-    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    normal, offset = np.cross(first, second), point - triangles[:, 0]
-    squared = np.einsum("md,md->m", normal, normal)
-    v = np.einsum("md,md->m", np.cross(offset, second), normal) / squared
-    w = np.einsum("md,md->m", np.cross(first, offset), normal) / squared
-    candidates = [np.stack([1 - v - w, v, w], axis=1)]
-    for start, end in ((0, 1), (1, 2), (2, 0)):
-        along = triangles[:, end] - triangles[:, start]
-        reach = np.einsum("md,md->m", point - triangles[:, start], along)
-        share = np.clip(reach / np.einsum("md,md->m", along, along), 0.0, 1.0)
-        weights = np.zeros((len(triangles), 3))
-        weights[:, start], weights[:, end] = 1 - share, share
-        candidates.append(weights)
-    choices = np.stack(candidates)
-    distance = np.linalg.norm(np.einsum("kmc,mcd->kmd", choices, triangles) - point, axis=2)
-    distance[0][(choices[0] < 0).any(axis=1)] = np.inf
-    return np.asarray(choices[np.argmin(distance, axis=0), np.arange(len(triangles))])
+def closest_barycentric(triangles: FloatArray, point: FloatArray) -> tuple[int, FloatArray]:
+    """The triangle nearest to ``point`` (3,), and its nearest point's barycentric coordinates."""
+    functions: Any = trimesh.triangles
+    centroid = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
+    distance = np.linalg.norm(centroid - point, axis=1)
+    near = np.flatnonzero(distance - radius <= distance.min())
+    closest = functions.closest_point(triangles[near], np.broadcast_to(point, (len(near), 3)))
+    best = int(np.argmin(np.linalg.norm(closest - point, axis=1)))
+    face = int(near[best])
+    weights = functions.points_to_barycentric(triangles[[face]], closest[[best]])[0].clip(0)
+    return face, weights / weights.sum()

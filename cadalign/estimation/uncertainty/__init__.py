@@ -1,1 +1,1 @@
-"""What is uncertain in an estimate, what contradicts it, and which evidence to add."""
+"""Uncertainty of an estimate, contradictions, and which evidence to add."""

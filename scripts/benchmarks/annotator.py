@@ -1,0 +1,372 @@
+"""The annotator's page in a real Chromium, and pictures of it with ten models."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from playwright.sync_api import Browser, Page
+from support.annotating import Case, make_case, place, place_of_pixel, place_twenty, served
+from support.chromium import chromium
+from support.killing import kill_at_random
+from support.panels import (
+    AXE,
+    MODEL,
+    PHOTO,
+    SETTLED,
+    WATCH_SHIFTS,
+    Keyboard,
+    open_page,
+    prepare,
+    shifts,
+)
+from support.web import axe_script
+
+from benchmarks.section import BenchmarkData, RatioTable, Row, clocked
+from cadalign import Camera, Mesh
+from cadalign.annotate.actions import perform
+from cadalign.annotate.masks import encode_runs
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.session import Session
+from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
+from cadalign.export import AlignedObject, ExportView, export_object
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.mesh import Material
+from cadalign.io.images import read_photo, write_image
+from cadalign.render import RaycastRenderer, Scene, cast_geometry, contact_sheet, visible_keypoints
+from cadalign.render.views.viewpoints import frame_object, look_at
+
+SCREENS = {"desktop": (1600, 1000), "laptop": (1366, 768), "phone": (390, 844)}
+SCHEMES = ("light", "dark")
+SERIOUS = ("serious", "critical")
+CAMERA = Camera(1024, 768, 1100.0, 1100.0, 511.5, 383.5)
+PICTURED_PAIRS = 8
+
+# From the event of the mouse to the task after the frame in which its answer is painted.
+WATCH_PAINT = """
+window.painted = [];
+window.pressed = null;
+addEventListener("pointerup", (event) => { window.pressed = event.timeStamp; }, { capture: true });
+window.watchPaint = () => {
+    const show = annotator.show.bind(annotator);
+    annotator.show = (state) => {
+        show(state);
+        const { pressed } = window;
+        window.pressed = null;
+        if (pressed === null) return;
+        requestAnimationFrame(() => {
+            const after = new MessageChannel();
+            after.port1.onmessage = () => window.painted.push(performance.now() - pressed);
+            after.port2.postMessage(0);
+        });
+    };
+};
+"""
+THUMBNAILS = """[...document.querySelectorAll(".thumbs img")].filter((image) => {
+    const { top, bottom } = image.getBoundingClientRect();
+    return bottom > 0 && top < innerHeight;
+}).every((image) => image.complete && image.naturalWidth > 0)"""
+
+
+_LIST = """async () => {
+    const begin = performance.now();
+    await annotator.worklist.open(annotator.state.image.number);
+    await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+    return performance.now() - begin;
+}"""
+
+
+@dataclass
+class Annotator:
+    """The annotator's page in a real Chromium; it needs the tests' packages and Chromium.
+
+    - times: from the mouse event to the painted frame, with 20 pairs, without and with a mask;
+    - list: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
+    - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds;
+    - kills: annotators killed at random moments, and what the next ones had lost;
+    - pictures: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
+      light and dark, on desktop, laptop and phone, as contact sheets.
+    """
+
+    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "pictures")
+    """What to measure."""
+    clicks: int = 30
+    """Clicks that are timed."""
+    photos: int = 200
+    """Photos in the folder."""
+    kills: int = 100
+    """Annotators to kill."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure the parts."""
+        measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
+            "times": self._times,
+            "list": self._list,
+            "panels": _panels,
+            "kills": self._kills,
+            "pictures": _pictures,
+        }
+        with tempfile.TemporaryDirectory() as folder, chromium() as browser:
+            os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
+            for part in self.parts:
+                before = os.getloadavg()[0]
+                rows = list(measures[part](given, browser, _new(Path(folder) / part)))
+                after = os.getloadavg()[0]
+                yield RatioTable(f"annotator, {part} (load {before:.1f}, then {after:.1f})", rows)
+
+    def _times(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+        """Clicks that complete the twentieth pair, without and with a mask."""
+        case = _case(given, folder)
+        for kind in ("pairs", "mask"):
+            own = case.copied_to(folder / kind)
+            session = own.open()
+            place_twenty(session, own)
+            if kind == "mask":
+                pose = own.instance.cam_from_model
+                mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
+                perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+            last = session.photos[0].document.pairs[-1]
+            perform(session, 0, {"do": "delete", "pair": last.number})
+            with served(session) as access:
+                page = _page(browser, access.url, WATCH_PAINT)
+                page.evaluate("window.watchPaint()")
+                milliseconds = _timed_clicks(page, session, last.uv, self.clicks)
+                page.context.close()
+            median, late = np.percentile(milliseconds, [50, 95]).tolist()
+            yield {"with": kind, "clicks": self.clicks, "median ms": median, "p95 ms": late}
+
+    def _list(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+        """The list of a folder of photos, and going from one to the next."""
+        case = _case(given, folder)
+        large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
+        case.photo.unlink()
+        for number in range(self.photos):
+            large.save(case.folder / f"photo_{number}.jpg", quality=90)
+        opened, _, session = clocked(
+            lambda: case.open(image=case.folder, camera=None, prepared=False)
+        )
+        session.warm_up()
+        for number in range(0, self.photos, 5):
+            for keypoint, (u, v) in case.clicks[:5]:
+                scale = 2000 / case.instance.camera.width
+                place(session, keypoint, [u * scale, v * scale], image=number)
+        listed, pictured, switched = [], [], []
+        with served(session) as access:
+            page = _page(browser, access.url)
+            wait = Keyboard(page).wait
+            for _ in range(5):
+                listed.append(page.evaluate(_LIST))
+                start = time.perf_counter()
+                wait(THUMBNAILS)
+                pictured.append(1000 * (time.perf_counter() - start))
+                page.keyboard.press("Escape")
+                wait("!annotator.worklist.dialog.isConnected")
+            page.locator(PHOTO).focus()
+            for number in range(1, 21):
+                start = time.perf_counter()
+                page.keyboard.press("PageDown")
+                wait(
+                    f"{SETTLED} && annotator.state.image.number === {number}"
+                    " && annotator.photo.wanted === annotator.photo.picture"
+                )
+                switched.append(1000 * (time.perf_counter() - start))
+            page.context.close()
+        yield {
+            "photos": self.photos,
+            "opened s": opened,
+            "list ms": float(np.median(listed)),
+            "first thumbnails ms": pictured[0],
+            "switch ms": float(np.median(switched)),
+            "switch p95 ms": float(np.percentile(switched, 95)),
+        }
+
+    def _kills(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+        """Annotators killed at random moments."""
+        rounds = []
+        for each in kill_at_random(_case(given, folder), rounds=self.kills, seed=given.seed):
+            rounds.append(each)
+            if each.lost:
+                print("lost", each.action, each.differences, flush=True)
+        yield {
+            "kills": len(rounds),
+            "during an action": sum(each.was_busy for each in rounds),
+            "answered actions": sum(each.answered for each in rounds),
+            "lost": sum(each.lost for each in rounds),
+        }
+
+
+def _case(given: BenchmarkData, folder: Path) -> Case:
+    """A photo of a chair: ShapeNet's if it is here, else the sample's."""
+    root = given.keypointnet
+    if root is None:
+        root = write_sample_dataset(folder / "sample", per_category=1)
+        return make_case(root, _new(folder / "case"))
+    return make_case(root, _new(folder / "case"), model_id="88382b877be91b2a572f8e1c1caad99e")
+
+
+def _new(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _page(
+    browser: Browser, url: str, *scripts: str, screen: str = "laptop", scheme: str = "light"
+) -> Page:
+    width, height = SCREENS[screen]
+    return open_page(browser, url, width=width, height=height, scheme=scheme, scripts=scripts)
+
+
+def _timed_clicks(
+    page: Page, session: Session, uv: tuple[float, float] | None, count: int
+) -> list[float]:
+    """Times of clicks on the model that complete a pair, each then undone [ms]."""
+    box = page.locator(MODEL).bounding_box()
+    assert box is not None
+    photo = place_of_pixel(page, uv or (0, 0))
+    times = []
+    wait = Keyboard(page).wait
+    full = len(session.photos[0].document.pairs) + 1
+    for click in range(count + 3):
+        page.evaluate("window.painted = []; annotator.select(null)")
+        page.mouse.click(*photo)
+        wait(f"{SETTLED} && annotator.state.pairs.length === {full} && window.painted.length === 1")
+        page.wait_for_timeout(350)  # a person's hand; meanwhile the next keypoint is ranked
+        place_on_model = page.evaluate(
+            "annotator.model.toPage(annotator.state.keypoints.find((each) => !each.used).xyz)"
+        )
+        page.mouse.click(place_on_model["x"], place_on_model["y"])
+        wait(
+            f"{SETTLED} && window.painted.length === 2"
+            f" && annotator.state.pairs.filter((each) => each.residual).length === {full}"
+        )
+        if click >= 3:  # the first ones warm up
+            times.append(page.evaluate("window.painted[1]"))
+        page.evaluate("annotator.undo(), annotator.undo()")
+        wait(f"{SETTLED} && annotator.state.pairs.length === {full - 1}")
+    return times
+
+
+def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """Layout shifts and what axe-core finds, over a session through every panel."""
+    root = write_sample_dataset(folder / "sample", per_category=3)
+    original = make_case(root, _new(folder / "case"))
+    axe = axe_script(folder)
+    for screen in SCREENS:
+        for scheme in SCHEMES:
+            shift, panels, serious = 0.0, 0, set[str]()
+            for with_axe in (False, True):
+                own = original.copied_to(folder / f"{screen} {scheme} {with_axe}")
+                with served(prepare(own, root)) as access:
+                    page = _page(browser, access.url, WATCH_SHIFTS, screen=screen, scheme=scheme)
+                    keyboard = Keyboard(page)
+                    if with_axe:
+                        page.evaluate(axe)
+                        keyboard.seen = lambda name, p=page, s=serious: s.update(_serious(p))
+                    keyboard.session()
+                    if not with_axe:
+                        shift = sum(each["value"] for each in shifts(page, also_after_input=False))
+                    panels = len(keyboard.visited)
+                    page.context.close()
+            yield {
+                "screen": f"{screen} {scheme}",
+                "cumulative layout shift": shift,
+                "panels": panels,
+                "axe serious": ", ".join(sorted(serious)),
+            }
+
+
+def _serious(page: Page) -> set[str]:
+    return {each["id"] for each in page.evaluate(AXE) if each["impact"] in SERIOUS}
+
+
+# Pictures -----------------------------------------------------------------------------------------
+
+
+def _pictures(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """Contact sheets of ten models on every screen, light and dark."""
+    sessions = {
+        name: _pictured_session(mesh, _new(folder / name))
+        for name, mesh in _pictured_models(given.keypointnet)
+    }
+    sheets = given.out / "annotator"
+    sheets.mkdir(parents=True, exist_ok=True)
+    for screen, (width, height) in SCREENS.items():
+        share = min(1.0, 900 / width)
+        size = int(width * share), int(height * share)
+        for scheme in SCHEMES:
+            shots = []
+            for name, session in sessions.items():
+                path = folder / f"{screen} {scheme} {name}.png"
+                with served(session) as access:
+                    page = _page(browser, access.url, screen=screen, scheme=scheme)
+                    page.evaluate("annotator.photo.setOverlay({ mode: 'edges' })")
+                    page.wait_for_timeout(300)
+                    page.screenshot(path=path)
+                    page.context.close()
+                shots.append(np.asarray(Image.fromarray(read_photo(path)).resize(size)))
+            columns = 5 if width < 600 else 2
+            sheet = sheets / f"{screen}_{scheme}.png"
+            write_image(sheet, contact_sheet(shots, list(sessions), columns=columns))
+            yield {"picture": str(sheet), "models": len(shots)}
+
+
+def _pictured_models(root: Path | None) -> Iterator[tuple[str, Mesh]]:
+    """Ten models that are hard to see: ShapeNet's where they are here."""
+    with tempfile.TemporaryDirectory() as folder:
+        sample = KeypointNet(write_sample_dataset(Path(folder), per_category=1))
+        own = {model.category: load_mesh(model.mesh_path) for model in sample if model.mesh_path}
+    real: dict[str, Mesh] = {}
+    if root is not None:
+        for path in sorted(root.glob("models/*/*/models/model_normalized.obj")):
+            real[path.parts[-3][:6]] = load_mesh(path)
+    chair, bottle = own["chair"], own["bottle"]
+    yield "white, doubled faces", real.get("341c9b", _painted(chair, 1.0))
+    yield "black", _painted(real.get("1eaf8d", chair), 0.0)
+    yield "doubled faces, cup", real.get("1ea9ea", chair)
+    thin = real.get("341e24", chair)
+    yield "thin", replace(thin, vertices=thin.vertices * [1.0, 1.0, 0.01])
+    yield "transparent", real.get("437678", _painted(bottle, 0.9, opacity=0.3))
+    yield "glass", _painted(bottle, 0.9, opacity=0.25)
+    yield "textured", real.get("88382b", chair)
+    yield "many faces", real.get("4e2769", own["vessel"])
+    huge, tiny = real.get("b08727", own["car"]), real.get("1cf98e", bottle)
+    yield "huge", replace(huge, vertices=huge.vertices * 1e5)
+    yield "tiny", replace(tiny, vertices=tiny.vertices * 1e-5)
+
+
+def _painted(mesh: Mesh, grey: float, *, opacity: float = 1.0) -> Mesh:
+    """The mesh in one grey."""
+    material = Material("grey", (grey, grey, grey, opacity))
+    return Mesh(mesh.vertices, mesh.faces, polygon=mesh.polygon, materials=(material,))
+
+
+def _pictured_session(mesh: Mesh, folder: Path) -> Session:
+    """A session on a drawing of the mesh, with pairs at visible corners."""
+    scene = Scene(mesh)
+    turned = look_at(azimuth=215, elevation=25, distance=1.0)
+    pose = frame_object(scene.bounds, CAMERA, rotation=turned.rotation, fill=0.8)
+    frame = RaycastRenderer().render(scene, CAMERA, pose)
+    write_image(folder / "photo.png", frame.composite((196, 200, 190)))
+    at_rest = Alignment(np.eye(3), np.zeros(3), pose.scale)  # the mesh is written as it is
+    aligned = AlignedObject((ExportView(CAMERA, at_rest),), mesh=mesh)
+    export_object(folder / "model.obj", aligned, format="obj")
+    session = open_session(
+        SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
+    )
+    perform(session, 0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
+    model = session.model
+    seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
+    shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]
+    rng = np.random.default_rng(0)
+    for point in shown[:PICTURED_PAIRS]:
+        ((u, v),) = CAMERA.project(pose.apply([point.xyz])) + rng.normal(size=(1, 2))
+        place(session, session.registry.add(point), [float(u), float(v)])
+    session.warm_up()
+    return session

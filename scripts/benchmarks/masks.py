@@ -1,0 +1,229 @@
+"""Masks beside keypoints: exact ones, damaged ones, masks of other objects."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.section import LIMIT_DRAWS, BenchmarkData, RatioTable, Row, clocked
+from cadalign import Camera, Model, View, align
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign.errors import CadalignError, RenderError
+from cadalign.estimation.contours.fit import contour_bound
+from cadalign.evaluation.accuracy.masks import DAMAGES, damaged_mask
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.metrics import alignment_box_iou, rotation_error
+from cadalign.render import Scene, cast_geometry, sample_view
+
+_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+_NOISE_PX = 1.0
+_STRETCH = 2.0
+_LEAST_KEYPOINTS = 4
+_ERRORS = ("R", "stretch", "IoU")
+
+
+@dataclass
+class Masks:
+    """Medians with masks and without, and of the bound of Cramer and Rao for both together.
+
+    Views of models with meshes, stretched by 0.5 to 2, their visible keypoints with noise of 1 px,
+    and masks of 640 x 480 pixels. The bound has the noise and correlation that the contour has at
+    the true alignment. The sample dataset, and KeypointNet's models beside ShapeNet's meshes.
+    """
+
+    views: int = 2
+    """Views of every model."""
+    kinds: tuple[str, ...] = (*DAMAGES, "border")
+    """Kinds of masks."""
+    neighbours: int = 40
+    """Masks of neighbouring objects."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure all kinds of masks, and those of neighbours."""
+        with tempfile.TemporaryDirectory() as folder:
+            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
+            models = [model for model in sample if model.mesh_path is not None]
+            if given.keypointnet is not None:
+                models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
+            cases = list(_draw_cases(models, self.views, given.seed))
+        rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
+        yield RatioTable(f"masks, {len(cases)} views: medians", rows)
+        if self.neighbours:
+            yield RatioTable("masks of neighbouring objects", [self._neighbours(cases, given.seed)])
+
+    def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
+        """Medians over all views for one kind of mask."""
+        alone, joint, bounds, times, sigmas, left_out, bottles = [], [], [], [], [], 0, []
+        for number, each in enumerate(cases):
+            rng = np.random.default_rng([seed, 1, number])
+            case = _cut_by_border(each, rng) if kind == "border" else each
+            mask = case.mask if kind == "border" else damaged_mask(case.mask, kind, rng)
+            view = case.view(mask)
+            try:
+                without = align(case.model, case.view(None))
+                wall, _, result = clocked(partial(align, case.model, view))
+            except CadalignError as error:
+                print(kind, case.annotated.model_id, error)
+                continue
+            times.append(wall)
+            alone.append(case.errors(without.alignment))
+            joint.append(case.errors(result.alignment))
+            bottles.append(case.annotated.category.endswith("bottle"))
+            (residuals,) = result.mask_residuals
+            assert residuals is not None
+            left_out += not residuals.is_used
+            sigmas.append(residuals.sigma)
+            bounds.append(case.ideal(contour_bound(case.model, view, case.truth), rng))
+        compared = (
+            np.median(alone, axis=0),
+            np.median(joint, axis=0),
+            np.median(np.concatenate(bounds, axis=1), axis=1),
+        )
+        row: Row = {"mask": kind}
+        for suffix, medians in zip(("keypoints", "mask", "bound"), compared, strict=True):
+            names = (f"{name} {suffix}" for name in _ERRORS)
+            row |= dict(zip(names, medians.tolist(), strict=True))
+        of_bottles = np.array(joint)[bottles, 2]
+        return row | {
+            "R ratio": row["R mask"] / row["R keypoints"],
+            "IoU bottles": float(np.median(of_bottles)) if len(of_bottles) else None,
+            "sigma": float(np.nanmedian(sigmas)),
+            "left out": left_out,
+            "seconds": float(np.median(times)),
+        }
+
+    def _neighbours(self, cases: list[_Case], seed: int) -> Row:
+        """Rate at which a neighbouring object's mask is named, and its effect on the estimate."""
+        named, ratios = [], []
+        for number in range(self.neighbours):
+            rng = np.random.default_rng([seed, 2, number])
+            case, other = cases[number % len(cases)], cases[int(rng.integers(len(cases)))]
+            mask = _beside(other.mask, case.mask, rng)
+            if mask is None:
+                continue
+            alone = case.errors(align(case.model, case.view(None)).alignment)
+            result = align(case.model, case.view(mask))
+            named.append(any("views[0].mask" in text for text in result.warnings))
+            ratios.append(case.errors(result.alignment)[0] / alone[0])
+        return {
+            "named": float(np.mean(named)),
+            "R ratio": float(np.median(ratios)),
+            "largest R ratio": float(np.max(ratios)),
+            "count": len(named),
+        }
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A view of a model: true alignment, and keypoints with noise."""
+
+    annotated: AnnotatedModel
+    scene: Scene
+    camera: Camera
+    truth: Alignment
+    ids: list[int]
+    points_2d: np.ndarray
+    mask: np.ndarray
+
+    @property
+    def model(self) -> Model:
+        """The model that is aligned."""
+        return Model(points_3d=self.annotated.keypoints.xyz, mesh=self.scene.mesh)
+
+    def view(self, mask: np.ndarray | None) -> View:
+        """The keypoints, with or without a mask."""
+        return View(self.camera, self.points_2d, ids=self.ids, sigma=_NOISE_PX, mask=mask)
+
+    def errors(self, est: Alignment) -> list[float]:
+        """Rotation [deg], larger stretch error [%], box IoU."""
+        gt = self.truth
+        iou = alignment_box_iou(est=est, gt=gt, bounds=self.scene.bounds)
+        stretch = 100 * float(np.abs(est.scale / gt.scale - 1)[1:].max())
+        return [rotation_error(est=est, gt=gt), stretch, iou]
+
+    def ideal(self, bound: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """`errors` of an ideal estimator, (3, draws)."""
+        drawn = rng.multivariate_normal(np.zeros(9), bound, size=LIMIT_DRAWS, method="eigh")
+        found = []
+        for turn, shift, logs in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6:], strict=True):
+            rotation = rotation_from_vector(turn) @ self.truth.rotation
+            scale = self.truth.scale * np.exp(logs)
+            found.append(self.errors(Alignment(rotation, self.truth.translation + shift, scale)))
+        return np.array(found).T
+
+
+def _has_obj(model: AnnotatedModel) -> bool:
+    return model.mesh_path is not None and model.mesh_path.suffix == ".obj"
+
+
+def _draw_cases(models: list[AnnotatedModel], views: int, seed: int) -> Iterator[_Case]:
+    """Random views of all models."""
+    for number, model in enumerate(models):
+        scene = Scene(model.load_mesh())
+        rng = np.random.default_rng([seed, number])
+        for _ in range(views):
+            scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
+            for least in (7, _LEAST_KEYPOINTS):
+                try:
+                    view = sample_view(
+                        scene,
+                        model.keypoints.xyz,
+                        _CAMERA,
+                        rng=rng,
+                        min_visible=least,
+                        scale=scale,
+                        fill=(0.6, 0.9),
+                        roll=10.0,
+                    )
+                except RenderError:
+                    continue
+                yield _case_of(model, scene, _CAMERA, view.cam_from_model, view.visible, rng)
+                break
+
+
+def _case_of(
+    model: AnnotatedModel,
+    scene: Scene,
+    camera: Camera,
+    truth: Alignment,
+    visible: np.ndarray,
+    rng: np.random.Generator,
+) -> _Case:
+    """A view with noisy keypoints and the exact mask."""
+    ids = np.flatnonzero(visible).tolist()
+    pixels = camera.project(truth.apply(model.keypoints.xyz[ids]))
+    noisy = pixels + rng.normal(0, _NOISE_PX, pixels.shape)
+    mask = cast_geometry(scene, camera, truth).mask
+    return _Case(model, scene, camera, truth, ids, noisy, mask)
+
+
+def _cut_by_border(case: _Case, rng: np.random.Generator) -> _Case:
+    """The view with a quarter of the object outside the image; enough keypoints stay inside."""
+    columns = np.cumsum(case.mask.sum(axis=0)) / case.mask.sum()
+    shift = float(np.searchsorted(columns, 0.25))
+    camera = replace(case.camera, cx=case.camera.cx - shift)
+    inside = camera.contains(case.points_2d - [shift, 0.0])
+    if inside.sum() < _LEAST_KEYPOINTS:
+        inside[:] = True
+    visible = np.zeros(len(case.annotated.keypoints.xyz), dtype=bool)
+    visible[np.array(case.ids)[inside]] = True
+    return _case_of(case.annotated, case.scene, camera, case.truth, visible, rng)
+
+
+def _beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Another object's mask moved beside the own one; None where too little of it is seen."""
+    angle = rng.uniform(0, 2 * np.pi)
+    rows, columns = np.nonzero(own)
+    width, height = np.ptp(columns), np.ptp(rows)
+    step = rng.uniform(0.5, 1.0) * np.array([np.cos(angle) * width, np.sin(angle) * height])
+    moved = cv2.warpAffine(
+        other.astype(np.uint8), np.array([[1, 0, step[0]], [0, 1, step[1]]]), own.shape[::-1]
+    )
+    return moved > 0 if moved.sum() > 0.2 * other.sum() else None

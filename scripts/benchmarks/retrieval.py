@@ -1,0 +1,248 @@
+"""Retrieval: time and memory of queries, and objects that are not in the library."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.section import (
+    BenchmarkData,
+    RatioTable,
+    Row,
+    clocked,
+    figure,
+    reference_seconds,
+)
+from cadalign import Box, Library, ShapeModel
+from cadalign.datasets import KeypointNet
+from cadalign.errors import CadalignError, DegenerateError
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
+from cadalign.evaluation.unseen.options import UnseenOptions
+from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTasks, observe_object
+from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.retrieval import LibraryModel, Match
+from cadalign.retrieval.models import ModelKey
+from cadalign.retrieval.shape import SAME_SHAPE, shape_distance
+
+_KEYPOINTS = 8
+_CALLS = 3
+_LEAST_SHARED = 4
+
+
+@dataclass
+class Retrieval:
+    """Time of a query and memory, for real models and growing synthetic libraries.
+
+    The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
+    of all categories are compared. Times are the least of three calls with as many threads as there
+    are cores, after warm-up. Ratios are those of processor time to `reference_seconds`.
+    """
+
+    queries: int = 20
+    """Timed queries per size of the library and noise."""
+    sizes: tuple[int, ...] = (50_000,)
+    """Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
+    200000."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure all libraries."""
+        real = list(Library.from_dataset(KeypointNet(given.needed("keypointnet"))))
+        mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
+        for size in (len(real), *self.sizes):
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, "library")
+                _jittered(mixed, size).save(path)
+                yield self._measure(path, mixed[:size])
+
+    def _measure(self, path: Path, models: Sequence[LibraryModel]) -> RatioTable:
+        """Opening, and queries of three levels of noise."""
+        reference = reference_seconds()
+        wall, busy, library = clocked(partial(Library.open, path))
+        size = f"{len(library):,}"
+        rows = [figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
+        shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
+        warm_up = next(_observed(shown, 1.0, seed=1), None)
+        if warm_up is None:
+            raise SystemExit("no model shows enough keypoints")
+        _retrieve(library, warm_up[1], 1.0)
+        for noise_px in (1.0, 3.0, 5.0):
+            rows += self._queries(library, shown, noise_px)
+        return RatioTable(f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows)
+
+    def _queries(
+        self, library: Library, models: Sequence[LibraryModel], noise_px: float
+    ) -> list[Row]:
+        """Median and longest time of queries for some of the models."""
+        wall, busy, found = [], [], 0
+        reference = reference_seconds()
+        for model, seen in islice(_observed(models, noise_px, seed=0), self.queries):
+            call = partial(_retrieve, library, seen, noise_px)
+            walls, busies, matches = zip(*(clocked(call) for _ in range(_CALLS)), strict=True)
+            wall.append(1e3 * min(walls))
+            busy.append(1e3 * min(busies))
+            reference = min(reference, reference_seconds())
+            first = matches[0][0]
+            found += (first.category, first.model_id) == model.key
+        name = f"query among {len(library):,}, {noise_px:g} px"
+        own = {"found first": f"{found} of {len(wall)}"}
+        return [
+            figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference)) | own
+            for which, take in (("median", np.median), ("longest", max))
+        ]
+
+
+def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
+    """A library of so many models, the given ones first, then variations of them."""
+    rng = np.random.default_rng(0)
+    filled = list(models[:count])
+    while len(filled) < count:
+        model = models[len(filled) % len(models)]
+        extent = np.linalg.norm(np.ptp(model.xyz, axis=0))
+        xyz = model.xyz + 0.03 / np.sqrt(3) * extent * rng.standard_normal(model.xyz.shape)
+        name = f"{model.model_id}-{len(filled)}"
+        filled.append(replace(model, model_id=name, xyz=xyz, mesh_path=None))
+    return Library.from_models(filled)
+
+
+def _observed(
+    models: Sequence[LibraryModel], noise_px: float, *, seed: int
+) -> Iterator[tuple[LibraryModel, RetrievalQuery]]:
+    """The models that show enough keypoints, each with an observation of it."""
+    for model in models:
+        try:
+            seen = observe_model(model, RetrievalTask(*model.key, noise_px, _KEYPOINTS), seed=seed)
+        except DegenerateError:
+            continue
+        yield model, seen
+
+
+def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
+    return library.retrieve(seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA, sigma=noise_px)
+
+
+@dataclass
+class UnseenRetrieval:
+    """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
+
+    Objects are those of the split val; shape models are learned from the split train. The library
+    holds all models but the object's own and those that are the same after a stretch. Each row is a
+    ranking: by the fit of each model, exact or with an uncertainty of its shape, and by the
+    estimated shape; models are stretched, or not. Boxes are those of the keypoints.
+    """
+
+    categories: tuple[str, ...] = ("chair", "airplane", "bottle", "mug", "guitar")
+    """Categories; each is a library of its own."""
+    objects: int = 40
+    """Objects of each category."""
+    keypoints: tuple[int, ...] = (0, 7)
+    """Numbers of given keypoints; 0 for all."""
+    noise_px: float = 2.0
+    """Standard deviation of the keypoints, in pixels."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure all categories and numbers of keypoints."""
+        dataset = KeypointNet(given.needed("keypointnet"))
+        for category in self.categories:
+            shape = ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
+            for count in self.keypoints:
+                rows = list(self._rankings(dataset, category, count, shape))
+                yield RatioTable(f"{category}, {count or 'all'} keypoints", rows)
+
+    def _rankings(
+        self, dataset: KeypointNet, category: str, count: int, shape: ShapeModel
+    ) -> Iterator[Row]:
+        """IoU and milliseconds of the queries, by ranking."""
+        models = dataset.subset(categories=[category])[category]
+        library = Library.from_models(
+            [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+        )
+        ious: dict[str, list[float]] = {name: [] for name in _ranking_options(shape)}
+        times: dict[str, list[float]] = {name: [] for name in ious}
+        for model_id, seen in self._sightings(dataset, category, count):
+            known = np.isin(seen.semantic_ids, shape.ids)
+            gt = Box.from_model(seen.bounds, seen.gt)
+            if known.sum() < _LEAST_SHARED or gt.volume < 1e-9:
+                continue
+            call = partial(
+                library.retrieve,
+                seen.points_2d[known],
+                seen.semantic_ids[known],
+                KEYPOINT_CAMERA,
+                top=1,
+                category=category,
+                sigma=self.noise_px,
+                exclude=_alike(library, (category, model_id)),
+                workers=1,
+            )
+            for name, options in _ranking_options(shape).items():
+                wall, _, iou = clocked(partial(_iou, partial(call, **options), gt))
+                times[name].append(1e3 * wall)
+                ious[name].append(iou)
+        for name, values in ious.items():
+            yield {
+                "ranking": name,
+                "objects": len(values),
+                "median IoU": float(np.median(values)),
+                "mean IoU": float(np.mean(values)),
+                "ms": float(np.median(times[name])),
+            }
+
+    def _sightings(
+        self, dataset: KeypointNet, category: str, count: int
+    ) -> Iterator[tuple[str, UnseenSighting]]:
+        """Ids and views of a category's objects."""
+        options = UnseenOptions(
+            root=dataset.root,
+            categories=(category,),
+            keypoints=count or None,
+            noise_px=self.noise_px,
+        )
+        tasks = UnseenTasks(dataset, options)
+        for place in range(0, len(tasks), -(-len(tasks) // self.objects)):
+            task = tasks[place]
+            try:
+                yield task.model_id, observe_object(task, options)
+            except CadalignError as error:
+                print(f"left out: {task.model_id}: {error}")
+
+
+def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
+    """Options of `Library.retrieve` for each ranking."""
+    found: dict[str, dict[str, Any]] = {}
+    for suffix, stretch in (("", {}), (", unstretched", {"stretch": "none"})):
+        found[f"fit{suffix}"] = stretch
+        found[f"fit, shape_sigma{suffix}"] = {"shape_sigma": 0.02, **stretch}
+        found[f"shape{suffix}"] = {"shape": shape, **stretch}
+    return found
+
+
+def _alike(library: Library, key: ModelKey) -> list[ModelKey]:
+    """A model and those that are the same after a stretch."""
+    own = library[key]
+    return [
+        key,
+        *(
+            model.key
+            for model in library
+            if np.array_equal(np.sort(model.semantic_ids), np.sort(own.semantic_ids))
+            and shape_distance(model, own) <= SAME_SHAPE
+        ),
+    ]
+
+
+def _iou(call: Callable[[], list[Match]], gt: Box) -> float:
+    """IoU of the first match of a query; 0 where there is none, or a flat one."""
+    try:
+        first = call()[0]
+        flat = first.box.volume < 1e-9
+        return 0.0 if flat else box_iou_up_to_scale(est=first.box, gt=gt)
+    except CadalignError:
+        return 0.0

@@ -1,0 +1,239 @@
+"""Times of first calls, of small calls, and of pictures."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from common import COMMAND
+
+import cadalign
+from benchmarks.section import (
+    BenchmarkData,
+    RatioTable,
+    Row,
+    figure,
+    medians_in_turns,
+    seconds,
+    seconds_of_process,
+)
+from cadalign import Alignment, Camera
+from cadalign.datasets import sample_models
+from cadalign.errors import RenderError
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+from cadalign.render import (
+    RaycastRenderer,
+    Renderer,
+    Scene,
+    Studio,
+    cast_geometry,
+    frame_object,
+    look_at,
+    make_renderer,
+    visible_keypoints,
+)
+from cadalign.render.probe import ball
+from cadalign.solvers.linear import aepnp_batch
+
+_POINTS = """
+import numpy as np
+from cadalign import Camera, RansacOptions, fit
+camera = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+points = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 3))
+pixels = camera.project(points + [0.0, 0.0, 2.0])
+"""
+_FIRST_CALLS = {
+    "first fit": _POINTS + "fit(points, pixels, camera)",
+    "first robust fit, after it": _POINTS
+    + "fit(points, pixels, camera, ransac=RansacOptions(), sigma=1.0)",
+    "doctor --compile, two processes": (
+        "from cadalign.cli import main; main(['doctor', '--compile'])"
+    ),
+}
+_SMALL_FUNCTION = """
+import numba, numpy as np
+@numba.njit
+def total(a):
+    found = np.zeros(a.shape[0])
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            found[i] += a[i, j] ** 2
+    return np.sqrt(found).sum()
+total(np.ones((3, 3)))
+"""
+# The largest allowed medians [ms], on two cores.
+_LIMITS = {
+    "raycast: geometry": 40.0,
+    "raycast: colour": 150.0,
+    "pyrender: colour": 100.0,
+    "visibility of 20 keypoints": 1.0,
+}
+
+
+@dataclass
+class Cold:
+    """Time of the first calls after installation, when nothing is compiled yet.
+
+    Each call runs in a new process with an empty folder of compiled code. The ratio is that to a
+    first call of a function of ten lines compiled by Numba, measured right before.
+    """
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure the first calls."""
+        with tempfile.TemporaryDirectory() as folder:
+            _, reference = self._called(_SMALL_FUNCTION, folder, "small")
+            rows = []
+            for name, code in _FIRST_CALLS.items():
+                place = "all" if "doctor" in name else "fit"
+                wall, processor = self._called(code, folder, place)
+                rows.append(figure(name, wall, "s", processor / reference, "a first small call"))
+        yield RatioTable("First calls", rows)
+
+    def _called(self, code: str, folder: str, place: str) -> tuple[float, float]:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
+        return seconds_of_process([sys.executable, "-c", code], environment=environment)
+
+
+@dataclass
+class Calls:
+    """Cost of calls beside their solving: the warm command line, and small fits in Python."""
+
+    runs: int = 7
+    """Runs of each command."""
+    calls: int = 2000
+    """Calls of each fit."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure commands and fits."""
+        with tempfile.TemporaryDirectory() as folder:
+            yield RatioTable("Commands, processor time", list(self._commands(Path(folder))))
+        yield RatioTable("Fits", list(self._fits()))
+
+    def _commands(self, folder: Path) -> Iterator[Row]:
+        seen = str(_observation(folder))
+        libraries = "import numpy, numba"
+        for name, given in {
+            "cadalign --help": ["--help"],
+            "cadalign fit": ["fit", seen],
+            "cadalign fit --json --no-picture": ["fit", seen, "--json", "--no-picture"],
+            "cadalign demo": ["demo", "--out", str(folder / "demo"), "--workers", "0"],
+        }.items():
+            command = [*COMMAND, *given]
+            seconds_of_process(command)  # compiles what is not yet on disk
+            medians = medians_in_turns(
+                {
+                    "own": lambda command=command: seconds_of_process(command)[1],
+                    "other": lambda: seconds_of_process([sys.executable, "-c", libraries])[1],
+                },
+                1 if name == "cadalign demo" else self.runs,
+            )
+            yield figure(name, medians["own"], "s", medians["own"] / medians["other"], libraries)
+
+    def _fits(self) -> Iterator[Row]:
+        ten, seven = (
+            simulate_problem(np.random.default_rng(0), points=points, noise_px=1.0)
+            for points in (10, 7)
+        )
+        x, uv, camera = ten.points_3d, ten.points_2d, ten.camera
+        rays, offsets = camera.normalize(uv), np.array([0, 10])
+        for name, ours, theirs, to in (
+            (
+                "fit(method='aepnp'), 10 points",
+                lambda: cadalign.fit(x, uv, camera, method="aepnp"),
+                lambda: aepnp_batch(x, rays, offsets),
+                "its kernel",
+            ),
+            (
+                "fit, 7 points",
+                lambda: cadalign.fit(seven.points_3d, seven.points_2d, seven.camera),
+                lambda: cv2.solvePnP(x, uv, camera.matrix, None),
+                "OpenCV's ITERATIVE, 10 points",
+            ),
+        ):
+            both = {"own": partial(seconds, ours), "other": partial(seconds, theirs)}
+            medians = medians_in_turns(both, self.calls)
+            ratio = medians["own"] / medians["other"]
+            yield figure(name, 1e6 * medians["own"], "us", ratio, to)
+
+
+def _observation(folder: Path) -> Path:
+    """An observation that names a photo and an OBJ model."""
+    (model,) = sample_models(categories=["chair"], per_category=1)
+    problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+    camera = problem.camera
+    photo, path = folder / "photo.jpg", folder / "chair.obj"
+    write_image(photo, np.full((camera.height, camera.width, 3), 180, dtype=np.uint8))
+    lines = [f"v {x} {y} {z}" for x, y, z in model.mesh.vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in (model.mesh.faces + 1).tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    seen = Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=path)
+    seen.save(folder / "seen.json")
+    return folder / "seen.json"
+
+
+@dataclass
+class Rendering:
+    """Milliseconds a frame of the renderers, and of what is done once per mesh.
+
+    640 x 480 px on 20,480 triangles. Medians, and the smallest beside them, since other programs
+    may share the machine.
+    """
+
+    repetitions: int = 15
+    """Timed frames per figure; the median counts."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure every renderer that is there."""
+        camera = Camera.from_fov(640, 480, fov_x=50.0)
+        scene = Scene(ball(5))
+        rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
+        pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
+        rows = []
+        for name, task in _render_tasks(scene, camera, pose).items():
+            task()  # prepares what is prepared once
+            times = [1e3 * seconds(task) for _ in range(self.repetitions)]
+            median, limit = float(np.median(times)), _LIMITS.get(name)
+            rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
+        share = 100 * float(cast_geometry(scene, camera, pose).mask.mean())
+        yield RatioTable(
+            f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows
+        )
+
+
+def _render_tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[], object]]:
+    """Everything that is timed, by name."""
+
+    def drawing(renderer: Renderer) -> Callable[[], object]:
+        return lambda: renderer.render(scene, camera, pose)
+
+    rng = np.random.default_rng(0)
+    keypoints = scene.mesh.vertices[rng.choice(len(scene.mesh.vertices), 20)]
+    plain = RaycastRenderer(studio=Studio(occlusion=0))
+    found: dict[str, Callable[[], object]] = {
+        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
+        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
+        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
+        "raycast: geometry": lambda: cast_geometry(scene, camera, pose),
+        "raycast: colour": drawing(RaycastRenderer()),
+        "raycast: colour, no ambient occlusion": drawing(plain),
+    }
+    for name in ("open3d", "pyrender"):
+        try:
+            found[f"{name}: colour"] = drawing(make_renderer(name))
+        except RenderError as error:
+            print(error, file=sys.stderr)
+            continue
+        if name == "open3d":
+            found["open3d: geometry"] = lambda: cast_geometry(
+                scene, camera, pose, caster=scene.open3d_caster
+            )
+    return found

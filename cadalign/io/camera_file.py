@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -89,10 +90,11 @@ def _is_json(path: Path) -> bool:
 
 
 def _read_array(path: Path) -> Any:
+    file = io.BytesIO(read_bytes(path, most=_MOST_BYTES))
     try:
-        values = np.load(io.BytesIO(read_bytes(path, most=_MOST_BYTES)), allow_pickle=False)
-    # MemoryError: of a header that announces more numbers than there is room for.
-    except (ValueError, EOFError, MemoryError) as error:
+        with warnings.catch_warnings(action="ignore"):
+            values = np.lib.format.read_array(file, allow_pickle=False)
+    except Exception as error:  # NumPy has Python parse the header, which raises what it likes
         what = f"not a NumPy array that can be read ({brief(error)})"
         raise DataError(what, where=str(path)) from None
     return _square(values, path)
@@ -108,5 +110,5 @@ def _square(values: Any, path: Path) -> Any:
     """A matrix (3, 3) of nine numbers by rows, however they are nested."""
     try:
         return np.asarray(values, dtype=float).reshape(3, 3)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError("not a calibration matrix", where=str(path), fix=_FIX) from None

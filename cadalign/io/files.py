@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import errno
+import io
 import json
 import math
 import os
@@ -10,15 +10,16 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from cadalign.errors import DataError, quote
 
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
+_MAX_PATH = 1000  # of a path that is shown whole
 MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
-# Opening a pipe would wait for its other end; the flags are not known everywhere.
-_OPENING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+# Opening a pipe would wait for its other end; Windows has none of this kind.
+_NOT_WAITING = getattr(os, "O_NONBLOCK", 0)
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -77,15 +78,36 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise DataError("no such file", where=str(path)) from None
+        raise DataError("no such file", where=printable(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DataError(f"cannot be read ({reason})", where=str(path)) from None
+        raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | _NOT_WAITING)
+
+
+class InputFile(io.BufferedReader):
+    """A file that is read; ``size`` is that at its opening.
+
+    No read asks for more: Python makes room for all that is asked for, such as the length that a
+    damaged part of a picture announces, and some files of the system grow without end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path, opener=_open_at_once))
+        self.status = os.fstat(self.fileno())
+        self.size = self.status.st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read so many bytes, or all."""
+        return super().read(self.size if size is None or size < 0 else min(size, self.size))
 
 
 @contextmanager
-def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a regular file of at most ``most`` bytes; gives the open file and its size.
+def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
+    """Open a regular file of at most ``most`` bytes.
 
     Every file that somebody names is opened here: a device has no end, and a pipe may have no other
     end.
@@ -95,24 +117,20 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[tuple[BinaryIO
     DataError
         If it is missing, no regular file, larger, or cannot be read.
     """
-    with reading(path), open(os.open(path, _OPENING), "rb") as file:
-        status = os.fstat(file.fileno())
-        if stat.S_ISDIR(status.st_mode):
-            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if not stat.S_ISREG(status.st_mode):
+    with reading(path), InputFile(path) as file:
+        if not stat.S_ISREG(file.status.st_mode):
             fix = "give a file, no pipe and no device"
             raise DataError("not a regular file", where=printable(path), fix=fix)
-        if status.st_size > most:
-            what = f"{status.st_size} bytes, more than the {most} that are read of such a file"
+        if file.size > most:
+            what = f"{file.size} bytes, more than the {most} that are read of such a file"
             raise DataError(what, where=printable(path))
-        yield file, status.st_size
+        yield file
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     """Read a regular file of at most ``most`` bytes; see `open_input`."""
-    with open_input(path, most=most) as (file, size):
-        # No more than it had when it was opened: some files of the system grow without end.
-        return file.read(size)
+    with open_input(path, most=most) as file:
+        return file.read()
 
 
 def read_text(path: Path, *, most: int = MOST_BYTES, errors: str = "strict") -> str:
@@ -138,9 +156,9 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def printable(path: Path | str) -> str:
-    """A path for a message, quoted where it holds what a terminal does not show."""
+    """A path for a message, quoted where a terminal does not show it, shortened where endless."""
     text = str(path)
-    return text if text.isprintable() else quote(text)
+    return text if text.isprintable() and len(text) <= _MAX_PATH else quote(text)
 
 
 def refuse_nul(path: Path) -> None:

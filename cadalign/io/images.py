@@ -36,7 +36,7 @@ _FREE_BYTES = 2**26
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are read when they are asked for, errors then named as well."""
     path = Path(path)
-    with open_input(path) as (file, size), open_picture(file, size, where=str(path)) as image:
+    with open_input(path) as file, open_picture(file, file.size, where=str(path)) as image:
         yield image
 
 
@@ -83,7 +83,10 @@ def _check_pixels(image: Image, file_size: int) -> None:
 
 
 def read_photo(path: str | os.PathLike[str]) -> ByteImage:
-    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held."""
+    """Read a photo as RGB (h, w, 3) uint8, turned upright where EXIF says how it was held.
+
+    It is of one of the `FORMATS`, whatever its name ends in.
+    """
     from PIL import ImageOps
 
     with open_photo(path) as image:

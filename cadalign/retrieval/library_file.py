@@ -20,6 +20,7 @@ from cadalign.io.sealed import Seal, checksum
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
 _AGAIN = "build it with: cadalign library build"
+_LARGEST = 1e50  # coordinate
 SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
 
 
@@ -74,8 +75,8 @@ def _check_table(table: pa.Table) -> None:
         raise ValueError("a labeling names a keypoint that does not exist")
     for numbers in (pc.list_flatten(pc.list_flatten(table["keypoints"])), table["bounds"]):
         values = numbers if pa.types.is_floating(numbers.type) else pc.list_flatten(numbers)
-        if not np.isfinite(values.to_numpy()).all():
-            raise ValueError("a coordinate is NaN or infinite")
+        if not (np.abs(values.to_numpy()) < _LARGEST).all():
+            raise ValueError("a coordinate is NaN, infinite or so large that its powers are")
     keys = list(zip(table["category"].to_pylist(), table["model_id"].to_pylist(), strict=True))
     if keys != sorted(set(keys)):
         raise ValueError("models are not sorted by category and id")

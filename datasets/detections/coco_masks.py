@@ -8,6 +8,7 @@ difference of every length from the last but one in groups of five bits.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -124,4 +125,5 @@ def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolA
     runs = mask.merge(
         mask.frPyObjects([list(map(float, each)) for each in polygons], height, width)
     )
-    return np.asarray(mask.decode(runs) != 0)
+    with warnings.catch_warnings(action="ignore"):  # its of NumPy's newer conventions
+        return np.asarray(mask.decode(runs) != 0)

@@ -292,7 +292,10 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
         k = matrix[:, :3]
         with in_file(f"{path}: P2"):
             camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
+        try:
+            return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
+        except np.linalg.LinAlgError:
+            raise damaged("P2 is not the matrix of a camera", path) from None
     raise damaged("there is no line P2", path)
 
 

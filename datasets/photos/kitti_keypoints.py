@@ -82,6 +82,7 @@ _MOST_TILT = 10.0  # of a written model's up from the camera's [degrees]
 _MEAN, _MODES = "meanShape_2.txt", "vectors2.txt"
 _LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of the logs of width, length, height of cars in KITTI
 _MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
+_LONGEST = 1e6  # of a coordinate
 _REST = 0.03  # what the modes leave of a keypoint's place [m]
 _Matrix = tuple[Point3, Point3, Point3]
 _Dims = tuple[Positive, Positive, Positive]
@@ -373,7 +374,11 @@ def car_shape(folder: Path) -> ShapeModel | None:
         return None
     car = _mean_car(paths[0], read_table(paths[0]))
     points = np.array(car.model_xyz, dtype=float).reshape(-1, 3)
+    _check_lengths(points, paths[0])
     mean = _numbers(paths[1], len(points) * 3).reshape(-1, 3)
+    if len(mean) != len(points):
+        what = f"{len(mean)} points, but {paths[0].name} has {len(points)}"
+        raise DataError(what, where=str(paths[1]))
     modes = _numbers(paths[2], len(points) * 3).reshape(-1, len(points), 3)
     box = car_bounds(points)
     metres, *_ = np.linalg.lstsq(mean - mean.mean(axis=0), points - points.mean(axis=0), rcond=None)
@@ -413,6 +418,12 @@ def _numbers(path: Path, multiple: int) -> FloatArray:
     if not len(values) or len(values) % multiple:
         what = f"{len(values)} numbers are not a multiple of {multiple}"
         raise DataError(what, where=str(path))
-    if not np.isfinite(values).all():
-        raise DataError("some of its numbers are not finite", where=str(path))
+    _check_lengths(values, path)
     return values
+
+
+def _check_lengths(values: FloatArray, path: Path) -> None:
+    """Refuse numbers that are no lengths of cars: not finite, or so large that squares are not."""
+    if not (np.abs(values) < _LONGEST).all():
+        what = f"some of its numbers are not finite, or beyond {_LONGEST:.0e}"
+        raise DataError(what, where=str(path))

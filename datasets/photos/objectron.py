@@ -95,7 +95,7 @@ class VideoFrame:
         import cv2  # on first use: it takes longer to import than all the rest
 
         # Going by the content, OpenCV would play lists of other files and addresses, too.
-        with open_input(self.path, most=_MOST_BYTES) as (file, _):
+        with open_input(self.path, most=_MOST_BYTES) as file:
             if file.read(8)[4:] not in _CONTAINERS:
                 raise DataError("not a video in QuickTime's or MP4's form", where=str(self.path))
         video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
@@ -201,7 +201,7 @@ def has_annotations(folder: Path) -> bool:
 
 
 def _is_sequence(path: Path) -> bool:
-    with suppress(DataError), open_input(path) as (file, _):
+    with suppress(DataError), open_input(path) as file:
         begin = file.read(_BEGINNING)
         return b"frame_annotations" in begin or b"frameAnnotations" in begin
     return False

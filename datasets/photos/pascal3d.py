@@ -24,6 +24,7 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    existing,
     first_existing,
 )
 from cadalign.errors import DataError, InputError
@@ -141,7 +142,7 @@ def cad_folder(root: Path) -> Path | None:
 
 def cad_model(folder: Path | None, category: str, index: int) -> CadModel | None:
     """The CAD model of a number from 1; None where the category has no file."""
-    if folder is None or not (folder / f"{category}.mat").is_file():
+    if folder is None or not existing(folder / f"{category}.mat"):
         return None
     return CadModel(
         f"{category}/{index:02d}", PascalCad(folder / f"{category}.mat", category, index)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
@@ -302,13 +303,18 @@ class DepthImage:
         Raises
         ------
         DataError
-            If the file cannot be read.
+            If the file cannot be read, or depths are not finite.
         """
         with open_photo(self.path) as image:
             values = np.asarray(image)
         if values.ndim != 2:
             raise DataError(f"{values.ndim} dimensions are not a depth image", where=str(self.path))
-        return np.asarray(values, dtype=np.float64) * self.scale
+        with np.errstate(over="ignore"):
+            depth = np.asarray(values, dtype=np.float64) * self.scale
+        if not np.isfinite(depth).all():
+            what = f"some depths are not finite, at a scale of {self.scale:g}"
+            raise DataError(what, where=str(self.path))
+        return depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,10 +369,10 @@ class Photo:
 
 
 def existing(path: Path) -> Path | None:
-    """The path if there is such a file, else None."""
-    return path if path.is_file() else None
+    """The path if there is such a file, else None; also of a name that no file can have."""
+    return path if os.path.isfile(path) else None
 
 
 def first_existing(paths: Iterable[Path]) -> Path | None:
     """The first of the paths that is a file; None where none is."""
-    return next((path for path in paths if path.is_file()), None)
+    return next((path for path in paths if existing(path)), None)

@@ -90,10 +90,10 @@ class _Model:
     keypoints_path: Path | None
 
     def load_mesh(self) -> Mesh | None:
-        return load_mesh(self.mesh_path) if self.mesh_path.is_file() else None
+        return load_mesh(self.mesh_path) if existing(self.mesh_path) else None
 
     def load_keypoints(self) -> NamedPoints | None:
-        if self.keypoints_path is None or not self.keypoints_path.is_file():
+        if self.keypoints_path is None or not existing(self.keypoints_path):
             return None
         xyz = read_matrix(self.keypoints_path, (None, 3))
         return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)

@@ -34,6 +34,7 @@ from cadalign.datasets.photos.photo import (
     PhotoKeypoints,
     PhotoObject,
     Truth,
+    existing,
     first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
@@ -293,7 +294,7 @@ def _inverse(alignment: Alignment) -> Alignment:
 
 def _annotation_file(path: Path) -> tuple[Path, Path]:
     """The folder and the annotation file that a path means."""
-    if path.is_file():
+    if existing(path):
         return path.parent, path
     found = first_existing(path / name for name in (FULL, *_SAMPLES))
     if found is not None:

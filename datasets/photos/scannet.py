@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.photo import first_existing
+from cadalign.datasets.photos.photo import existing, first_existing
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -90,7 +90,7 @@ def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
 def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
     prefix = f"scannet_{scene.removeprefix('scene')}_"
     intrinsics = folder / f"{prefix}intr.txt"
-    if not intrinsics.is_file():
+    if not existing(intrinsics):
         return
     for pose in folder.glob(f"{prefix}*_pose.txt"):
         stem = pose.name.removesuffix("_pose.txt")

@@ -319,5 +319,5 @@ class CorrespondenceFormat:
 
 def begins_with(file: Path, header: bytes) -> bool:
     """True if a file begins with these bytes."""
-    with open_input(file, most=sys.maxsize) as (stream, _):
+    with open_input(file, most=sys.maxsize) as stream:
         return stream.read(len(header)) == header

@@ -427,7 +427,7 @@ def test_pipes_in_the_place_of_photo_and_model(
     os.mkfifo(tmp_path / "model.obj")
     path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
     assert refusal_line(capsys, "fit", path) == (
-        f"{tmp_path / 'photo.png'}: not an image that can be read (not a regular file)"
+        f"{tmp_path / 'photo.png'}: not a regular file; give a file, no pipe and no device"
     )
     path = write_observation(tmp_path / "chair.json", model=tmp_path / "model.obj")
     assert refusal_line(capsys, "fit", path).startswith(f"{tmp_path / 'model.obj'}: ")

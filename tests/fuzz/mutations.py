@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz.readers import Format
+from fuzz.format import Format
 
 from cadalign import CadalignError
 

@@ -9,12 +9,13 @@ import pickle
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from fuzz import dataset_formats
+from fuzz.format import Format
 from PIL import Image
 
 import cadalign
@@ -34,28 +35,6 @@ from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
 from cadalign.report import headline_text
 from cadalign.retrieval import LibraryModel
-
-
-@dataclass(frozen=True)
-class Format:
-    """One file format.
-
-    Parameters
-    ----------
-    name : str
-    write : callable
-        Writes a valid file, and what goes with it, into a folder; returns the file to mutate.
-    read : callable
-        Reads that file.
-    seal : callable
-        Makes the checksum of mutated data right again, where the format has one.
-    """
-
-    name: str
-    write: Callable[[Path], Path]
-    read: Callable[[Path], object]
-    seal: Callable[[bytes], bytes] = bytes
-
 
 # --- formats ------------------------------------------------------------------------------------
 
@@ -417,6 +396,7 @@ FORMATS = {
             Format(f"run {name}", _write_run(f"{name}"), lambda path: _read_run(path.parent))
             for name in ("run.json", "results.parquet", "timings.parquet")
         ),
+        *dataset_formats.FORMATS,
         Format("open3d", _write_views(write_open3d, "v.json"), read_camera_views),
         Format("nerf", _write_views(write_nerf, "transforms.json"), read_camera_views),
     )

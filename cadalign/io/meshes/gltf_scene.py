@@ -15,15 +15,13 @@ from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import damaged
-from cadalign.io.meshes.gltf import (
+from cadalign.io.meshes.gltf import GltfFile, embedded, nth
+from cadalign.io.meshes.gltf_document import (
     Glossiness,
-    GltfFile,
     Node,
     Primitive,
     TextureTransform,
     TextureUse,
-    embedded,
-    nth,
 )
 from cadalign.io.meshes.join import join
 from cadalign.io.meshes.mtl import WHITE

@@ -1,0 +1,288 @@
+"""Files of data sets, shapes, cameras and estimates to fuzz, beside those of `fuzz.readers`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz.format import Format
+from PIL import Image
+from scipy.io import savemat
+from support.gltf_files import write_gltf
+from support.photo_data import matrix_text, message, read_whole, write_photo, write_text
+from support.photo_sets import WRITERS
+
+from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
+from cadalign.datasets import load_mesh
+from cadalign.datasets.detections.coco_masks import decode_segmentation
+from cadalign.datasets.photos.bop_files import RESULT_COLUMNS, read_bop_results, read_scene_gt
+from cadalign.datasets.photos.kitti_keypoints import car_shape
+from cadalign.io.camera_file import read_camera
+from cadalign.io.documents import read_json
+from cadalign.io.images import read_grey, read_photo
+from cadalign.shapes.shape_file import SEAL
+
+_CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+_POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))
+_POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 3.0]), [1.0, 1.2, 0.8])
+_PIXELS = _CAMERA.project(_POSE.apply(_POINTS))
+
+# Of each data set of photos the files that a mutation may stand in.
+_CHANGED = {
+    "Pix3D": ("pix3d.json", "model/m.obj", "model/k.txt", "mask/0.png"),
+    "BOP": (
+        "models/models_info.json",
+        "models/obj_000001.ply",
+        "test/000001/depth/000000.png",
+        "test/000001/mask_visib/000000_000000.png",
+        "test/000001/scene_camera.json",
+        "test/000001/scene_gt.json",
+    ),
+    "Scan2CAD": (
+        "full_annotations.json",
+        "scans/scene0000_00/intrinsic/intrinsic_color.txt",
+        "scans/scene0000_00/pose/0.txt",
+    ),
+    "KITTI": ("cars.json",),
+    "PASCAL3D+": ("Annotations/chair_pascal/1.mat", "CAD/chair.mat"),
+    "Objectron": ("annotations/cup/batch-1/3.json",),
+}
+
+
+def _photo_set(kind: str, changed: str) -> Format:
+    """A file of a data set; whatever is in it, the rest is read, or the folder refused."""
+
+    def write(folder: Path) -> Path:
+        root = WRITERS[kind](folder / "set")
+        return root / changed
+
+    depth = len(Path(changed).parts) - 1
+    return Format(f"{kind} {changed}", write, lambda path: read_whole(path.parents[depth]))
+
+
+# --- data sets of which no tiny whole one is written elsewhere ---------------------------------
+
+
+def _write_kitti_labels(changed: str) -> Callable[[Path], Path]:
+    car = "Car 0.00 1 -1.5 100 50 200 150 1.5 1.6 4.0 2.0 1.7 20.0 0.0"
+
+    def write(folder: Path) -> Path:
+        training = folder / "set" / "training"
+        write_text(training / "label_2" / "000007.txt", f"{car}\nDontCare -1 -1 -10\n{car} 0.9\n")
+        write_text(training / "calib" / "000007.txt", "P2: 700 0 600 70 0 700 170 7 0 0 1 0.5\n")
+        write_photo(training / "image_2" / "000007.png", 64, 48)
+        return training / changed
+
+    return write
+
+
+def _write_detections(folder: Path) -> Path:
+    """Photos of PASCAL3D+ with detected keypoints."""
+    root = folder / "set"
+    lists = {
+        "imgname": np.array(["a", "b"], dtype=object),
+        "class": np.array(["chair", "bus"], dtype=object),
+        "cad_index": np.array([1.0, 3.0]),
+    }
+    (root / "annot").mkdir(parents=True)
+    savemat(root / "annot" / "valid.mat", {"annot": lists}, do_compression=True)
+    write_photo(root / "images" / "a.jpg")
+    return root / "annot" / "valid.mat"
+
+
+def _write_protobuf(folder: Path) -> Path:
+    """A frame of Objectron's protocol buffers."""
+    keypoints = [
+        (2, message((1, number), (3, message((1, 0.5), (2, 0.4), (3, 1.0))))) for number in range(9)
+    ]
+    camera = message((5, 320), (6, 240), (8, [2.0] * 16), (9, np.eye(4).ravel().tolist()))
+    found = message(
+        (1, 1), (2, "cup"), (4, np.eye(3).ravel().tolist()), (5, [0.0, 0.0, -2.0]), (6, [1.0] * 3)
+    )
+    frame = message((1, 0), (2, message((1, 1), *keypoints, (3, 0.9))), (3, camera))
+    path = folder / "set" / "annotations" / "cup" / "batch-1" / "3.pbdata"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(message((1, found), (2, frame)))
+    return path
+
+
+def _write_car_shape(changed: str) -> Callable[[Path], Path]:
+    points = np.random.default_rng(1).uniform(-1, 1, (14, 3)) * [0.8, 2, 0.7]
+    names = [f"k{number}" for number in range(14)]
+
+    def write(folder: Path) -> Path:
+        tracks = {"names": names, "model_xyz": points.tolist()}
+        write_text(folder / "car_tracks.json", json.dumps(tracks))
+        write_text(folder / "meanShape_2.txt", matrix_text(points))
+        modes = np.random.default_rng(2).normal(size=(5, 42))
+        write_text(folder / "vectors2.txt", matrix_text(modes))
+        return folder / changed
+
+    return write
+
+
+# --- shapes, results, estimates, masks, cameras ------------------------------------------------
+
+
+def _write_shape(folder: Path) -> Path:
+    directions = np.random.default_rng(0).normal(size=(2, 8, 3))
+    ShapeModel.from_basis(_POINTS, directions, [0.1, 0.1]).save(folder / "a.shape")
+    return folder / "a.shape"
+
+
+def _seal_shape(data: bytes) -> bytes:
+    """A shape file whose header tells the length and the checksum of what it holds."""
+    payload = data[64:]
+    checksum = hashlib.blake2b(payload, digest_size=32).digest()
+    header = struct.pack("<16sIIQ32s", SEAL.magic, SEAL.version, 0, len(payload), checksum)
+    return header + payload
+
+
+def _write_result(folder: Path) -> Path:
+    """The result of two views of a model of known size."""
+    views = [
+        View(_CAMERA, _PIXELS, sigma=1.0),
+        View(_CAMERA, _PIXELS + 0.5, sigma=1.0),
+    ]
+    result = align(Model(points_3d=_POINTS), views, size=Size(width=1.0, sigma=0.1))
+    return write_text(folder / "fit.json", result.to_json())
+
+
+def _write_bop_results(folder: Path) -> Path:
+    row = "1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 1000,0.1\n"
+    return write_text(folder / "results.csv", ",".join(RESULT_COLUMNS) + "\n" + row + row)
+
+
+def _write_scene_gt(folder: Path) -> Path:
+    pose = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 900], "obj_id": 1}
+    return write_text(folder / "scene_gt.json", json.dumps({"0": [pose], "1": [pose, pose]}))
+
+
+_POLYGONS = [[1.0, 0.0, 30.0, 0.0, 30.0, 20.0, 1.0, 20.0], [40, 30, 50.5, 30, 45, 45]]
+_RUNS = {"size": [48, 64], "counts": [2, 40, 3000, 30]}
+_TEXT = {"size": [2, 4], "counts": "242"}
+
+
+def _mask(name: str, segmentation: Any, width: int, height: int) -> Format:
+    return Format(
+        f"coco mask of {name}",
+        lambda folder: write_text(folder / "mask.json", json.dumps(segmentation)),
+        lambda path: decode_segmentation(read_json(path), width=width, height=height),
+    )
+
+
+def _write_matrix(ending: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        path = folder / f"K.{ending}"
+        if ending == "npy":
+            np.save(path, _CAMERA.matrix)
+            return path
+        by_rows = {"matrix": _CAMERA.matrix.tolist(), "width": 64, "height": 48}
+        return write_text(
+            path, json.dumps(by_rows) if ending == "json" else "60 0 31\n0 60 23\n0 0 1\n"
+        )
+
+    return write
+
+
+def _read_camera(path: Path) -> object:
+    return read_camera(path, size=(64, 48))
+
+
+# --- pictures and scenes -----------------------------------------------------------------------
+
+
+def _write_picture(ending: str) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        pixels = np.random.default_rng(1).integers(0, 255, (20, 30, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"photo.{ending}")
+        return folder / f"photo.{ending}"
+
+    return write
+
+
+def _write_depth(folder: Path) -> Path:
+    depth = np.arange(600, dtype=np.uint16).reshape(20, 30)
+    Image.fromarray(depth).save(folder / "depth.png")
+    return folder / "depth.png"
+
+
+def _write_scene(folder: Path) -> Path:
+    """A scene with a texture, a strip, sparse positions and copies of a mesh."""
+    more = np.array([2], "<u2").tobytes() + b"\0\0" + np.array([[5, 6, 7]], "<f4").tobytes()
+    more += np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4").tobytes()
+    _write_picture("png")(folder)
+    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
+    primitive = {"attributes": attributes, "indices": 1, "material": 0, "mode": 5}
+    return write_gltf(
+        folder / "scene.gltf",
+        more=more,
+        nodes=[{"mesh": 0, "children": [1, 2]}, {"mesh": 0, "scale": [1, 1, -1]}, {"mesh": 0}],
+        meshes=[{"primitives": [primitive]}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": {
+            "KHR_texture_transform": {"offset": [0.5, 0], "rotation": 0.1, "scale": [2, 2]}}}}}],
+        textures=[{"source": 0}],
+        images=[{"uri": "photo.png"}],
+        bufferViews=[
+            {"buffer": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+            {"buffer": 0, "byteOffset": 60, "byteLength": 2},
+            {"buffer": 0, "byteOffset": 64, "byteLength": 12},
+            {"buffer": 0, "byteOffset": 76, "byteLength": 32, "byteStride": 8},
+        ],
+        accessors=[
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "sparse": {
+                "count": 1, "indices": {"bufferView": 2, "componentType": 5123},
+                "values": {"bufferView": 3}}},
+            {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+            {"bufferView": 4, "componentType": 5126, "count": 4, "type": "VEC2"},
+        ],
+    )  # fmt: skip
+
+
+FORMATS = (
+    *(_photo_set(kind, changed) for kind, names in _CHANGED.items() for changed in names),
+    Format(
+        "KITTI labels",
+        _write_kitti_labels("label_2/000007.txt"),
+        lambda path: read_whole(path.parents[2]),
+    ),
+    Format(
+        "KITTI calibration",
+        _write_kitti_labels("calib/000007.txt"),
+        lambda path: read_whole(path.parents[2]),
+    ),
+    *(
+        Format(f"KITTI {name}", _write_car_shape(name), lambda path: car_shape(path.parent))
+        for name in ("car_tracks.json", "meanShape_2.txt", "vectors2.txt")
+    ),
+    Format("PASCAL3D+ detections", _write_detections, lambda path: read_whole(path.parents[1])),
+    Format("Objectron pbdata", _write_protobuf, lambda path: read_whole(path.parents[3])),
+    Format("shape", _write_shape, ShapeModel.open),
+    Format("forged shape", _write_shape, ShapeModel.open, _seal_shape),
+    Format(
+        "result of views",
+        _write_result,
+        lambda path: Result.from_json(path.read_text("utf-8", "replace")),
+    ),
+    Format("BOP results", _write_bop_results, read_bop_results),
+    Format("BOP scene_gt", _write_scene_gt, read_scene_gt),
+    _mask("polygons", _POLYGONS, 64, 48),
+    _mask("runs", _RUNS, 64, 48),
+    _mask("compressed runs", _TEXT, 4, 2),
+    *(
+        Format(f"camera {ending}", _write_matrix(ending), _read_camera)
+        for ending in ("txt", "npy", "json")
+    ),
+    *(
+        Format(f"image {ending}", _write_picture(ending), read_photo)
+        for ending in ("webp", "bmp", "tiff", "gif", "tga", "ppm")
+    ),
+    Format("depth image", _write_depth, read_grey),
+    Format("scene", _write_scene, load_mesh),
+)

@@ -54,7 +54,7 @@ class CodeFiles(IndexDataCacheFile):
 
 
 def _read_whole(path: str) -> bytes | None:
-    """What a file of compiled code holds; None where there is none, or it is damaged."""
+    """Content of a file of compiled code; None where there is none, or it is damaged."""
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from cadalign.errors import DataError, brief, quote
 from cadalign.io.documents import convert, in_file, parse_json
 from cadalign.io.files import damaged, read_bytes, reading
-from cadalign.io.meshes.gltf_document import Accessor, Buffer, Document, Sparse
+from cadalign.io.meshes.gltf_document import Accessor, Buffer, GltfDocument, Sparse
 
 Array = npt.NDArray[Any]
 _T = TypeVar("_T")
@@ -51,7 +51,7 @@ class GltfFile:
 
     Attributes
     ----------
-    document : Document
+    document : GltfDocument
     size : int
         The bytes read so far, of the files that it names, too.
 
@@ -69,7 +69,7 @@ class GltfFile:
         with reading(path):
             parsed = parse_json(str(text, "utf-8-sig"), str(path))
         with in_file(path):
-            self.document: Document = convert(parsed, Document)
+            self.document: GltfDocument = convert(parsed, GltfDocument)
             _check(self.document)
         self._buffers: dict[int, memoryview] = {}
         self._files: dict[str, bytes] = {}
@@ -197,7 +197,7 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
     return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
 
 
-def _check(document: Document) -> None:
+def _check(document: GltfDocument) -> None:
     """Refuse other versions, and extensions without which the file means something else."""
     if not document.asset.version.startswith("2."):
         what = f"version {quote(document.asset.version)} of glTF; only version 2 is read"

@@ -19,12 +19,12 @@ class _Part(ForeignDocument, rename="camel", kw_only=True):
 
 
 class Asset(_Part):
-    """What the file says of itself."""
+    """Statements of the file about itself."""
 
     version: str = "2.0"
 
 
-class Scene(_Part):
+class GltfScene(_Part):
     """The roots of a scene's trees of nodes."""
 
     nodes: list[Count] = field(default_factory=list)
@@ -50,14 +50,14 @@ class Primitive(_Part):
     mode: int = 4
 
 
-class MeshPart(_Part):
+class GltfMesh(_Part):
     """The primitives of a mesh."""
 
     primitives: list[Primitive]
 
 
 class SparseIndices(_Part):
-    """Where a sparse accessor has values of its own."""
+    """Places at which a sparse accessor has values of its own."""
 
     buffer_view: Count
     component_type: int
@@ -72,7 +72,7 @@ class SparseValues(_Part):
 
 
 class Sparse(_Part):
-    """What a sparse accessor changes."""
+    """Values that a sparse accessor changes."""
 
     count: Count
     indices: SparseIndices
@@ -134,7 +134,7 @@ class Texture(_Part):
 
 
 class TextureTransform(_Part):
-    """What is done to texture coordinates: scaled, rotated [rad], moved."""
+    """Change of texture coordinates: scaled, rotated [rad], moved."""
 
     offset: Point2 = (0.0, 0.0)
     rotation: Finite = 0.0
@@ -184,14 +184,14 @@ class MaterialPart(_Part):
     extensions: MaterialExtensions = field(default_factory=MaterialExtensions)
 
 
-class Document(_Part):
+class GltfDocument(_Part):
     """The whole document."""
 
     asset: Asset = field(default_factory=Asset)
     scene: Count = 0
-    scenes: list[Scene] = field(default_factory=list)
+    scenes: list[GltfScene] = field(default_factory=list)
     nodes: list[Node] = field(default_factory=list)
-    meshes: list[MeshPart] = field(default_factory=list)
+    meshes: list[GltfMesh] = field(default_factory=list)
     accessors: list[Accessor] = field(default_factory=list)
     buffer_views: list[BufferView] = field(default_factory=list)
     buffers: list[Buffer] = field(default_factory=list)

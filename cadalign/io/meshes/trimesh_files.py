@@ -91,7 +91,7 @@ def _parsing(path: Path) -> Iterator[None]:
 
 @dataclass
 class _Header:
-    """What a PLY file's header says: numbers of elements, and the name of a texture."""
+    """Header of a PLY file: numbers of elements, and the name of a texture."""
 
     counts: dict[str, int] = field(default_factory=dict)
     texture: str = ""

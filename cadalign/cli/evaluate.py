@@ -14,7 +14,12 @@ import tyro
 from cadalign.cli.options import JsonOption, named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
-from cadalign.evaluation.options import ExperimentOptions, RunOptions
+from cadalign.evaluation.options import (
+    ExperimentOptions,
+    FunctionOptions,
+    PluginOption,
+    RunOptions,
+)
 from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
@@ -44,6 +49,10 @@ class RunCommand(JsonOption, RunOptions):
         write_run_report(run.folder)
         return code
 
+    def load_plugins(self) -> tuple[str, ...]:
+        """Names of methods that the command line brings along; see `MethodsCommand`."""
+        return ()
+
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.runs.folder import RunFolder
@@ -52,7 +61,9 @@ class RunCommand(JsonOption, RunOptions):
         kind = self.options_type
         spec = spec_named(kind.experiment)
         with named_as_flags(self):
+            names = self.load_plugins()
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
+            options = options.with_methods(names) if names else options
             count = options.default_workers if self.workers is None else self.workers
             workers = workers_of(count, self.dask, threads=options.threads)
             out = self.out or Path("runs") / options.run_name
@@ -60,6 +71,17 @@ class RunCommand(JsonOption, RunOptions):
         with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
             execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
         return spec, spec.open(out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodsCommand(PluginOption, RunCommand):
+    """Command of an experiment that runs functions of one's own as well."""
+
+    def load_plugins(self) -> tuple[str, ...]:
+        """Register the plugins' functions; returns their names."""
+        from cadalign.evaluation.methods.registry import load_plugin
+
+        return tuple(name for text in self.plugin if (name := load_plugin(text)) is not None)
 
 
 def command_of(
@@ -118,7 +140,11 @@ class EvaluateShow(JsonOption):
 def _commands() -> Any:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
     commands = {
-        options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
+        options.experiment: command_of(
+            options,
+            MethodsCommand if issubclass(options, FunctionOptions) else RunCommand,
+            about=f"{getdoc(options)}\n\n{_EXIT_CODES}",
+        )
         for options in known_options()
         if options.command == _COMMAND
     }

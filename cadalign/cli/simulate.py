@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from cadalign.cli.evaluate import command_of, one_of
+from cadalign.cli.evaluate import MethodsCommand, command_of, one_of
 from cadalign.evaluation.simulation.options import SweepOptions
 
 _ABOUT = {
@@ -21,7 +21,8 @@ _ABOUT = {
 def _commands() -> Any:
     """The command of every sweep."""
     commands = {
-        name: command_of(SweepOptions, about=about, sweep=name) for name, about in _ABOUT.items()
+        name: command_of(SweepOptions, MethodsCommand, about=about, sweep=name)
+        for name, about in _ABOUT.items()
     }
     return one_of(commands)
 

@@ -8,7 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cadalign.evaluation.methods.registry import register_method
+from cadalign.evaluation.metrics.registry import register_metric
 from cadalign.evaluation.options import ExperimentOptions, tuples
+from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -49,7 +52,9 @@ def evaluate(
         ``--noise-px 2``. Those of ``keypointnet`` are the fields of
         `cadalign.evaluation.keypointnet.options.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
-        ``shape``, ``visibility``, ``render``, ``seed``.
+        ``shape``, ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
+        ``metrics`` may be functions of one's own, and names that they were registered by; see
+        `cadalign.evaluation.register_method` and `cadalign.evaluation.register_metric`.
 
     Returns
     -------
@@ -71,6 +76,9 @@ def evaluate(
     >>> table = evaluate("colmap_model", "correspondences", draws=5)  # doctest: +SKIP
     """
     source = () if root is None else (Path(root),)
+    for name, register in (("methods", register_method), ("metrics", register_metric)):
+        if options.get(name) is not None:
+            options[name] = names_of(options[name], register, where=name)
     chosen = spec_named(experiment).options(*source, **tuples(options))
     with ExitStack() as stack:
         if out is None:

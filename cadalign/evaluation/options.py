@@ -7,9 +7,10 @@ the text below it. These modules load quickly: `cadalign --help` imports them.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from cadalign.errors import InputError
 
@@ -44,6 +45,14 @@ class ExperimentOptions:
         """Number of threads of a run without workers."""
         return 1
 
+    def as_config(self) -> dict[str, Any]:
+        """The options in a run's configuration."""
+        return asdict(self)
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods, for experiments that run functions."""
+        raise InputError(f"{self.experiment} runs no functions", where="plugin")
+
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
         for name, least in bounds.items():
@@ -59,6 +68,36 @@ class ExperimentOptions:
                 raise InputError(
                     f"unknown value {value!r}", where=name, fix=f"known are {', '.join(known)}"
                 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunctionOptions(ExperimentOptions):
+    """Options of experiments that take functions of one's own, as methods and as metrics."""
+
+    metrics: tuple[str, ...] = ()
+    """Metrics of one's own, beside the experiment's: names that a plugin registers."""
+
+    def as_config(self) -> dict[str, Any]:
+        """The options in a run's configuration, which has metrics where there are any."""
+        config = super().as_config()
+        del config["metrics"]
+        return config
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods, those of plugins.
+
+        Raises
+        ------
+        InputError
+            If the other methods are not given.
+        """
+        methods: tuple[str, ...] = getattr(self, "methods", ())
+        if not methods:
+            fix = "give --methods, too: the functions, and methods to compare them with"
+            raise InputError("the other methods are not given", where="plugin", fix=fix)
+        found = copy(self)
+        object.__setattr__(found, "methods", tuple(dict.fromkeys((*methods, *names))))
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +117,7 @@ class ModelOptions(ExperimentOptions):
 
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration: ``shapenet`` only where it is given."""
-        config = asdict(self)
+        config = super().as_config()
         shapenet = config.pop("shapenet")
         return config if shapenet is None else {**config, "shapenet": str(shapenet.absolute())}
 
@@ -106,6 +145,16 @@ class RunOptions:
     """Processes; -1 for one for each core (the default; for running times it is 1), 0 for none."""
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginOption:
+    """Methods of one's own on the command line."""
+
+    plugin: tuple[str, ...] = ()
+    """Functions to run beside the methods, module:function or name=module:function; the module may
+    be a file, such as mine.py:solve. They take points_3d, points_2d and a camera, or a model and
+    its views, and return an alignment. A module alone registers its methods itself."""
 
 
 def tuples(options: dict[str, Any]) -> dict[str, Any]:

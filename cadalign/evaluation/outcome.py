@@ -5,17 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from cadalign.errors import CadalignError, InputError, TooFewVisibleError
+from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.runs.tables import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
-from cadalign.geometry.metrics import (
-    box_iou,
-    box_iou_up_to_scale,
-    rotation_error,
-    scale_error,
-    translation_error,
-)
 
 OK = "ok"
 FAILED = "failed"
@@ -23,6 +14,10 @@ LEFT_OUT = "left out"
 """Of an instance, or a method on it, that lacks what is asked for: no failure, and no result."""
 SKIPPED = "skipped"
 """Of an instance that no view shows enough keypoints of: no method was run, and none failed."""
+
+
+class LeftOutError(CadalignError):
+    """An instance, or a method on it, lacks what is asked for; that is no failure."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +41,6 @@ class Outcome:
         """A failed task; ``values`` are the columns that are known of it all the same."""
         return cls(names, values, FAILED, reason)
 
-    @classmethod
-    def without_instance(cls, error: Exception, names: Row, **values: Any) -> Outcome:
-        """A task whose instance could not be made: skipped where too few keypoints are visible."""
-        status = SKIPPED if isinstance(error, TooFewVisibleError) else FAILED
-        return cls(names, values, status, reason_of(error))
-
     @property
     def is_ok(self) -> bool:
         """True where there are metrics."""
@@ -66,31 +55,11 @@ class Outcome:
         return {**self.names, "seconds": self.seconds}
 
 
-def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
-    """Errors of pose and stretch by column, the translation's over a length [model units]."""
-    _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
-    return {
-        "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "translation_error": translation_error(est=est, gt=gt) / length,
-        "scale_y_error": scale_y,
-        "scale_z_error": scale_z,
-    }
-
-
-def overlap(*, est: Box, gt: Box) -> float | None:
-    """Intersection over union of two boxes; None where one has no volume."""
-    try:
-        return box_iou(est=est, gt=gt)
-    except InputError:
-        return None
-
-
-def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
-    """Like `overlap`, after the estimate was scaled about the camera centre."""
-    try:
-        return box_iou_up_to_scale(est=est, gt=gt)
-    except InputError:
-        return None
+def status_of(error: Exception) -> str:
+    """The status of a row without metrics, by the reason that there are none."""
+    if isinstance(error, TooFewVisibleError):
+        return SKIPPED
+    return LEFT_OUT if isinstance(error, LeftOutError) else FAILED
 
 
 def reason_of(error: Exception) -> str:

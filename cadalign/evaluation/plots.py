@@ -1,19 +1,23 @@
-"""Lines with quartile bands: plots of a report's page, and the same as figures."""
+"""Lines with quartile bands, and cumulative curves: plots of a page, and the same as figures."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray
 from cadalign.evaluation.accuracy.style import label_log_axis, look_of, new_figure, save_figure
-from cadalign.evaluation.metrics import Metric
-from cadalign.evaluation.summary import Quartiles
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import HIGH, Metric
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.summary import Quartiles, known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -187,3 +191,41 @@ def _draw_lines(axes: Axes, plot: Plot, dash: str) -> list[tuple[Any, Any, Any, 
             axes.plot(trace.x, low, trace.x, high, alpha=0)  # make room for the band
             bands.append((trace.x, low, high, look.color))
     return bands
+
+
+_SHARE = replace(metrics.COVERED, key="share", label="objects", better=HIGH)
+
+
+def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
+    """Shares of the objects with at most an error, or at least an overlap, by method.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+    metric : Metric
+        Column of the result tables; failures count as never within.
+    places : (k,) float
+        The errors, in the column's unit.
+    title : str
+    """
+    traces = []
+    for index, run in enumerate(runs):
+        for method in run.methods:
+            chosen = run.cells["method"] == method
+            solved = chosen & (run.cells["status"] == OK)
+            errors = known(run.cells[metric.key][solved])
+            count = max(int(chosen.sum()), 1)
+            within = (
+                errors >= places[:, None] if metric.better == HIGH else errors <= places[:, None]
+            )
+            shares = within.sum(axis=1) / count
+            traces.append(Trace.of(index, method, places.tolist(), shares.tolist(), _SHARE))
+    words = "at least this overlap" if metric.better == HIGH else "at most this error"
+    return Plot(
+        id=f"within_{metric.key}",
+        x=metric,
+        y=replace(_SHARE, label=f"objects with {words}"),
+        traces=traces,
+        note="over all categories; failures count",
+        title=title,
+    )

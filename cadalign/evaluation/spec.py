@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.metrics import CATEGORY, Metric, told
+from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots
@@ -115,7 +115,7 @@ class Spec:
         if self.table is not None:
             return self.table(run, summaries)
         lines = self.lines(summaries)
-        columns = self.shown_columns(lines)
+        columns = self.shown_columns(lines, [run])
         return ConsoleTable(
             title="Medians per group and method",
             labels=(self.group(run).heading, "method"),
@@ -127,9 +127,11 @@ class Spec:
             note="",
         )
 
-    def shown_columns(self, lines: Summaries) -> list[Metric]:
-        """The columns that some line has a value of."""
-        return [c for c in self.columns if told(c, [line.number(c.key) for line in lines])]
+    def shown_columns(self, lines: Summaries, runs: Sequence[Run]) -> list[Metric]:
+        """The columns that some line has a value of, those of registered metrics last."""
+        further = {metric.key: metric for run in runs for metric in run.metrics}
+        columns = (*self.columns, *further.values())
+        return [c for c in columns if told(c, [line.number(c.key) for line in lines])]
 
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""

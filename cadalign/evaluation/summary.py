@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics import CATEGORY, INSTANCES, Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
+from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Row
 
@@ -173,19 +173,48 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
 def by_category_and_method(
     run: Run, summarize: Callable[[str, str, Cells], Summary]
 ) -> list[Summary]:
-    """A summary of each category's cells for every method, and of all where there are several."""
-    return summaries_of(run.cells, run.methods, summarize)
+    """A summary of each category's cells for every method, and of all where there are several.
+
+    Medians of registered metrics are added.
+    """
+    return summaries_of(run.cells, run.methods, summarize, further=run.metrics)
 
 
 def summaries_of(
-    cells: Cells, methods: Sequence[str], summarize: Callable[[str, str, Cells], Summary]
+    cells: Cells,
+    methods: Sequence[str],
+    summarize: Callable[[str, str, Cells], Summary],
+    *,
+    further: Sequence[Metric] = (),
 ) -> list[Summary]:
     """Summaries of cells for some methods; see `by_category_and_method`."""
     categories = sorted(set(cells["category"].tolist()))
     parts = [(name, where(cells, cells["category"] == name)) for name in categories]
     if len(parts) > 1:
         parts.append((ALL, cells))
-    return [summarize(category, method, found) for category, found in parts for method in methods]
+    return [
+        with_medians(summarize(category, method, found), found, further)
+        for category, found in parts
+        for method in methods
+    ]
+
+
+def with_medians(summary: Summary, cells: Cells, metrics: Sequence[Metric]) -> Summary:
+    """The summary with medians of the rows of its method that are no failures."""
+    if not metrics:
+        return summary
+    solved = (cells["method"] == summary.method) & (cells["status"] == OK)
+    medians = {metric.key: median_of(cells[metric.key][solved]) for metric in metrics}
+    return replace(summary, values={**summary.values, **medians})
+
+
+def counted(cells: Cells, method: str) -> tuple[dict[str, int], int, Cells]:
+    """Numbers of instances and of failures of a method, of skipped ones, and the rows without."""
+    chosen = cells["method"] == method
+    solved = where(cells, chosen & (cells["status"] == OK))
+    skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
+    count = int(chosen.sum()) - skipped
+    return {"instances": count, "failed": count - len(solved["method"])}, skipped, solved
 
 
 def text_rows(summaries: Sequence[Summary], shown: Sequence[Metric]) -> list[tuple[str, ...]]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from cadalign.evaluation.accuracy.methods import LIMIT
-from cadalign.evaluation.metrics import HIGH, Metric
+from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
@@ -82,7 +82,7 @@ def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
     spec, group = spec_of(runs[0]), spec_of(runs[0]).group(runs[0])
     lines = [_all_first(spec.lines(spec.summarize(run))) for run in runs]
-    columns = spec.shown_columns([line for found in lines for line in found])
+    columns = spec.shown_columns([line for found in lines for line in found], runs)
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
         rows += _with_best([HeadlineRow.of(index, line, columns) for line in lines[index]], columns)

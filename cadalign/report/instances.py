@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import LEFT_OUT, OK, SKIPPED
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.runs.opened import Run

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cadalign.errors import InputError
-from cadalign.evaluation.metrics import Metric
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.registry import spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -44,7 +44,9 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
 def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
     """Metrics of the instances that some run has; none for runs without instances."""
     known = {name for run in runs for name in run.results.column_names}
-    return [metric for metric in spec_of(runs[0]).metrics if metric.key in known]
+    metrics = spec_of(runs[0]).metrics
+    further = {metric.key: metric for run in runs for metric in run.metrics} if metrics else {}
+    return [metric for metric in (*metrics, *further.values()) if metric.key in known]
 
 
 def all_methods(runs: Sequence[Run]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
-from cadalign.evaluation.accuracy.methods import LIMIT
+from cadalign.evaluation.methods.fitted import LIMIT
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 

@@ -28,7 +28,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
-from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import (
     SIMULATION_CAMERA,
     Problem,

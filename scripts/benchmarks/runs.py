@@ -28,7 +28,7 @@ from benchmarks.section import (
 )
 from cadalign import Alignment, Camera, RansacOptions, metrics
 from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset
-from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 
@@ -74,7 +74,7 @@ def _on_annotations(root: Path, count: int, method: str) -> Row:
     """Rate of instances whose meshes are not looked at."""
     options = KeypointNetOptions(root, visibility="hull", methods=(method,))
     tasks = KeypointTasks(KeypointNet(root), options)
-    experiment = KeypointNetExperiment(options, None)
+    experiment = keypointnet_benchmark(options)
     experiment.warm_up()
     count = min(count, len(tasks))
 

@@ -20,7 +20,7 @@ from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.simulation.experiment import SweepExperiment
+from cadalign.evaluation.simulation.experiment import sweep_benchmark
 from cadalign.evaluation.simulation.options import SweepOptions
 
 distributed = pytest.importorskip(
@@ -149,5 +149,5 @@ def test_a_lost_scheduler_is_told_of_and_the_run_goes_on(
 def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
     workers = DaskWorkers(address, timeout=1.0)
     with pytest.raises(DataError, match="no Dask scheduler answers") as caught:
-        next(workers.evaluate(SweepExperiment(KIND.kind, seed=0), []))
+        next(workers.evaluate(sweep_benchmark(KIND.kind, seed=0), []))
     assert caught.value.where == address

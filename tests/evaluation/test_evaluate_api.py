@@ -13,7 +13,7 @@ from cadalign import Mesh
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.instances.instance import make_instance
-from cadalign.evaluation.outcome import alignment_errors
+from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.registry import known_options, spec_named
 from cadalign.render import Scene
 

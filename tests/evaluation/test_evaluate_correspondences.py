@@ -22,17 +22,17 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation import plots
-from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.experiment import (
-    CorrespondenceExperiment,
+    CorrespondenceTask,
+    CorrespondenceTasks,
+    correspondence_benchmark,
     errors_of,
     spoil,
 )
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.correspondences.spec import SPEC
-from cadalign.evaluation.correspondences.summary import summarize
-from cadalign.evaluation.correspondences.tasks import CorrespondenceTask, CorrespondenceTasks
+from cadalign.evaluation.correspondences.spec import SPEC, summarize
+from cadalign.evaluation.methods.fitted import fit_methods, fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
@@ -317,18 +317,18 @@ class TestRows:
         pose = Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99])
         est = made(pose, np.array([True, False, True, True]))
         inlier_columns = ("inliers", "inlier_precision", "inlier_recall")
-        row = errors_of(est, truth, method="ransac-optimal")
+        row = errors_of(est, truth, method=fit_methods()["ransac-optimal"])
         assert row["rotation_error_deg"] == pytest.approx(0.4)
         assert row["translation_error"] == pytest.approx(0.05)
         assert (row["scale_y_error"], row["scale_z_error"]) == pytest.approx((0.005, 0.005))
         assert row["success"]
         assert [row[name] for name in inlier_columns] == [3, 2 / 3, 2 / 3]
         every = made(pose, np.ones(4, dtype=bool))
-        row = errors_of(every, truth, method="ransac-optimal")
+        row = errors_of(every, truth, method=fit_methods()["ransac-optimal"])
         assert [row[name] for name in inlier_columns] == [4, 3 / 4, 1]
         for scale in ([1, 1.02, 2.0], [1, 1.0, 1.97]):
             off = made(Alignment(turn, [0, 0, 10], scale), np.ones(4, dtype=bool))
-            assert not errors_of(off, truth, method="epnp")["success"]
+            assert not errors_of(off, truth, method=fit_methods()["epnp"])["success"]
 
     def test_options_of_the_search_reach_it(self):
         problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))
@@ -348,7 +348,7 @@ class TestRows:
         few = seen_image("a", 1).subset(np.arange(5))
         task = CorrespondenceTask("a", 0.0, 0, few)
         options = CorrespondenceOptions(ANY, methods=("aepnp-paper", "epnp"))
-        paper, epnp = CorrespondenceExperiment(options).evaluate([task]).rows
+        paper, epnp = correspondence_benchmark(options).evaluate([task]).rows
         assert (paper["status"], epnp["status"]) == ("failed", "ok")
         assert "5" in paper["reason"]
         assert (paper["points"], paper["success"], paper.get("rotation_error_deg")) == (

@@ -17,10 +17,9 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.instances.drawing import draw_instance
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.keypointnet.experiment import COLUMNS, KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import COLUMNS, keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.spec import SPEC
-from cadalign.evaluation.keypointnet.summary import summarize_cells, texts
+from cadalign.evaluation.keypointnet.spec import SPEC, summarize_cells, texts
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
 from cadalign.evaluation.outcome import FAILED, OK, SKIPPED
 from cadalign.evaluation.runs.folder import RunFolder
@@ -121,7 +120,7 @@ def test_an_instance_does_not_depend_on_its_neighbours(sample_root: Path) -> Non
     methods = ("optimal", "aepnp-paper", "limit")
     options = KeypointNetOptions(sample_root, views_per_model=2, methods=methods)
     tasks = KeypointTasks(KeypointNet(sample_root), options)
-    experiment = KeypointNetExperiment(options, drawn_in=None)
+    experiment = keypointnet_benchmark(options, drawn_in=None)
     together = experiment.evaluate(tasks[:]).rows
     alone = [row for task in reversed(tasks[:]) for row in experiment.evaluate([task]).rows]
     assert sorted(map(str, together)) == sorted(map(str, alone))

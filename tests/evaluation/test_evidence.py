@@ -12,11 +12,17 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
-from cadalign.evaluation.evidence.experiment import BOUNDS, EvidenceExperiment
-from cadalign.evaluation.evidence.methods import bound_of, evidence_for, truth_in
+from cadalign.evaluation.evidence.experiment import BOUNDS, evidence_benchmark
 from cadalign.evaluation.evidence.options import METHODS, EvidenceRunOptions
-from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
-from cadalign.evaluation.evidence.summary import summarize
+from cadalign.evaluation.evidence.scene import (
+    EvidenceInstance,
+    ObjectScene,
+    bound_of,
+    evidence_for,
+    make_scene,
+    truth_in,
+)
+from cadalign.evaluation.evidence.spec import summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.opened import Run
 
@@ -63,7 +69,7 @@ def test_shots_without_noise_show_the_truth(car: ObjectScene) -> None:
 def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str) -> None:
     """Without noise the estimate is the truth, where its stated covariance is the bound."""
     options = EvidenceRunOptions(root, noise_px=0.0)
-    given = evidence_for(method, car, options)
+    given = evidence_for(method, EvidenceInstance(car, options))
     result = align(car.model, given.views, size=given.size)
     bound = bound_of(result, given, car)
     stated = result.covariance
@@ -77,7 +83,7 @@ def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str
 def test_every_method_gives_what_it_is_named_after(car: ObjectScene, root: Path) -> None:
     options = EvidenceRunOptions(root)
     for method in METHODS:
-        given = evidence_for(method, car, options)
+        given = evidence_for(method, EvidenceInstance(car, options))
         first = given.views[0]
         assert (first.up is not None) == ("gravity" in method or method == "all")
         assert (given.size is not None) == ("length" in method or method == "all")
@@ -125,7 +131,7 @@ def test_rows_have_errors_and_bounds(root: Path) -> None:
 
 def test_model_that_fails_gives_failed_rows(root: Path) -> None:
     options = EvidenceRunOptions(root, methods=("keypoints", "depth"))
-    experiment = EvidenceExperiment(options)
+    experiment = evidence_benchmark(options)
     (model,) = KeypointNet(root).subset(categories=["car"])
     from cadalign.evaluation.keypointnet.tasks import KeypointTask
 
@@ -142,7 +148,10 @@ def test_model_that_fails_gives_failed_rows(root: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"methods": ("masks",)}, "methods: unknown method 'masks'; known are keypoints, "),
+        (
+            {"methods": ("masks",)},
+            "methods: unknown method 'masks', did you mean 'mask'?; known are ",
+        ),
         ({"methods": ()}, "methods: none is given; "),
         ({"min_visible": 3}, "min_visible: 3 is less than 4"),
         ({"depth_sigma": 0.0}, "depth_sigma: 0.0 is not between 0 and 90"),

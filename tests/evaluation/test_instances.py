@@ -9,7 +9,6 @@ from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
 from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, check_methods, fit_options, method_names
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
@@ -18,6 +17,8 @@ from cadalign.evaluation.instances.instance import (
 )
 from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
+from cadalign.evaluation.methods.fitted import LIMIT, fit_methods, fit_options
+from cadalign.evaluation.methods.registry import checked_names
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -188,7 +189,7 @@ def test_the_limit_refuses_keypoints_in_one_plane() -> None:
         limit_estimate(points, camera.project(gt.apply(points)), camera, gt)
 
 
-@pytest.mark.parametrize("name", [name for name in method_names() if name != LIMIT])
+@pytest.mark.parametrize("name", [name for name in fit_methods() if name != LIMIT])
 def test_every_method_solves_an_easy_problem(name: str) -> None:
     problem = simulate_problem(
         np.random.default_rng(4), points=30, noise_px=0.0, stretch=(1.0, 1.0)
@@ -204,7 +205,7 @@ def test_every_method_solves_an_easy_problem(name: str) -> None:
 
 def test_an_unknown_method_is_named_with_the_nearest() -> None:
     with pytest.raises(InputError, match="did you mean 'optimal'"):
-        check_methods(["optimum"])
+        checked_names(["optimum"])
     with pytest.raises(InputError, match="none is given"):
-        check_methods([])
-    assert check_methods(["aepnp", "aepnp"]) == ("aepnp",)
+        checked_names([])
+    assert checked_names(["aepnp", "aepnp"]) == ("aepnp",)

@@ -19,10 +19,9 @@ from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.retrieval.experiment import RetrievalExperiment, same_shapes
+from cadalign.evaluation.retrieval.experiment import retrieval_benchmark, same_shapes
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
-from cadalign.evaluation.retrieval.spec import SPEC
-from cadalign.evaluation.retrieval.summary import summarize
+from cadalign.evaluation.retrieval.spec import SPEC, summarize
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, retrieval_tasks
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -187,7 +186,7 @@ class TestRows:
         Library.from_models([model, other]).save(path)
         options = replace(QUICK, keypoints=(14,), methods=("optimal",))
         rows = (
-            RetrievalExperiment(str(path), options)
+            retrieval_benchmark(str(path), options)
             .evaluate([RetrievalTask("box", "001", 1.0, 14)])
             .rows
         )
@@ -199,7 +198,7 @@ class TestRows:
         flat = [replace(m, bounds=m.bounds * [1, 1, 0]) for m in models]
         path = tmp_path / "lib"
         Library.from_models(flat).save(path)
-        experiment = RetrievalExperiment(str(path), replace(QUICK, methods=("optimal",)))
+        experiment = retrieval_benchmark(str(path), replace(QUICK, methods=("optimal",)))
         (row, _) = experiment.evaluate([RetrievalTask("box", "001", 1.0, 8)]).rows
         assert row["status"] == "ok"
         assert row["box_iou"] is None

@@ -13,7 +13,12 @@ import pytest
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.simulation.experiment import SweepExperiment, SweepTask, sweep_tasks
+from cadalign.evaluation.simulation.experiment import (
+    SweepProblems,
+    SweepTask,
+    sweep_benchmark,
+    sweep_tasks,
+)
 from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.problems import simulate_problem
 
@@ -53,7 +58,7 @@ def test_without_outliers_a_problem_is_as_it_was() -> None:
 def test_a_problem_does_not_depend_on_its_neighbours() -> None:
     options = {"values": (1, 3), "runs": 4, "points": 12, "methods": ("optimal", "limit")}
     kind = SweepOptions("noise", **options).kind
-    experiment = SweepExperiment(kind, seed=3)
+    experiment = sweep_benchmark(kind, seed=3)
     tasks = sweep_tasks(kind)
     together = experiment.evaluate(tasks).rows
     alone = [row for task in tasks for row in experiment.evaluate([task]).rows]
@@ -63,8 +68,8 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
 
 def test_another_seed_gives_other_problems() -> None:
     kind = SweepOptions("points", values=(8,)).kind
-    first = SweepExperiment(kind, 0).problem(SweepTask(8.0, 0))
-    other = SweepExperiment(kind, 1).problem(SweepTask(8.0, 0))
+    first = SweepProblems(kind, 0).problem(SweepTask(8.0, 0))
+    other = SweepProblems(kind, 1).problem(SweepTask(8.0, 0))
     assert not np.array_equal(first.points_2d, other.points_2d)
 
 

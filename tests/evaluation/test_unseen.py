@@ -23,7 +23,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.evaluation.unseen.calibration import probability_level
+from cadalign.evaluation.unseen.experiment import probability_level
 from cadalign.evaluation.unseen.options import METHODS, UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview
 from cadalign.evaluation.unseen.spec import SPEC

@@ -20,13 +20,13 @@ from support.pages import embedded_payload
 from cadalign import Alignment, Box, Camera, Library, fit
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.accuracy.methods import fit_options
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.methods.fitted import fit_options
 from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
@@ -451,7 +451,7 @@ def half_finished(run: Path, options: KeypointNetOptions) -> Path:
     for path in (folder.results, folder.records, folder.timings):
         path.unlink()
     folder.parts.mkdir()
-    experiment = KeypointNetExperiment(options, drawn_in=None)
+    experiment = keypointnet_benchmark(options, drawn_in=None)
     tasks = KeypointTasks(KeypointNet(options.root), options)
     for index in (0, 2):
         result = experiment.evaluate(tasks[64 * index : 64 * index + 64])

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import numpy as np
 
-from cadalign.evaluation.accuracy.methods import LIMIT, method_names
+from cadalign.evaluation.methods.fitted import LIMIT, fit_methods
 from cadalign.io.files import write_whole
 
 if TYPE_CHECKING:
@@ -106,9 +107,13 @@ def look_of(method: str) -> Look:
     if method == LIMIT:
         return Look(label, "black", "", "--")
     # Those of `cadalign.fit` first.
-    names = [name for name in dict.fromkeys([*method_names(), *_LABELS]) if name != LIMIT]
-    place = names.index(method) if method in names else len(names)
-    return Look(label, _COLORS[place % len(_COLORS)], _MARKERS[place % len(_MARKERS)], "-")
+    names = [name for name in dict.fromkeys([*fit_methods(), *_LABELS]) if name != LIMIT]
+    if method in names:
+        place = mark = names.index(method)
+    else:  # of a registered one by its name, wherever it is drawn
+        place = crc32(method.encode())
+        mark = place // len(_COLORS)
+    return Look(label, _COLORS[place % len(_COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
 
 
 @contextmanager

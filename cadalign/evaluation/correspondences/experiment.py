@@ -27,27 +27,107 @@ inlier_recall
 
 from __future__ import annotations
 
-import time
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets import Correspondences
+from cadalign.datasets import Correspondences, CorrespondenceSet
 from cadalign.errors import DataError
-from cadalign.estimation.fit import fit
+from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.evaluation.accuracy.methods import fit_options, is_robust
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.correspondences.tasks import CorrespondenceTask
-from cadalign.evaluation.outcome import Outcome, alignment_errors, reason_of
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng
+
+
+@dataclass(frozen=True, eq=False)
+class CorrespondenceTask:
+    """One draw of scales for one image, with a share of its points to be moved.
+
+    ``seen`` is None where the image cannot be read, for the reason ``problem``.
+    """
+
+    image: str
+    outliers: float
+    draw: int
+    seen: Correspondences | None
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
+
+
+class CorrespondenceTasks(Sequence[CorrespondenceTask]):
+    """All draws, image by image and share by share, made when asked for."""
+
+    def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
+        self._images = images
+        self._outliers = options.outliers
+        self._draws = options.draws
+        self._ids = images.ids[: options.max_images]
+        if not self._ids:
+            raise DataError("there are no images", where=str(images.source))
+        problems = images.problems
+        self._problems = {name: problems[name] for name in self._ids if name in problems}
+        if len(self._problems) == len(self._ids):
+            first = self._problems[self._ids[0]]
+            raise DataError(
+                f"none of {len(self._ids)} images can be read; the first: {first}",
+                where=str(images.source),
+            )
+        self._read = lru_cache(maxsize=2)(self._read_image)
+
+    def __len__(self) -> int:
+        return len(self._ids) * len(self._outliers) * self._draws
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        rest, draw = divmod(range(len(self))[index], self._draws)
+        place, share = divmod(rest, len(self._outliers))
+        name = self._ids[place]
+        problem = self._problems.get(name)
+        return CorrespondenceTask(
+            image=name,
+            outliers=self._outliers[share],
+            draw=draw,
+            seen=self._read(name) if problem is None else None,
+            problem="" if problem is None else str(problem),
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of all that is read: a run must not go on with other data."""
+        digest = hashlib.sha256()
+        for name in self._ids:
+            digest.update(f"{name}\0".encode())
+            if name in self._problems:
+                digest.update(str(self._problems[name]).encode())
+                continue
+            seen = self._read(name)
+            pose = seen.cam_from_world
+            for values in (seen.points_3d, seen.points_2d, pose.rotation, pose.translation):
+                digest.update(np.ascontiguousarray(values).tobytes())
+            digest.update(repr(seen.camera).encode())
+        return digest.hexdigest()[:16]
+
+    def _read_image(self, name: str) -> Correspondences:
+        return self._images[name]
+
 
 SUCCESS_DEG = 0.5
 """A success has less than this rotation error [degrees] ..."""
@@ -65,71 +145,93 @@ COLUMNS: Columns = (
 )
 
 
-@dataclass(frozen=True)
-class CorrespondenceExperiment:
-    """Evaluates methods on stretched scenes with outliers."""
+@dataclass(frozen=True, eq=False)
+class SpoiledImage:
+    """An image with a stretched scene and moved points, and the options of searches for inliers."""
 
+    truth: Problem
+    ransac: RansacOptions
+
+
+@dataclass(frozen=True)
+class SpoiledImages(Setting):
+    """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
+
+    names = _NAMES
     columns = COLUMNS
-    timing_columns = (*_NAMES, ("seconds", float))
 
     options: CorrespondenceOptions
 
-    def warm_up(self) -> None:
-        """Compile the solvers."""
+    def warm_up(self) -> Sequence[CorrespondenceTask]:
+        """A task whose evaluation compiles the solvers."""
         problem = simulate_problem(
             np.random.default_rng(0), points=40, noise_px=0.5, stretch=(1.0, 1.0)
         )
         seen = Correspondences(
             "", problem.points_3d, problem.points_2d, problem.camera, problem.alignment
         )
-        self.evaluate([CorrespondenceTask("warm-up", 0.2, 0, seen)])
+        return [CorrespondenceTask("warm-up", 0.2, 0, seen)]
 
-    def evaluate(self, tasks: Sequence[CorrespondenceTask]) -> Rows:
-        """A row for every task and method."""
-        return Rows.joined([self._evaluate_one(task) for task in tasks])
+    def cases(self, tasks: Sequence[CorrespondenceTask]) -> list[Case]:
+        """The spoiled image of every task, or why there is none."""
+        return [self._case(task) for task in tasks]
 
-    def failure(self, task: CorrespondenceTask, reason: str) -> Rows:
-        """A failed row for every method."""
-        return Rows.of(_failure(task, method, reason) for method in self.options.methods)
+    def failed(self, task: CorrespondenceTask) -> list[Case]:
+        """The case of a task without an instance."""
+        points = None if task.seen is None else len(task.seen)
+        return [Case(task.names, {"points": points, "success": False})]
 
-    def _evaluate_one(self, task: CorrespondenceTask) -> Rows:
+    def _case(self, task: CorrespondenceTask) -> Case:
+        (case,) = self.failed(task)
         if task.seen is None:
-            return self.failure(task, task.problem)
+            return replace(case, error=DataError(task.problem))
         names = (task.image, str(task.draw), repr(task.outliers))
         rng = instance_rng(self.options.seed, *names)
-        truth = spoil(task.seen, task.outliers, rng=rng)
+        truth = attempt(partial(spoil, task.seen, task.outliers, rng=rng))
+        if isinstance(truth, Exception):
+            return replace(case, error=truth)
         ransac = self.options.ransac(int(rng.integers(2**31)))
-        outcomes = []
-        for method in self.options.methods:
-            start = time.perf_counter()
-            try:
-                how = fit_options(method, sigma=1.0, ransac=ransac)
-                result = fit(truth.points_3d, truth.points_2d, truth.camera, **how)
-                seconds = time.perf_counter() - start
-                outcome = Outcome(task.names(method), errors_of(result, truth, method=method))
-            except Exception as error:
-                seconds = time.perf_counter() - start
-                outcome = _failure(task, method, reason_of(error))
-            outcomes.append(replace(outcome, seconds=seconds))
-        return Rows.of(outcomes)
+        return replace(case, instance=SpoiledImage(truth, ransac))
+
+    def given(self, image: SpoiledImage) -> MethodInput:
+        """All points of the image."""
+        truth = image.truth
+        return MethodInput(truth.points_3d, truth.points_2d, truth.camera, 1.0, ransac=image.ransac)
+
+    def compared(self, image: SpoiledImage, estimate: Alignment | Result) -> Compared:
+        """The estimated and the true alignment."""
+        if isinstance(estimate, Alignment):
+            return Compared(estimate, image.truth.alignment)
+        return Compared(estimate.alignment, image.truth.alignment, estimate)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Errors by column."""
+        return [errors_of(estimate, image.truth, method=method) for image, estimate in pairs]
 
 
-def errors_of(result: Result, truth: Problem, *, method: str) -> Row:
-    """Errors of a fit by column."""
+def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
+    """The methods of the options on spoiled images."""
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(SpoiledImages(options), choose_methods(options.methods), metrics=metrics)
+
+
+def errors_of(found: Alignment | Result, truth: Problem, *, method: Method) -> Row:
+    """Errors of an estimate by column."""
+    est = found if isinstance(found, Alignment) else found.alignment
     distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
-    errors = alignment_errors(est=result.alignment, gt=truth.alignment, length=float(distance))
+    errors = alignment_errors(est=est, gt=truth.alignment, length=float(distance))
     scales = max(errors["scale_y_error"], errors["scale_z_error"])
-    found: Row = {
+    row: Row = {
         "points": len(truth.points_3d),
         **errors,
         "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
     }
-    if not is_robust(method):
-        return found
+    if not method.is_robust or isinstance(found, Alignment):
+        return row
     inliers = np.ones(len(truth.points_3d), bool) if truth.outliers is None else ~truth.outliers
-    kept, kept_inliers = int(result.inliers.sum()), int((result.inliers & inliers).sum())
+    kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
     return {
-        **found,
+        **row,
         "inliers": kept,
         "inlier_precision": kept_inliers / max(kept, 1),
         "inlier_recall": kept_inliers / max(int(inliers.sum()), 1),
@@ -169,8 +271,3 @@ def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> Fl
             return pixels
         pixels[~valid] = rng.uniform(-0.5, size - 0.5, (int((~valid).sum()), 2))
     raise DataError("the lens model is valid in a small part of the image only", where="camera")
-
-
-def _failure(task: CorrespondenceTask, method: str, reason: str) -> Outcome:
-    points = None if task.seen is None else len(task.seen)
-    return Outcome.failure(reason, task.names(method), points=points, success=False)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import FunctionOptions
 
 if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
 
 
 @dataclass(frozen=True)
-class CorrespondenceOptions(ExperimentOptions):
+class CorrespondenceOptions(FunctionOptions):
     """Evaluate methods on real correspondences with outliers.
 
     For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
@@ -55,10 +55,11 @@ class CorrespondenceOptions(ExperimentOptions):
     """Largest number of images, the first ones."""
 
     def __post_init__(self) -> None:
-        from cadalign.evaluation.accuracy.methods import LIMIT, check_methods
+        from cadalign.evaluation.methods.fitted import LIMIT
+        from cadalign.evaluation.methods.registry import checked_names
 
         super().__post_init__()
-        object.__setattr__(self, "methods", check_methods(self.methods))
+        object.__setattr__(self, "methods", checked_names(self.methods))
         if LIMIT in self.methods:
             raise InputError(
                 "the Cramer-Rao bound needs the noise of the image points, unknown in real images",

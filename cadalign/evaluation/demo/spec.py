@@ -8,13 +8,12 @@ from typing import Any
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError
-from cadalign.evaluation import metrics
 from cadalign.evaluation.demo.options import DemoOptions
-from cadalign.evaluation.keypointnet.experiment import KeypointNetExperiment
+from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.spec import ON_INSTANCES
-from cadalign.evaluation.keypointnet.summary import TABLE
+from cadalign.evaluation.keypointnet.spec import ON_INSTANCES, TABLE
 from cadalign.evaluation.keypointnet.tasks import AUTO, KeypointTask
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import Plan
@@ -62,9 +61,9 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     views = KeypointNetOptions(
         root, methods=(METHOD,), noise_px=options.noise_px, seed=options.seed
     )
-    experiment = KeypointNetExperiment(views, folder.made_for_pictures())
+    benchmark = keypointnet_benchmark(views, folder.made_for_pictures())
     tasks = [KeypointTask.of_model(dataset, *key, visibility=AUTO) for key in keys]
-    return Plan(experiment, tasks, config, chunk_size=1)
+    return Plan(benchmark, tasks, config, chunk_size=1)
 
 
 def _clear(folder: RunFolder, config: dict[str, Any]) -> None:

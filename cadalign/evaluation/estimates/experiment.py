@@ -3,152 +3,148 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from cadalign.datasets.photos.photo import NamedPoints, Photo
+from cadalign.datasets.photos.photo import NamedPoints
 from cadalign.datasets.photos.poses import PoseEstimate
-from cadalign.errors import CadalignError, DataError, DegenerateError
-from cadalign.evaluation.estimates.files import opened_estimates
-from cadalign.evaluation.estimates.matching import match_estimates
+from cadalign.errors import CadalignError, DegenerateError
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
+from cadalign.evaluation.estimates.files import match_estimates, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
-from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
-from cadalign.evaluation.photos.drawing import draw_sighting
-from cadalign.evaluation.photos.experiment import COLUMNS
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.metrics.sets import score_alignment
+from cadalign.evaluation.outcome import LeftOutError, Outcome
+from cadalign.evaluation.photos.experiment import COLUMNS, draw, targets_of
 from cadalign.evaluation.photos.methods import PhotoEstimate
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
 from cadalign.evaluation.photos.records import sighting_record
-from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import PhotoTarget, Sighting
+from cadalign.evaluation.photos.sighting import Sighting
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.photos.tasks import PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Columns
-from cadalign.evaluation.runs.work import AbortError, Rows
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.box import Box
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
-_Answer = tuple[Outcome, PhotoEstimate | CadalignError]
 _FACTS = {"source": "", "keypoints": 0}
 
 
+@dataclass(frozen=True, eq=False)
+class GivenPoses:
+    """An object of a photo, and each file's estimate of it, or why it has none."""
+
+    target: PhotoTarget
+    protocol: Protocol
+    poses: tuple[PoseEstimate | CadalignError | None, ...]
+    is_shown: bool
+
+
 @dataclass(frozen=True)
-class EstimatesExperiment:
-    """Scores the estimates of files on the objects of photos.
+class PosesOfFiles(Setting):
+    """Estimates of files on the objects of photos: the setting of the experiment.
 
     Parameters
     ----------
     options : EstimatesOptions
-    methods : tuple of str
-        A name for each file.
     drawn_in : RunFolder
         The folder that pictures go to.
     """
 
+    names = VIEW_NAMES
     columns = COLUMNS
-    timing_columns = (*_NAMES, ("seconds", float))
     record_columns = RECORD_COLUMNS
 
     options: EstimatesOptions
-    methods: tuple[str, ...]
     drawn_in: RunFolder = field(repr=False)
 
-    def warm_up(self) -> None:
+    def warm_up(self) -> Sequence[PhotoTask]:
         """Nothing is compiled here."""
+        return ()
 
-    def evaluate(self, tasks: Sequence[PhotoTask]) -> Rows:
-        """Rows and a record for every object of every photo."""
-        return Rows.joined([self._rows(task) for task in tasks])
+    def cases(self, tasks: Sequence[PhotoTask]) -> list[Case]:
+        """The objects of every photo, with their estimates."""
+        return [case for task in tasks for case in self._cases(task)]
 
-    def failure(self, task: PhotoTask, reason: str) -> Rows:
-        """A failed row for every file."""
-        return Rows.of(Outcome.failure(reason, task.names(name), **_FACTS) for name in self.methods)
+    def failed(self, task: PhotoTask) -> list[Case]:
+        """The case of a photo that cannot be scored."""
+        return [Case(task.names, _FACTS)]
 
-    def _rows(self, task: PhotoTask) -> Rows:
-        if task.problem:
-            return self.failure(task, task.problem)
-        dataset = opened(self.options.root)
-        try:
-            photo = dataset[task.index]
-        except DataError as error:
-            return self.failure(task, str(error))
-        parts = [
-            self.failure(PhotoTask(-1, f"{photo.name}, problem {row + 1}"), str(problem))
-            for row, problem in enumerate(photo.problems)
-        ]
-        targets = [PhotoTarget(photo, found, str(dataset.root)) for found in photo.objects]
-        estimates = [self._estimates(index, photo, targets) for index in range(len(self.methods))]
-        protocol = protocol_of(dataset.kind)
-        for target in targets:
-            own = [
-                each if isinstance(each, CadalignError) else each.get(target.found.object_id)
-                for each in estimates
-            ]
-            shown = task.index < self.options.pictures
-            parts.append(self._object(target, own, protocol, shown=shown))
-        return Rows.joined(parts)
+    def _cases(self, task: PhotoTask) -> list[Case]:
+        found = targets_of(task, self.options.root)
+        targets = [each for each in found if isinstance(each, PhotoTarget)]
+        files = range(len(self.options.estimates))
+        poses = [self._poses(index, targets) for index in files] if targets else []
+        protocol = protocol_of(opened(self.options.root).kind) if targets else None
+        shown = task.index < self.options.pictures
+        cases = []
+        for each in found:
+            if isinstance(each, Case):
+                cases.append(replace(each, facts=_FACTS))
+                continue
+            own = tuple(
+                some if isinstance(some, CadalignError) else some.get(each.found.object_id)
+                for some in poses
+            )
+            assert protocol is not None
+            cases.append(Case(each.names, _FACTS, GivenPoses(each, protocol, own, shown)))
+        return cases
 
-    def _estimates(
-        self, index: int, photo: Photo, targets: Sequence[PhotoTarget]
+    def _poses(
+        self, index: int, targets: Sequence[PhotoTarget]
     ) -> dict[str, PoseEstimate] | CadalignError:
-        """Estimates of a file by the objects' ids, or why it has none of the photo."""
+        """Poses of a file by the objects' ids, or why it has none of the photo."""
         try:
             file = opened_estimates(self.options.estimates[index], opened(self.options.root))
-            return match_estimates(targets, file.poses_in(photo))
+            return match_estimates(targets, file.poses_in(targets[0].photo))
         except CadalignError as error:
             return error
 
-    def _object(
-        self,
-        target: PhotoTarget,
-        estimates: Sequence[PoseEstimate | CadalignError | None],
-        protocol: Protocol,
-        *,
-        shown: bool,
-    ) -> Rows:
-        answers = [
-            self._answer(target, name, estimate, protocol)
-            for name, estimate in zip(self.methods, estimates, strict=True)
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Errors by the metrics of the data set."""
+        return [
+            attempt(score_alignment, each.target, each.protocol.metrics, found.alignment, found.box)
+            for each, found in pairs
         ]
-        outcomes = [outcome for outcome, _ in answers]
-        found = [estimate for _, estimate in answers]
-        sighting = _sighting(target)
-        if sighting is None or not any(outcome.is_ok for outcome in outcomes):
-            return Rows.of(outcomes)
-        if shown:
-            best = next(each for each in found if isinstance(each, PhotoEstimate))
-            try:
-                draw_sighting(self.drawn_in, sighting, best)
-            except OSError as error:
-                what = f"a picture cannot be written: {error}"
-                fix = "free some space, and start the same command again: the run goes on"
-                raise AbortError(what, fix=fix) from None
-        return Rows.of(outcomes, [sighting_record(sighting, outcomes, found)])
 
-    def _answer(
-        self,
-        target: PhotoTarget,
-        method: str,
-        estimate: PoseEstimate | CadalignError | None,
-        protocol: Protocol,
-    ) -> _Answer:
-        names = target.names(method)
-        try:
-            bounds = target.bounds
-            if target.gt is None or bounds is None:
-                why = "the true pose or the size of the model is not known"
-                return Outcome(names, dict(_FACTS), LEFT_OUT, why), DegenerateError(why)
-            if not isinstance(estimate, PoseEstimate):
-                why = "there is no estimate" if estimate is None else str(estimate)
-                return Outcome.failure(why, names, **_FACTS), DegenerateError(why)
-            pose = estimate.cam_from_model
-            found = PhotoEstimate(pose, Box.from_model(bounds, pose))
-            scores = score_alignment(target, protocol, pose, found.box)
-        except Exception as error:
-            why = reason_of(error)
-            return Outcome.failure(why, names, **_FACTS), DegenerateError(why)
-        return Outcome(names, _FACTS | scores, seconds=estimate.seconds), found
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """The outcomes with their files' times, the record and the pictures of an object."""
+        instance: GivenPoses = case.instance
+        outcomes = [
+            replace(outcome, seconds=pose.seconds if isinstance(pose, PoseEstimate) else None)
+            for outcome, pose in zip(outcomes, instance.poses, strict=True)
+        ]
+        sighting = _sighting(instance.target)
+        if sighting is None or not any(outcome.is_ok for outcome in outcomes):
+            return outcomes, None
+        if instance.is_shown:
+            best = next(each for each in estimates if isinstance(each, PhotoEstimate))
+            draw(self.drawn_in, sighting, best)
+        return outcomes, sighting_record(sighting, outcomes, estimates)
+
+
+def estimates_benchmark(
+    options: EstimatesOptions, names: Sequence[str], drawn_in: RunFolder
+) -> Benchmark:
+    """Files of estimates, by these names, on the objects of photos."""
+    methods = tuple(Method(name, partial(_pose, index=k)) for k, name in enumerate(names))
+    return Benchmark(PosesOfFiles(options, drawn_in), methods)
+
+
+def _pose(instance: GivenPoses, *, index: int) -> PhotoEstimate:
+    """The pose that a file has of an object."""
+    target, pose = instance.target, instance.poses[index]
+    bounds = target.bounds
+    if target.gt is None or bounds is None:
+        raise LeftOutError("the true pose or the size of the model is not known")
+    if not isinstance(pose, PoseEstimate):
+        raise DegenerateError("there is no estimate") if pose is None else pose
+    return PhotoEstimate(pose.cam_from_model, Box.from_model(bounds, pose.cam_from_model))
 
 
 def _sighting(target: PhotoTarget) -> Sighting | None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from cadalign.evaluation import metrics
-from cadalign.evaluation.estimates.experiment import EstimatesExperiment
+from cadalign.evaluation.estimates.experiment import estimates_benchmark
 from cadalign.evaluation.estimates.files import method_names, opened_estimates
 from cadalign.evaluation.estimates.options import EstimatesOptions
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.photos.experiment import COLUMNS
-from cadalign.evaluation.photos.figures import plots
 from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.summary import GALLERY, HEADLINE, console_table, summarize
+from cadalign.evaluation.photos.spec import GALLERY, HEADLINE, console_table, plots, summarize
 from cadalign.evaluation.photos.tasks import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -43,7 +41,7 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         for problem in file.problems[:_LOGGED]:
             logger.warning("%s: left out: %s", name, problem)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "kind": dataset.kind,
@@ -54,8 +52,8 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         "strays": strays,
         "annotations": tasks.fingerprint(),
     }
-    experiment = EstimatesExperiment(options, methods, folder.made_for_pictures())
-    return Plan(experiment, tasks, config, _CHUNK)
+    benchmark = estimates_benchmark(options, methods, folder.made_for_pictures())
+    return Plan(benchmark, tasks, config, _CHUNK)
 
 
 def _fingerprint(path: Path) -> str:

@@ -26,7 +26,6 @@ The metrics of failed rows are empty.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,23 +37,33 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.evidence.methods import bound_of, evidence_for
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.evidence.options import EvidenceRunOptions
-from cadalign.evaluation.evidence.scene import ObjectScene, make_scene
+from cadalign.evaluation.evidence.scene import (
+    EVERYTHING,
+    OWN_METHODS,
+    EvidenceEstimate,
+    EvidenceInstance,
+    ObjectScene,
+    bound_of,
+    evidence_for,
+    make_scene,
+)
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
-from cadalign.evaluation.outcome import Outcome, alignment_errors, overlap, reason_of
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import alignment_errors, overlap
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Rows
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.seeding import instance_rng
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 _ERRORS = ("rotation_error_deg", "translation_error", "scale_y_error", "scale_z_error")
 BOUNDS = ("rotation_bound_deg", "translation_bound", "scale_y_bound", "scale_z_bound")
 COLUMNS: Columns = (
-    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *((name, float) for name in (*_ERRORS, "box_iou", *BOUNDS, "over_limit")),
     ("warnings", int),
 )
@@ -62,15 +71,15 @@ _DRAWS = 1000
 
 
 @dataclass(frozen=True)
-class EvidenceExperiment:
-    """Evaluates kinds of evidence on views of annotated models with meshes."""
+class EvidenceScenes(Setting):
+    """Views of annotated models with meshes: the setting of the experiment."""
 
+    names = VIEW_NAMES
     columns = COLUMNS
-    timing_columns = (*_NAMES, ("seconds", float))
 
     options: EvidenceRunOptions
 
-    def warm_up(self) -> None:
+    def warm_up(self) -> Sequence[KeypointTask]:
         """Compile the kernels."""
         points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
         pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
@@ -79,41 +88,61 @@ class EvidenceExperiment:
             align(Model(points_3d=points), View(KEYPOINT_CAMERA, pixels, up=up))
         box = Box.from_model([points.min(axis=0), points.max(axis=0)], pose)
         overlap(est=box, gt=box)
+        return ()
 
-    def evaluate(self, tasks: Sequence[KeypointTask]) -> Rows:
-        """A row for every task and method."""
-        return Rows.of(outcome for task in tasks for outcome in self._outcomes(task))
+    def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
+        """The scene of every view, or why there is none."""
+        return [self._case(task) for task in tasks]
 
-    def failure(self, task: KeypointTask, reason: str) -> Rows:
-        """A failed row for every method."""
-        return Rows.of(Outcome.failure(reason, task.names(name)) for name in self.options.methods)
+    def failed(self, task: KeypointTask) -> list[Case]:
+        """The case of a view without a scene."""
+        return [Case(task.names)]
 
-    def _outcomes(self, task: KeypointTask) -> list[Outcome]:
-        try:
-            if task.problem:
-                raise DataError(task.problem)
-            assert task.model is not None
-            scene = make_scene(task.model, task.view, self.options)
-        except Exception as error:
-            methods = self.options.methods
-            return [Outcome.without_instance(error, task.names(name)) for name in methods]
-        return [self._outcome(task, scene, method) for method in self.options.methods]
+    def _case(self, task: KeypointTask) -> Case:
+        if task.problem:
+            return Case(task.names, error=DataError(task.problem))
+        assert task.model is not None
+        scene = attempt(make_scene, task.model, task.view, self.options)
+        if isinstance(scene, Exception):
+            return Case(task.names, error=scene)
+        return Case(task.names, instance=EvidenceInstance(scene, self.options))
 
-    def _outcome(self, task: KeypointTask, scene: ObjectScene, method: str) -> Outcome:
-        names = task.names(method)
-        try:
-            given = evidence_for(method, scene, self.options)
-            facts = {"keypoints": sum(len(shot.rows) for shot in given.shots)}
-            start = time.perf_counter()
-            result = align(scene.model, given.views, size=given.size)
-            seconds = time.perf_counter() - start
-            values = facts | _errors(result, scene)
-            bounds = self._bounds(bound_of(result, given, scene), scene)
-            over = values["rotation_error_deg"] / bounds["rotation_bound_deg"]
-            values |= {**bounds, "over_limit": over, "warnings": len(result.warnings)}
-        except Exception as error:
-            return Outcome.failure(reason_of(error), names)
-        return Outcome(names, values, seconds=seconds)
+    def given(self, instance: EvidenceInstance) -> MethodInput:
+        """The first view's keypoints; for functions of views, two views with all evidence."""
+        scene, shot = instance.scene, instance.scene.shots[0]
+        return MethodInput(
+            np.asarray(scene.model.points_3d)[shot.rows],
+            shot.points_2d,
+            KEYPOINT_CAMERA,
+            self.options.noise_px or 1.0,
+            bounds=np.asarray(scene.model.bounds),
+            make_views=lambda: (scene.model, evidence_for(EVERYTHING, instance).views),
+        )
+
+    def answered(
+        self, method: Method, instance: EvidenceInstance, answer: Alignment | Result
+    ) -> EvidenceEstimate:
+        """The answer beside the first view, whose bound is not known."""
+        return EvidenceEstimate(answer, None)
+
+    def compared(self, instance: EvidenceInstance, estimate: EvidenceEstimate) -> Compared:
+        """The estimated and the true alignment."""
+        result = estimate.answer if isinstance(estimate.answer, Result) else None
+        return Compared(estimate.alignment, instance.scene.gt, result)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Errors, and their bounds, by column."""
+        return [attempt(self._row, instance.scene, estimate) for instance, estimate in pairs]
+
+    def _row(self, scene: ObjectScene, estimate: EvidenceEstimate) -> Row:
+        result, given = estimate.answer, estimate.given
+        values = _errors(estimate.alignment, scene)
+        if given is None or isinstance(result, Alignment):
+            return values
+        values["keypoints"] = sum(len(shot.rows) for shot in given.shots)
+        bounds = self._bounds(bound_of(result, given, scene), scene)
+        over = values["rotation_error_deg"] / bounds["rotation_bound_deg"]
+        return values | {**bounds, "over_limit": over, "warnings": len(result.warnings)}
 
     def _bounds(self, bound: FloatArray, scene: ObjectScene) -> Row:
         """Median errors of a Gaussian with the bound as its covariance."""
@@ -128,8 +157,15 @@ class EvidenceExperiment:
         return dict(zip(BOUNDS, (float(np.median(each)) for each in values), strict=True))
 
 
-def _errors(result: Result, scene: ObjectScene) -> Row:
-    est, gt = result.alignment, scene.gt
+def evidence_benchmark(options: EvidenceRunOptions) -> Benchmark:
+    """The kinds of evidence of the options on views of models."""
+    methods = choose_methods(options.methods, OWN_METHODS)
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(EvidenceScenes(options), methods, metrics=metrics)
+
+
+def _errors(est: Alignment, scene: ObjectScene) -> Row:
+    gt = scene.gt
     bounds = np.asarray(scene.model.bounds)
     boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}
     return {

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 KEYPOINTS = "keypoints"
 MASK, DEPTH, GRAVITY, LENGTH = "mask", "depth", "gravity", "length"
@@ -32,7 +32,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mas
 
 
 @dataclass(frozen=True)
-class EvidenceRunOptions(ModelOptions, NoiseOption):
+class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -76,11 +76,9 @@ class EvidenceRunOptions(ModelOptions, NoiseOption):
             value = getattr(self, name)
             if not 0 < value < 90:
                 raise InputError(f"{value} is not between 0 and 90", where=name)
-        object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
-        unknown = [name for name in self.methods if name not in METHODS]
-        if unknown or not self.methods:
-            what = f"unknown method {unknown[0]!r}" if unknown else "none is given"
-            raise InputError(what, where="methods", fix=f"known are {', '.join(METHODS)}")
+        from cadalign.evaluation.methods.registry import checked_names
+
+        object.__setattr__(self, "methods", checked_names(self.methods, METHODS))
 
 
 OPTIONS = EvidenceRunOptions

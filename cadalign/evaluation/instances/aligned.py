@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -127,19 +128,28 @@ def align_instance(
         target = alignment.inverse(each.alignment.apply(each.points_3d[order]))
         return alignment, Warp(given, target)
 
-    alignment, warp = found(result)
+    return shape_of_result(result, found, rms=_rms(result), sigma=sigma)
+
+
+def shape_of_result(
+    result: Result,
+    placed: Callable[[Result | Alternative], tuple[Alignment, Warp]],
+    *,
+    rms: float,
+    sigma: float,
+) -> AlignedShape:
+    """The aligned shape of a result.
+
+    ``placed`` tells the alignment of an estimate's box and what remains of its shape; ``rms`` and
+    ``sigma`` are those of `AlignedShape` [px].
+    """
     alternatives = []
-    for each in result.alternatives:
-        other, own_warp = found(each)
-        alternatives.append(AlignedAlternative(other, each.relative_likelihood, own_warp))
+    for other in result.alternatives:
+        alignment, warp = placed(other)
+        alternatives.append(AlignedAlternative(alignment, other.relative_likelihood, warp))
+    alignment, warp = placed(result)
     return AlignedShape(
-        alignment,
-        result.std,
-        _rms(result),
-        sigma,
-        result.warnings,
-        tuple(alternatives),
-        warp,
+        alignment, result.std, rms, sigma, result.warnings, tuple(alternatives), warp
     )
 
 

@@ -36,7 +36,6 @@ the status ``skipped``; they count in no share and no median.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -45,13 +44,10 @@ from typing import Any
 import numpy as np
 
 from cadalign.datasets import AnnotatedModel
-from cadalign.errors import CadalignError, DataError
-from cadalign.estimation.fit import fit, fit_batch
+from cadalign.errors import DataError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, SHAPE, fit_options, has_statistics
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting
 from cadalign.evaluation.instances.aligned import AlignedShape, align_instance
-from cadalign.evaluation.instances.errors import POSE_ERRORS, estimate_errors
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
@@ -59,22 +55,26 @@ from cadalign.evaluation.instances.instance import (
     make_hull_instances,
     make_instance,
 )
-from cadalign.evaluation.instances.record import RECORD_COLUMNS, Estimate, pose_of, record_row
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, pose_of, record_row
 from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.shapes import NO_SHAPES, ShapeFiles
 from cadalign.evaluation.keypointnet.tasks import KeypointTask
-from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
-from cadalign.evaluation.outcome import FAILED, Outcome, overlap_up_to_scale, reason_of
+from cadalign.evaluation.methods.fitted import SHAPE
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import POSE_ERRORS, estimate_errors, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
+from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
+from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import AbortError, Rows
+from cadalign.evaluation.runs.work import AbortError
+from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 COLUMNS: Columns = (
-    *_NAMES,
+    *VIEW_NAMES,
     *(("status", str), ("reason", str), ("visibility", str), ("keypoints", int)),
     *((name, float) for name in ("stretch_y", "stretch_z", "rotation_error_deg")),
     *((name, float) for name in ("translation_error", "scale_y_error", "scale_z_error")),
@@ -85,19 +85,27 @@ COLUMNS: Columns = (
 """Columns of every run."""
 REQUIRED_COLUMNS: Columns = COLUMNS[:-1]
 """Those that all runs have; earlier ones lack the last."""
-_Usable = tuple[KeypointTask, Instance]
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointView:
+    """A view of a model as an instance: its task, what it shows, and the shapes that are known."""
+
+    task: KeypointTask
+    instance: Instance
+    sigma: float
+    shapes: ShapeFiles
 
 
 @dataclass(frozen=True)
-class KeypointNetExperiment:
-    """Evaluates methods on views of annotated models.
+class KeypointViews(Setting):
+    """Views of annotated models: the setting of the KeypointNet experiment.
 
     The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
     if one is given; its folders for pictures must exist.
     """
 
-    # A method's share of the seconds that its chunk took.
-    timing_columns = (*_NAMES, ("seconds", float))
+    names = VIEW_NAMES
     record_columns = RECORD_COLUMNS
 
     options: KeypointNetOptions
@@ -109,59 +117,41 @@ class KeypointNetExperiment:
         """The columns of the result table."""
         return (*COLUMNS, (BOX_IOU_UP_TO_SCALE.key, float)) if self.shapes.paths else COLUMNS
 
-    def methods_for(self, category: str) -> tuple[str, ...]:
-        """The methods for the models of a category, that of its learned shape the last."""
-        known = category in dict(self.shapes.paths)
-        return (*self.options.methods, SHAPE) if known else self.options.methods
-
-    def warm_up(self) -> None:
-        """Compile solvers and metrics."""
+    def warm_up(self) -> Sequence[KeypointTask]:
+        """A task whose evaluation compiles solvers and metrics."""
         rng = np.random.default_rng(0)
-        task = KeypointTask(
-            category="warm-up",
-            model_id="",
-            view=0,
-            hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
-            semantic_ids=np.arange(12),
-            symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
-            model=None,
-        )
-        self.evaluate([task])
+        return [
+            KeypointTask(
+                category="warm-up",
+                model_id="",
+                view=0,
+                hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
+                semantic_ids=np.arange(12),
+                symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
+                model=None,
+            )
+        ]
 
-    def evaluate(self, tasks: Sequence[KeypointTask]) -> Rows:
-        """A row for every task and method, and a record for every instance."""
-        start = time.perf_counter()
-        instances = self._instances(tasks)
-        # The first method's rows bear the time of making the instances.
-        share = (time.perf_counter() - start) / len(tasks)
-        answers_of: list[list[tuple[Outcome, Estimate]]] = [[] for _ in tasks]
-        for method in (*self.options.methods, SHAPE):
-            places = [
-                k for k, task in enumerate(tasks) if method in self.methods_for(task.category)
-            ]
-            if not places:
-                continue
-            extra = share if method == self.options.methods[0] else 0.0
-            chosen = [tasks[k] for k in places], [instances[k] for k in places]
-            answers = self._evaluate_method(method, *chosen, extra=extra)
-            for k, answer in zip(places, answers, strict=True):
-                answers_of[k].append(answer)
-        outcomes, records = [], []
-        for instance, answers in zip(instances, answers_of, strict=True):
-            found = [outcome for outcome, _ in answers]
-            outcomes += found
-            if isinstance(instance, Instance):
-                records.append(record_row(instance, found, [estimate for _, estimate in answers]))
-        return Rows.of(outcomes, records)
+    def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
+        """The instance of every task, or why there is none."""
+        sigma = self.options.noise_px or 1.0
+        found = []
+        for task, instance in zip(tasks, self._instances(tasks), strict=True):
+            (case,) = self.failed(task)
+            if isinstance(instance, Exception):
+                found.append(replace(case, error=instance))
+            else:
+                view = KeypointView(task, instance, sigma, self.shapes)
+                found.append(Case(case.names, _facts(task, instance), view, without=case.without))
+        return found
 
-    def failure(self, task: KeypointTask, reason: str) -> Rows:
-        """A failed row for every method."""
-        known = _known(task)
-        methods = self.methods_for(task.category)
-        return Rows.of(Outcome.failure(reason, task.names(each), **known) for each in methods)
+    def failed(self, task: KeypointTask) -> list[Case]:
+        """The case of a task without an instance."""
+        facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
+        has_shape = task.category in dict(self.shapes.paths)
+        return [Case(task.names, facts, without=() if has_shape else (SHAPE,))]
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
-        """The instance of every task, or why there is none."""
         names = ("noise_px", "min_visible", "seed")
         how = {name: getattr(self.options, name) for name in names}
         plain = [task for task in tasks if not task.problem and task.model is None]
@@ -176,131 +166,97 @@ class KeypointNetExperiment:
                 instances.append(_with_mesh(task, task.model, **how))
         return instances
 
-    def _evaluate_method(
-        self,
-        method: str,
-        tasks: Sequence[KeypointTask],
-        instances: Sequence[Instance | Exception],
-        *,
-        extra: float,
-    ) -> list[tuple[Outcome, Estimate]]:
-        """One method's outcome, and the estimate it is of, for every task.
+    def given(self, view: KeypointView) -> MethodInput:
+        """The visible keypoints of the stretched model."""
+        found = view.instance
+        return MethodInput(
+            found.points_3d,
+            found.points_2d,
+            found.camera,
+            view.sigma,
+            bounds=found.bounds,
+            gt=found.gt,
+        )
 
-        ``extra`` is the time [s] that each has taken before.
-        """
-        start = time.perf_counter()
-        usable = [
-            (task, instance)
-            for task, instance in zip(tasks, instances, strict=True)
-            if isinstance(instance, Instance)
+    def compared(self, view: KeypointView, estimate: Alignment | Result | AlignedShape) -> Compared:
+        """The estimated and the true alignment."""
+        result = estimate if isinstance(estimate, Result) else None
+        return Compared(pose_of(estimate), view.instance.gt, result)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Metrics by column of each estimate."""
+        rows: list[Row | Exception] = [
+            *estimate_errors(
+                [pose_of(estimate) for _, estimate in pairs],
+                [view.instance for view, _ in pairs],
+                [view.task.symmetry for view, _ in pairs],
+            )
         ]
-        if method == SHAPE:
-            estimates = [self._aligned(*pair) for pair in usable]
-        else:
-            estimates = self._estimates(method, [instance for _, instance in usable])
-        drawn = self.drawn_in is not None and method == self.options.methods[0]
-        answers = iter(zip(self._results(usable, estimates, drawn=drawn), estimates, strict=True))
-        seconds = (time.perf_counter() - start) / max(len(usable), 1) + extra
-        outcomes: list[tuple[Outcome, Estimate]] = []
-        for task, instance in zip(tasks, instances, strict=True):
-            names = task.names(method)
-            if isinstance(instance, Exception):
-                outcome = Outcome.without_instance(instance, names, **_known(task))
-                outcome = replace(outcome, seconds=extra or None)
-                outcomes.append((outcome, DataError(outcome.reason)))
-                continue
-            result, estimate = next(answers)
-            facts = _facts(task, instance)
-            if isinstance(result, Exception):
-                outcome = Outcome(names, facts, FAILED, reason_of(result), seconds)
-            else:
-                outcome = Outcome(names, facts | result, seconds=seconds)
-            outcomes.append((outcome, estimate))
-        return outcomes
-
-    def _estimates(self, method: str, instances: Sequence[Instance]) -> list[Estimate]:
-        """A method's estimate of every instance."""
-        if method == LIMIT or has_statistics(method):
-            return [self._estimate(method, instance) for instance in instances]
-        if not instances:
-            return []
-        batch = fit_batch(
-            [instance.points_3d for instance in instances],
-            [instance.points_2d for instance in instances],
-            [instance.camera for instance in instances],
-            **fit_options(method, sigma=self.options.noise_px or 1.0, ransac=None),
-        )
-        return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
-
-    def _estimate(self, method: str, instance: Instance) -> Estimate:
-        """The estimate of the bound, or of a method that tells more than an alignment."""
-        given = instance.points_3d, instance.points_2d, instance.camera
-        try:
-            if method == LIMIT:
-                return limit_estimate(*given, instance.gt)
-            noise = self.options.noise_px or 1.0
-            return fit(*given, **fit_options(method, sigma=noise, ransac=None))
-        except CadalignError as error:
-            return error
-
-    def _aligned(self, task: KeypointTask, instance: Instance) -> Estimate:
-        """The estimate from the learned shape of the model's category."""
-        shape = self.shapes.shape(task.category)
-        assert shape is not None
-        sigma = self.options.noise_px or 1.0
-        try:
-            own = task.semantic_ids, task.hull.xyz
-            return align_instance(shape, instance, *own, sigma=sigma)
-        except CadalignError as error:
-            return error
-
-    def _results(
-        self, usable: Sequence[_Usable], estimates: Sequence[Estimate], *, drawn: bool
-    ) -> list[Row | Exception]:
-        """Metrics by column of each estimate, or why there are none; pictures, if ``drawn``."""
-        results: dict[int, Row | Exception] = {}
-        found: dict[int, Result | AlignedShape | Alignment] = {}
-        for k, ((task, instance), estimate) in enumerate(zip(usable, estimates, strict=True)):
-            if isinstance(estimate, CadalignError):
-                results[k] = estimate
-            elif drawn and (problem := self._draw(task, instance, pose_of(estimate))):
-                results[k] = problem
-            else:
-                found[k] = estimate
-        rows = estimate_errors(
-            [pose_of(estimate) for estimate in found.values()],
-            [usable[k][1] for k in found],
-            [usable[k][0].symmetry for k in found],
-        )
-        for (k, estimate), row in zip(found.items(), rows, strict=True):
-            results[k] = row
+        for (view, estimate), row in zip(pairs, rows, strict=True):
             if isinstance(row, Exception):
                 continue
             if isinstance(estimate, AlignedShape):
                 row["rms_px"] = estimate.rms
             if self.shapes.paths:  # it takes longer than most methods
-                row[BOX_IOU_UP_TO_SCALE.key] = _overlap_up_to_scale(usable[k][1], estimate)
-        return [results[k] for k in range(len(usable))]
+                box = Box.from_model(view.instance.bounds, pose_of(estimate))
+                overlap = overlap_up_to_scale(est=box, gt=view.instance.gt_box)
+                row[BOX_IOU_UP_TO_SCALE.key] = overlap
+        return rows
 
-    def _draw(
-        self, task: KeypointTask, instance: Instance, estimate: Alignment
-    ) -> Exception | None:
-        """Draw an estimate; the reason if that fails."""
-        from cadalign.evaluation.instances.drawing import draw_instance
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """Draw the first method's estimate; a failure is one of its row."""
+        view: KeypointView = case.instance
+        first = outcomes[0]
+        if self.drawn_in is not None and first.is_ok:
+            problem = _draw(self.drawn_in, view, pose_of(estimates[0]))
+            if problem is not None:
+                failed = replace(first, status=FAILED, reason=reason_of(problem), values=case.facts)
+                outcomes = [failed, *outcomes[1:]]
+        return outcomes, record_row(view.instance, outcomes, estimates)
 
-        if self.drawn_in is None or instance.scene is None:
-            return None
-        names = {"category": task.category, "model_id": task.model_id}
-        try:
-            draw_instance(self.drawn_in, instance, estimate, view=task.view, **names)
-        except (OSError, DataError) as error:
-            raise AbortError(
-                f"the overlay cannot be written: {error}",
-                fix="free some space, and start the same command again: the run goes on",
-            ) from None
-        except Exception as error:
-            return error
+
+def keypointnet_benchmark(
+    options: KeypointNetOptions, drawn_in: RunFolder | None = None, shapes: ShapeFiles = NO_SHAPES
+) -> Benchmark:
+    """The methods of the options on views of models, and that of learned shapes where there are."""
+    methods = choose_methods(options.methods)
+    batched = frozenset(each.name for each in methods if not each.has_statistics)
+    if shapes.paths:
+        methods = (*methods, Method(SHAPE, _aligned))
+    setting = KeypointViews(options, drawn_in, shapes)
+    metrics = choose_metrics(options.metrics, setting.columns)
+    return Benchmark(setting, methods, batched, metrics=metrics)
+
+
+def _aligned(view: KeypointView) -> AlignedShape:
+    """The estimate from the learned shape of the model's category."""
+    task = view.task
+    shape = view.shapes.shape(task.category)
+    assert shape is not None
+    own = task.semantic_ids, task.hull.xyz
+    return align_instance(shape, view.instance, *own, sigma=view.sigma)
+
+
+def _draw(folder: RunFolder, view: KeypointView, estimate: Alignment) -> Exception | None:
+    """Draw an estimate; the reason if that fails."""
+    from cadalign.evaluation.instances.drawing import draw_instance
+
+    if view.instance.scene is None:
         return None
+    task = view.task
+    names = {"category": task.category, "model_id": task.model_id}
+    try:
+        draw_instance(folder, view.instance, estimate, view=task.view, **names)
+    except (OSError, DataError) as error:
+        raise AbortError(
+            f"the overlay cannot be written: {error}",
+            fix="free some space, and start the same command again: the run goes on",
+        ) from None
+    except Exception as error:
+        return error
+    return None
 
 
 # Views of one model come one after another.
@@ -315,13 +271,6 @@ def _with_mesh(task: KeypointTask, model: AnnotatedModel, **how: Any) -> Instanc
         return error
 
 
-def _overlap_up_to_scale(
-    instance: Instance, estimate: Result | AlignedShape | Alignment
-) -> float | None:
-    box = Box.from_model(instance.bounds, pose_of(estimate))
-    return overlap_up_to_scale(est=box, gt=instance.gt_box)
-
-
 def _facts(task: KeypointTask, instance: Instance) -> Row:
     """Columns that do not depend on the estimate."""
     _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
@@ -332,8 +281,3 @@ def _facts(task: KeypointTask, instance: Instance) -> Row:
         "stretch_z": stretch_z,
         "symmetry": str(task.symmetry),
     }
-
-
-def _known(task: KeypointTask) -> Row:
-    """The facts where there is no instance."""
-    return {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}

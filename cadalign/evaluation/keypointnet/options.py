@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 
 @dataclass(frozen=True)
-class KeypointNetOptions(ModelOptions, NoiseOption):
+class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate methods on views of KeypointNet's models.
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
@@ -46,10 +46,10 @@ class KeypointNetOptions(ModelOptions, NoiseOption):
     """Draw the first method's result for every model with a mesh, or nothing."""
 
     def __post_init__(self) -> None:
-        from cadalign.evaluation.accuracy.methods import check_methods
+        from cadalign.evaluation.methods.registry import checked_names
 
         super().__post_init__()
-        check_methods(self.methods)
+        object.__setattr__(self, "methods", checked_names(self.methods))
         self.check_least(min_visible=1, views_per_model=1)
         self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
 

@@ -45,10 +45,10 @@ class KeypointTask:
     model: AnnotatedModel | None
     problem: str = ""
 
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method."""
-        model = {"category": self.category, "model_id": self.model_id}
-        return {**model, "view": self.view, "method": method}
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"category": self.category, "model_id": self.model_id, "view": self.view}
 
     @classmethod
     def of_model(

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.evaluation import metrics
-from cadalign.evaluation.accuracy.methods import LIMIT
 from cadalign.evaluation.api import run
 from cadalign.evaluation.keypointnet.options import KeypointNetOptions
 from cadalign.evaluation.keypointnet.spec import SPEC as KEYPOINTNET
-from cadalign.evaluation.keypointnet.summary import texts
+from cadalign.evaluation.keypointnet.spec import texts
+from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.paper.table import PAPER_TABLE, PERCENT_NOTE, STATED
 from cadalign.evaluation.runs.folder import RunFolder

@@ -8,12 +8,12 @@ import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import CadalignError, InputError, quote
+from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
 from cadalign.evaluation.photos.experiment import COLUMNS
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.scores import score_alignment
-from cadalign.evaluation.photos.sighting import PhotoTarget
-from cadalign.evaluation.photos.summary import summarize_cells
+from cadalign.evaluation.photos.spec import summarize_cells
+from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Alignment
@@ -71,7 +71,7 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
 
 
 def summarize_rows(rows: list[Row]) -> list[Summary]:
-    """Summaries of rows by category and method; see `cadalign.evaluation.photos.summary`."""
+    """Summaries of rows by category and method; see `cadalign.evaluation.photos.spec`."""
     names = (*(name for name, _ in COLUMNS), "seconds")
     cells = {name: np.array([row.get(name) for row in rows], dtype=object) for name in names}
     return summarize_cells(cells, list(dict.fromkeys(row["method"] for row in rows)))
@@ -87,14 +87,14 @@ def _targets(dataset: PhotoDataset, root: str) -> Iterator[PhotoTarget]:
 def _outcome(
     target: PhotoTarget, protocol: Protocol, est: Alignment | None, method: str
 ) -> Outcome:
-    names, facts = target.names(method), {"source": ""}
+    names, facts = {**target.names, "method": method}, {"source": ""}
     if est is None:
         return Outcome.failure("there is no estimate", names, **facts)
     try:
         bounds = target.bounds
         if bounds is None:
             return Outcome(names, facts, LEFT_OUT, "the size of the model is not known")
-        scores = score_alignment(target, protocol, est, Box.from_model(bounds, est))
+        scores = score_alignment(target, protocol.metrics, est, Box.from_model(bounds, est))
     except CadalignError as error:
         return Outcome.failure(reason_of(error), names, **facts)
     return Outcome(names, facts | scores)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.aligned import box_alignment
-from cadalign.evaluation.photos.names import (
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.outcome import LeftOutError
+from cadalign.evaluation.photos.options import (
     DEPTH,
     EPNP,
     GRAVITY,
@@ -25,10 +28,12 @@ from cadalign.evaluation.photos.names import (
     RIGID,
     SHAPE,
     SIMILAR,
+    STRETCHED,
     TRUTH,
     parts_of,
 )
-from cadalign.evaluation.photos.sighting import LeftOutError, Sighting
+from cadalign.evaluation.photos.protocols import Protocol
+from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh
@@ -57,20 +62,37 @@ class PhotoEstimate:
     result: Result | None = None
 
 
-def estimate_object(
-    method: str, sighting: Sighting, shapes: Collection[ShapeModel], *, similar_sigma: float
-) -> PhotoEstimate:
-    """The estimate of a method.
+@dataclass(frozen=True, eq=False)
+class PhotoInstance:
+    """An object in a photo, with what methods are given of it.
 
     Parameters
     ----------
-    method : str
-        See `cadalign.evaluation.photos.names`.
     sighting : Sighting
-    shapes : collection of ShapeModel
+    protocol : Protocol
+        Of the data set.
+    shapes : tuple of ShapeModel
         Each for the category that it names.
     similar_sigma : float
         Deviation of the object's keypoints from the model's [diagonals of the model].
+    is_shown : bool
+        Its pictures are drawn.
+    """
+
+    sighting: Sighting
+    protocol: Protocol
+    shapes: tuple[ShapeModel, ...]
+    similar_sigma: float
+    is_shown: bool
+
+
+def photo_method(name: str) -> Method:
+    """The method of a name; see `cadalign.evaluation.photos.options`."""
+    return Method(name, partial(estimate_object, name))
+
+
+def estimate_object(method: str, instance: PhotoInstance) -> PhotoEstimate:
+    """The estimate of a method.
 
     Raises
     ------
@@ -79,6 +101,7 @@ def estimate_object(
     CadalignError
         If there is no estimate.
     """
+    sighting = instance.sighting
     base, evidence = parts_of(method)
     if base == TRUTH:
         return _truth(sighting)
@@ -87,11 +110,50 @@ def estimate_object(
         found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
         return _of_model(found.alignment, sighting)
     if base == SHAPE:
-        return _of_shape(sighting, shapes, evidence)
-    model = _model(base, sighting, similar_sigma, with_mesh=MASK in evidence)
-    up_axis = _UP_OF_MODELS if sighting.up_axis == _UP_OF_MODELS else None
-    result = align(model, _view(sighting, evidence, up_axis=up_axis))
+        return _of_shape(sighting, instance.shapes, evidence)
+    model = _model(base, sighting, instance.similar_sigma, with_mesh=MASK in evidence)
+    result = align(model, _view(sighting, evidence, up_axis=_up_axis(sighting)))
     return _of_model(result.alignment, sighting, result)
+
+
+def given_of(instance: PhotoInstance) -> MethodInput:
+    """What general methods are given of an object."""
+    sighting = instance.sighting
+    return MethodInput(
+        sighting.points_3d * sighting.width,
+        sighting.points_2d,
+        sighting.camera,
+        sighting.sigma,
+        bounds=sighting.bounds * sighting.width,
+        make_views=lambda: _with_all_evidence(instance),
+    )
+
+
+def _with_all_evidence(instance: PhotoInstance) -> tuple[Model, list[View]]:
+    """The model to be stretched, and the view with all evidence that there is for it."""
+    sighting = instance.sighting
+    target, up_axis = sighting.target, _up_axis(sighting)
+    has_mesh = target.cad is not None and target.cad.has_mesh
+    kinds = {
+        MASK: has_mesh and target.found.mask_path is not None,
+        DEPTH: target.photo.depth is not None,
+        GRAVITY: target.photo.up is not None and up_axis is not None,
+    }
+    evidence = [kind for kind, is_there in kinds.items() if is_there]
+    model = _model(STRETCHED, sighting, instance.similar_sigma, with_mesh=has_mesh)
+    return model, [_view(sighting, evidence, up_axis=up_axis)]
+
+
+def estimate_of_answer(answer: Alignment | Result, sighting: Sighting) -> PhotoEstimate:
+    """The estimate of an object by a general method's answer."""
+    if isinstance(answer, Alignment):
+        return _of_model(answer, sighting)
+    is_of_model = tuple(answer.ids) == tuple(sighting.model.names)
+    return _of_model(answer.alignment, sighting, answer if is_of_model else None)
+
+
+def _up_axis(sighting: Sighting) -> str | None:
+    return _UP_OF_MODELS if sighting.up_axis == _UP_OF_MODELS else None
 
 
 def _truth(sighting: Sighting) -> PhotoEstimate:

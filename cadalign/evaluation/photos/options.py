@@ -1,21 +1,92 @@
-"""Options of the experiment on data sets of photos."""
+"""Options of the experiment on data sets of photos, and the names of its methods.
+
+A method's name is a base, and the evidence beside the keypoints, as in ``rigid+mask``.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.photos.names import check_method
+from cadalign.errors import InputError, quote
+from cadalign.evaluation.options import FunctionOptions
+
+EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
+SHAPE, TRUTH = "shape", "truth"
+BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
+MASK, DEPTH, GRAVITY = "mask", "depth", "gravity"
+EVIDENCE = (MASK, DEPTH, GRAVITY)
+
+
+def parts_of(method: str) -> tuple[str, frozenset[str]]:
+    """The base of a method, and its evidence.
+
+    Examples
+    --------
+    >>> base, evidence = parts_of("rigid+mask+depth")
+    >>> base, sorted(evidence)
+    ('rigid', ['depth', 'mask'])
+    """
+    base, *evidence = method.split("+")
+    return base, frozenset(evidence)
+
+
+def is_own(method: str) -> bool:
+    """True for a name whose base is one of the experiment's."""
+    return parts_of(method)[0] in (*BASES, TRUTH)
+
+
+def check_method(method: str) -> None:
+    """Check the name of a method.
+
+    Raises
+    ------
+    InputError
+        If there is none of this name, or EPnP or the truth is given evidence.
+    """
+    base, evidence = parts_of(method)
+    is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
+    if not is_known or method.count("+") != len(evidence):
+        fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
+        raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
+    if evidence and base in (EPNP, TRUTH):
+        fix = "give rigid, stretched, prior, similar or shape the evidence"
+        raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
+
+
+def default_methods(
+    *,
+    with_evidence: Collection[str],
+    evidence: Collection[str],
+    has_shape: bool,
+    up_axis: str = "y",
+) -> tuple[str, ...]:
+    """The methods for data that have some evidence, which the given bases get, where they can.
+
+    A shape model has no mesh for a mask; other models must be upright along y for gravity.
+
+    Examples
+    --------
+    >>> default_methods(with_evidence=("rigid",), evidence={"mask", "depth"}, has_shape=False)[5:]
+    ('rigid+mask', 'rigid+depth', 'rigid+mask+depth')
+    """
+    bases = [base for base in BASES if has_shape or base != SHAPE]
+    more = []
+    for base in (each for each in with_evidence if each in bases):
+        useless = {MASK} if base == SHAPE else {GRAVITY} if up_axis != "y" else set()
+        kinds = [kind for kind in EVIDENCE if kind in evidence and kind not in useless]
+        sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
+        more += ["+".join((base, *each)) for each in sets]
+    return (*bases, *more)
 
 
 @dataclass(frozen=True)
-class PhotosOptions(ExperimentOptions):
+class PhotosOptions(FunctionOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
@@ -72,8 +143,11 @@ class PhotosOptions(ExperimentOptions):
         if not math.isfinite(self.min_score):
             raise InputError(f"{self.min_score} is not a score", where="min_score")
         object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
+        from cadalign.evaluation.methods.registry import is_registered
+
         for name in self.methods:
-            check_method(name)
+            if is_own(name) or not is_registered(name):
+                check_method(name)
 
 
 OPTIONS = PhotosOptions

@@ -11,10 +11,16 @@ from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD
-from cadalign.evaluation.photos.names import PRIOR, RIGID, SHAPE, SIMILAR, STRETCHED
+from cadalign.evaluation.metrics.bop import BOP
+from cadalign.evaluation.metrics.kitti import KITTI
+from cadalign.evaluation.metrics.nine_dof import NINE_DOF
+from cadalign.evaluation.metrics.pascal3d import VIEWPOINT
+from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
+from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.photos.options import PRIOR, RIGID, SHAPE, SIMILAR, STRETCHED
 
-VIEWPOINT, NINE_DOF, SCAN2CAD = "viewpoint", "nine_dof", "scan2cad"
-KITTI, BOP = "kitti", "bop"
+SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)
+"""All sets of metrics, in the order of the result table's columns."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +29,7 @@ class Protocol:
 
     Parameters
     ----------
-    metrics : tuple of str
-        Kinds of metrics.
+    metrics : tuple of MetricSet
     best : str
         The method whose estimates are drawn, and which gets the evidence besides the rigid one.
     up_axis : str
@@ -38,7 +43,7 @@ class Protocol:
         Its keypoints are projections of the truth: noise is added.
     """
 
-    metrics: tuple[str, ...]
+    metrics: tuple[MetricSet, ...]
     best: str
     up_axis: str = "y"
     sigma_of_side: float = 1 / 64

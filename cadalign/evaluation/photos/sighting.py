@@ -8,16 +8,12 @@ import numpy as np
 from scipy import ndimage
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.datasets.photos.photo import NamedPoints, Photo, PhotoObject
-from cadalign.errors import CadalignError
+from cadalign.datasets.photos.photo import NamedPoints, PhotoObject
 from cadalign.estimation.fit import fit
-from cadalign.evaluation.instances.aligned import box_alignment
-from cadalign.evaluation.photos.cad import Cad
+from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import Protocol
-from cadalign.evaluation.runs.tables import Row
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.geometry.camera import Camera
 from cadalign.render.views.visibility import visible_keypoints
 from cadalign.seeding import instance_rng
@@ -26,81 +22,6 @@ ANNOTATED, DETECTED, SIMULATED = "annotated", "detected", "simulated"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
-
-
-class LeftOutError(CadalignError):
-    """An object, or a method on it, lacks what is asked for; that is no failure."""
-
-
-@dataclass(frozen=True, eq=False)
-class PhotoTarget:
-    """An object of a photo with its truth, as metrics need it.
-
-    Parameters
-    ----------
-    photo : Photo
-    found : PhotoObject
-    root : str
-        The data set's folder.
-    """
-
-    photo: Photo
-    found: PhotoObject
-    root: str
-
-    @property
-    def cad(self) -> Cad | None:
-        """The CAD model."""
-        model = self.found.model
-        return None if model is None else Cad(self.root, model.model_id, model)
-
-    @property
-    def bounds(self) -> FloatArray | None:
-        """The box (2, 3) of the CAD model; of an object without one, that of its truth."""
-        bounds = None if self.cad is None else self.cad.bounds
-        box = self.found.truth.box
-        if bounds is None and box is not None:
-            bounds = np.array([-box.extents / 2, box.extents / 2])
-        return bounds
-
-    @property
-    def gt(self) -> Alignment | None:
-        """The true alignment; where a box is known only, that of the model's box with it."""
-        truth = self.found.truth
-        if truth.cam_from_model is not None or truth.box is None or self.bounds is None:
-            return truth.cam_from_model
-        box = truth.box
-        pose = Alignment(box.rotation, box.center, np.ones(3))
-        own = np.array([-box.extents / 2, box.extents / 2])
-        return box_alignment(pose, own, model_bounds=self.bounds)
-
-    @property
-    def gt_box(self) -> Box | None:
-        """The true box."""
-        if self.found.truth.box is not None:
-            return self.found.truth.box
-        gt, bounds = self.gt, self.bounds
-        return None if gt is None or bounds is None else Box.from_model(bounds, gt)
-
-    @property
-    def camera(self) -> Camera | None:
-        """The photo's camera, or that of the annotation's convention at the object's rectangle.
-
-        Where the focal length is unknown, the true pose is of a camera whose principal point is at
-        the object; methods get the middle of its rectangle instead.
-        """
-        camera, annotated = self.photo.camera, self.found.truth.camera
-        if camera is None or camera.focal_known or annotated is None:
-            return camera
-        left, top, right, bottom = _rectangle(self.found)
-        middle = (left + right) / 2, (top + bottom) / 2
-        return Camera(camera.width, camera.height, annotated.fx, annotated.fy, *middle)
-
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method."""
-        found = self.found
-        model_id = f"{self.photo.name}/{found.object_id}"
-        return {"category": found.category, "model_id": model_id, "view": 0, "method": method}
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +148,7 @@ def _simulated(
         seen = np.isfinite(pixels).all(axis=1) & camera.contains(pixels)
     else:
         raise LeftOutError("there are neither keypoints nor a mesh to simulate them on")
-    name = target.names("")["model_id"]
+    name = target.names["model_id"]
     noise = instance_rng(options.seed, name, "keypoints").standard_normal((len(model), 2))
     pixels = camera.project_where_ahead(gt.apply(model.xyz)) + options.simulated_noise_px * noise
     return model, tuple(np.array(model.names)[seen].tolist()), pixels[seen]
@@ -249,18 +170,8 @@ def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, sour
         return options.sigma
     if protocol.sigma_of_width is not None and target.photo.camera is not None:
         return protocol.sigma_of_width * target.photo.camera.width
-    left, top, right, bottom = _rectangle(target.found)
+    left, top, right, bottom = rectangle_of(target.found)
     return max(protocol.sigma_of_side * float(max(right - left, bottom - top)), _LEAST_PX)
-
-
-def _rectangle(found: PhotoObject) -> FloatArray:
-    """The object's rectangle [px], or that of its keypoints."""
-    if found.bbox is not None:
-        return found.bbox
-    if found.keypoints is None or not len(found.keypoints):
-        raise LeftOutError("the object's place in the photo is not known")
-    points = found.keypoints.points_2d
-    return np.concatenate([points.min(axis=0), points.max(axis=0)])
 
 
 def _calibrated(sighting: Sighting) -> Sighting:

@@ -1,31 +1,194 @@
-"""Specification of the experiment on data sets of photos."""
+"""Specification of the experiment on data sets of photos.
+
+Cells of a summary: ``instances``, those with rows that are not left out, ``failed`` and
+``left_out``; ``keypoints``, the mean number of those that did not fail; over these the medians of
+the result table's errors, ``yaw_error_deg_90``, the 90th percentile, and ``milliseconds``, the
+median time of an estimate. Of all instances, failures included: ``accuracy_pi_6``, the share of
+rotation errors below 30 degrees; ``iou_25``, ``iou_50``, ``iou_75``, boxes with a larger IoU;
+``deg_5_cm_5`` and the like; ``scan2cad_aligned``; ``mssd_recall``, ``mspd_recall`` and
+``vsd_recall``, and their mean ``average_recall``. NaN where there is none, as for objects whose
+truth is not known.
+
+The categories of objects with simulated keypoints are marked so. Behind all categories comes
+``mean of categories``, as Scan2CAD and PASCAL3D+ report.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError
-from cadalign.evaluation.outcome import FAILED, LEFT_OUT
-from cadalign.evaluation.photos.experiment import COLUMNS, PhotosExperiment
-from cadalign.evaluation.photos.figures import plots
-from cadalign.evaluation.photos.names import DEPTH, GRAVITY, MASK, RIGID, default_methods
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.protocols import protocol_of
-from cadalign.evaluation.photos.shapes import fingerprint, shapes_of
+from cadalign.evaluation.metrics import kitti
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.bop import BOP
+from cadalign.evaluation.metrics.kitti import KITTI
+from cadalign.evaluation.metrics.nine_dof import NINE_DOF
+from cadalign.evaluation.metrics.pascal3d import ROTATION, VIEWPOINT
+from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
+from cadalign.evaluation.metrics.sets import medians_of, shares_of
+from cadalign.evaluation.metrics.table import BOX_IOU, Metric
+from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK
+from cadalign.evaluation.photos.experiment import COLUMNS, photos_benchmark
+from cadalign.evaluation.photos.options import (
+    DEPTH,
+    GRAVITY,
+    MASK,
+    RIGID,
+    PhotosOptions,
+    default_methods,
+)
+from cadalign.evaluation.photos.protocols import SETS, protocol_of
 from cadalign.evaluation.photos.sighting import SIMULATED
-from cadalign.evaluation.photos.summary import GALLERY, HEADLINE, console_table, summarize
-from cadalign.evaluation.photos.tasks import PhotoTask, PhotoTasks, opened
+from cadalign.evaluation.photos.tasks import UNREADABLE, PhotoTask, PhotoTasks, opened
+from cadalign.evaluation.plots import Plot, cumulative
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
 from cadalign.evaluation.spec import Spec, on_datasets
-from cadalign.evaluation.summary import Conclusion, Summary
+from cadalign.evaluation.summary import (
+    ALL,
+    Conclusion,
+    ConsoleTable,
+    Summary,
+    known,
+    mean_of,
+    median_of,
+    summaries_of,
+    text_rows,
+    where,
+)
+
+MEAN = "mean of categories"
+GALLERY = (
+    *(metric for each in SETS for metric in each.medians),
+    metrics.RMS,
+    *BOP.shares,
+)
+"""Errors of single objects."""
+# The data sets' own first.
+_OWN_FIRST = (SCAN2CAD, KITTI, BOP, VIEWPOINT, NINE_DOF)
+HEADLINE = (
+    *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT, metrics.KEYPOINTS),
+    *(metric for each in _OWN_FIRST for metric in each.headline),
+    *(metric for each in _OWN_FIRST for metric in each.details),
+    *(metrics.RMS, metrics.QUERY_MILLISECONDS),
+)
+
+
+def summarize(run: Run) -> list[Summary]:
+    """A summary for every category and method, for all together, and the mean of categories."""
+    return summarize_cells(run.cells, run.methods, further=run.metrics)
+
+
+def summarize_cells(
+    cells: Cells, methods: Sequence[str], *, further: Sequence[Metric] = ()
+) -> list[Summary]:
+    """Summaries of the columns of a result table; see `summarize`."""
+    marked = {**cells, "category": _categories(cells)}
+    found = summaries_of(marked, methods, _summarize, further=further)
+    names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
+    if len(names) < 2:
+        return found
+    return [*found, *(_mean([s for s in found if s.method == name]) for name in methods)]
+
+
+def _categories(cells: Cells) -> npt.NDArray[np.object_]:
+    """The rows' categories, those of objects with simulated keypoints marked."""
+    categories, is_simulated = cells["category"], cells["source"] == SIMULATED
+    known_otherwise = set(categories[(cells["status"] != LEFT_OUT) & ~is_simulated].tolist())
+    only = set(categories[is_simulated].tolist()) - known_otherwise
+    marked = is_simulated | np.isin(categories.astype(str), sorted(only))
+    names = [
+        f"{name}, {SIMULATED}" if mark else name
+        for name, mark in zip(categories.tolist(), marked.tolist(), strict=True)
+    ]
+    return np.array(names, dtype=object)
+
+
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
+    """The summaries for the console: the columns that the data set has."""
+    sets = protocol_of(str(run.config.get("kind"))).metrics
+    columns = (
+        *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
+        *(column for each in sets for column in each.console),
+        *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
+        *run.metrics,
+    )
+    shown = [column for column in columns if any(_is_known(each[column.key]) for each in summaries)]
+    return ConsoleTable(
+        title="Medians and shares per category and method",
+        labels=("category", "method"),
+        heads=tuple(column.symbol for column in shown),
+        rows=text_rows(summaries, shown),
+        note=_note(summaries),
+        narrow=True,
+        wraps=True,
+    )
+
+
+def _note(summaries: Sequence[Summary]) -> str:
+    has_simulated = any(SIMULATED in each.group for each in summaries)
+    more = f"; {SIMULATED}: keypoints projected with the true pose, with noise"
+    return f"shares count failures{more if has_simulated else ''}"
+
+
+def _summarize(category: str, method: str, cells: Cells) -> Summary:
+    chosen = where(cells, cells["method"] == method)
+    left_out = chosen["status"] == LEFT_OUT
+    rated = where(chosen, ~left_out)
+    solved = where(rated, rated["status"] == OK)
+    values = {
+        "instances": len(rated["method"]),
+        "failed": int((rated["status"] == FAILED).sum()),
+        metrics.LEFT_OUT.key: int(left_out.sum()),
+        "keypoints": mean_of(solved["keypoints"]),
+        **medians_of(SETS, solved, metrics.RMS),
+        **shares_of(SETS, rated, solved),
+        "milliseconds": 1e3 * median_of(solved["seconds"]),
+    }
+    return Summary(category, {"category": category, "method": method}, values)
+
+
+def _mean(found: Sequence[Summary]) -> Summary:
+    """The mean of a method's values over categories; its counts are those of all."""
+    (every,) = (each for each in found if each.group == ALL)
+    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
+    counts = ("instances", "failed", metrics.LEFT_OUT.key)
+    values = {
+        key: value if key in counts else mean_of(np.array([each.values[key] for each in single]))
+        for key, value in every.values.items()
+    }
+    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
+
+
+def _is_known(value: float) -> bool:
+    return value == value
+
+
+_CURVES = (
+    (ROTATION, np.array([0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 45, 90])),
+    (replace(kitti.DEPTH, log=False), np.array([1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
+    (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
+    (replace(kitti.IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
+)
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    """Shares of objects within an error, for the errors that the data sets have."""
+    return [
+        cumulative(runs, metric, places, title=f"{metric.label} on photos")
+        for metric, places in _CURVES
+        if any(len(known(run.cells[metric.key])) for run in runs)
+    ]
+
 
 _CHUNK, _LARGE_CHUNK = 4, 32
 _LARGE = 500  # photos
@@ -47,17 +210,18 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
         options = replace(options, methods=methods)
     tasks = PhotoTasks(dataset, options.max_photos)
     config = {
-        **asdict(options),
+        **options.as_config(),
         "experiment": options.experiment,
         "root": str(options.root.absolute()),
         "kind": dataset.kind,
         "shape": [str(path.absolute()) for path in options.shape],
-        "shapes": fingerprint(shapes),
+        "shapes": shapes_fingerprint(shapes),
         "annotations": tasks.fingerprint(),
     }
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
-    return Plan(PhotosExperiment(options, shapes, pictures), tasks, config, chunk)
+    benchmark = photos_benchmark(options, shapes, pictures)
+    return Plan(benchmark, tasks, config | benchmark.config, chunk)
 
 
 def _evidence(dataset: PhotoDataset) -> set[str]:

@@ -34,9 +34,10 @@ class PhotoTask:
     name: str
     problem: str = ""
 
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method on the whole record."""
-        return {"category": UNREADABLE, "model_id": self.name, "view": 0, "method": method}
+    @property
+    def names(self) -> Row:
+        """The cells that name the rows of the whole record, but for the method."""
+        return {"category": UNREADABLE, "model_id": self.name, "view": 0}
 
 
 class PhotoTasks(Sequence[PhotoTask]):

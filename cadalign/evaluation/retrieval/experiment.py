@@ -34,23 +34,23 @@ rotation_error_deg
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import DegenerateError
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.outcome import FAILED, Outcome, overlap, overlap_up_to_scale, reason_of
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Rows
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import rotation_error
@@ -88,17 +88,33 @@ REQUIRED_COLUMNS: Columns = tuple(
 """Those that all runs have; earlier ones lack the others."""
 
 
-@dataclass(frozen=True)
-class RetrievalExperiment:
-    """Evaluates retrieval from a library's file, which all workers map into memory."""
+_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
 
+
+@dataclass(frozen=True, eq=False)
+class RetrievalInstance:
+    """A query of a library's file, with the models that count as the true one."""
+
+    library: str
+    task: RetrievalTask
+    query: RetrievalQuery
+    gt: LibraryModel
+    alike: frozenset[ModelKey]
+    protocol: str
+    options: RetrievalRunOptions
+
+
+@dataclass(frozen=True)
+class RetrievalQueries(Setting):
+    """Queries of a library's file, which all workers map into memory: the experiment's setting."""
+
+    names = _NAMES
     columns = COLUMNS
-    timing_columns = (*_NAMES, ("seconds", float))
 
     library: str
     options: RetrievalRunOptions
 
-    def warm_up(self) -> None:
+    def warm_up(self) -> Sequence[RetrievalTask]:
         """Compile the kernels."""
         rng = np.random.default_rng(0)
         models = [
@@ -108,69 +124,68 @@ class RetrievalExperiment:
         pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
         pixels = KEYPOINT_CAMERA.project(pose.apply(models[0].xyz))
         Library.from_models(models).retrieve(pixels, np.arange(9), KEYPOINT_CAMERA)
+        return ()
 
-    def evaluate(self, tasks: Sequence[RetrievalTask]) -> Rows:
-        """A row for every task, protocol and method."""
-        return Rows.of(outcome for task in tasks for outcome in self._outcomes(task))
+    def cases(self, tasks: Sequence[RetrievalTask]) -> list[Case]:
+        """A case for every task and protocol."""
+        return [case for task in tasks for case in self._cases(task)]
 
-    def failure(self, task: RetrievalTask, reason: str) -> Rows:
-        """A failed row for every protocol and method."""
-        return Rows.of(self._without_match(task, FAILED, reason))
+    def failed(self, task: RetrievalTask) -> list[Case]:
+        """The cases of a task without a query."""
+        return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]
 
-    def _without_match(self, task: RetrievalTask, status: str, reason: str) -> list[Outcome]:
-        return [
-            Outcome(task.names(*names), dict(_NO_MATCH), status, reason)
-            for names in product(self.options.protocols, self.options.methods)
-        ]
-
-    def _outcomes(self, task: RetrievalTask) -> list[Outcome]:
+    def _cases(self, task: RetrievalTask) -> list[Case]:
         gt = _opened(self.library)[task.category, task.model_id]
         try:
             query = observe_model(gt, task, seed=self.options.seed)
         except DegenerateError as error:
-            return self._without_match(task, NO_VIEW, str(error))
+            return [replace(case, error=error, status=NO_VIEW) for case in self.failed(task)]
+        alike = same_shapes(self.library, gt.key)
         return [
-            self._outcome(task, query, gt, *names)
-            for names in product(self.options.protocols, self.options.methods)
+            replace(
+                case,
+                instance=RetrievalInstance(
+                    self.library, task, query, gt, alike, protocol, self.options
+                ),
+            )
+            for case, protocol in zip(self.failed(task), self.options.protocols, strict=True)
         ]
 
-    def _outcome(
-        self,
-        task: RetrievalTask,
-        query: RetrievalQuery,
-        gt: LibraryModel,
-        protocol: str,
-        method: str,
-    ) -> Outcome:
-        library, names = _opened(self.library), task.names(protocol, method)
-        alike = same_shapes(self.library, gt.key)
-        start = time.perf_counter()
-        try:
-            matches = library.retrieve(
-                query.points_2d,
-                query.semantic_ids,
-                KEYPOINT_CAMERA,
-                top=TOP,
-                category=None if self.options.whole_library else task.category,
-                sigma=max(task.noise_px, _LEAST_SIGMA),
-                shape_sigma=self._shape_sigma(protocol, method),
-                exclude=alike if protocol == LEAVE_OUT else (),
-                workers=1,
-                **_OPTIONS[method],
-            )
-            seconds = time.perf_counter() - start
-            best = library[matches[0].category, matches[0].model_id]
-            values = match_values(matches, best=best, gt=gt, placed=query.gt, alike=alike)
-        except CadalignError as error:
-            return Outcome.failure(reason_of(error), names, **_NO_MATCH)
-        return Outcome(names, values, seconds=seconds)
-
-    def _shape_sigma(self, protocol: str, method: str) -> float:
-        exact = protocol == LEAVE_IN and method == "optimal"
-        return 0.0 if exact else self.options.shape_sigma
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Compare matches with the truth; see `match_values`."""
+        return [attempt(_row, instance, matches) for instance, matches in pairs]
 
 
-_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
+def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
+    """The methods of the options on queries of a library's file."""
+    methods = choose_methods(options.methods, _OWN_METHODS, general=False)
+    return Benchmark(RetrievalQueries(library, options), methods)
+
+
+def _retrieve(instance: RetrievalInstance, *, method: str) -> list[Match]:
+    options, task = instance.options, instance.task
+    is_exact = instance.protocol == LEAVE_IN and method == "optimal"
+    return _opened(instance.library).retrieve(
+        instance.query.points_2d,
+        instance.query.semantic_ids,
+        KEYPOINT_CAMERA,
+        top=TOP,
+        category=None if options.whole_library else task.category,
+        sigma=max(task.noise_px, _LEAST_SIGMA),
+        shape_sigma=0.0 if is_exact else options.shape_sigma,
+        exclude=instance.alike if instance.protocol == LEAVE_OUT else (),
+        workers=1,
+        **_OPTIONS[method],
+    )
+
+
+_OWN_METHODS = {name: Method(name, partial(_retrieve, method=name)) for name in _OPTIONS}
+
+
+def _row(instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
+    best = _opened(instance.library)[matches[0].category, matches[0].model_id]
+    placed = instance.query.gt
+    return match_values(matches, best=best, gt=instance.gt, placed=placed, alike=instance.alike)
 
 
 def match_values(

@@ -1,20 +1,186 @@
-"""Specification of the retrieval experiment."""
+"""Specification of the retrieval experiment.
+
+Cells of a summary: ``queries``, the number made, without models of which no view shows enough
+keypoints; ``failed``, those without a match; ``rank_1`` and ``rank_5``, the share of the queries
+with the true model, or one that counts as it, first or among the first 5; ``reciprocal_rank``, the
+mean of one over the rank, 0 beyond 50 (these three are NaN in the leave-out protocol); ``score``,
+the mean probability of the best match, which is the rank-1 rate where it is calibrated; ``none``,
+the share of the queries whose object is more likely none of the models than one, which is false
+in the leave-in protocol and true in the other (NaN in runs without it); of the best match
+the medians ``shape_distance``, ``box_iou``, ``box_iou_up_to_scale`` (NaN in runs that have none),
+``rotation_error_deg`` and the mean ``mean_box_iou``; ``milliseconds``, the median time of a query
+on one core.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.metrics import QUERIES
-from cadalign.evaluation.retrieval.experiment import REQUIRED_COLUMNS, RetrievalExperiment
-from cadalign.evaluation.retrieval.options import RetrievalRunOptions
-from cadalign.evaluation.retrieval.summary import HEADLINE, console_table, lines, plots, summarize
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import QUERIES, Metric
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.plots import Plot, Trace
+from cadalign.evaluation.retrieval.experiment import NO_VIEW, REQUIRED_COLUMNS, retrieval_benchmark
+from cadalign.evaluation.retrieval.options import LEAVE_IN, LEAVE_OUT, RetrievalRunOptions
 from cadalign.evaluation.retrieval.tasks import RetrievalTask, retrieval_tasks
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec, on_datasets
+from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 from cadalign.retrieval.library import Library
+
+HEADLINE = (
+    *(metrics.INSTANCES, metrics.FAILED, metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK),
+    *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
+)
+_KEYPOINTS = replace(metrics.KEYPOINTS, label="keypoints in the image", log=False)
+_PLOTS = (
+    (metrics.RANK_1, LEAVE_IN),
+    (metrics.RANK_5, LEAVE_IN),
+    (replace(metrics.BOX_IOU, label="median box IoU"), LEAVE_OUT),
+    (replace(metrics.SHAPE_DISTANCE, label="median shape distance"), LEAVE_OUT),
+)
+
+
+def summarize(run: Run) -> list[Summary]:
+    """A summary for every category, protocol, method, noise and number of keypoints."""
+    cells = run.cells
+    categories = sorted(set(cells["category"].tolist()))
+    groups = [*categories, ALL] if len(categories) > 1 else [ALL]
+    return [
+        _summarize(cells, category, protocol, method, noise, keypoints)
+        for category in groups
+        for protocol in dict.fromkeys(cells["protocol"].tolist())
+        for method in run.methods
+        for noise in np.unique(cells["noise_px"]).tolist()
+        for keypoints in np.unique(cells["keypoints"]).tolist()
+    ]
+
+
+def lines(summaries: Sequence[Summary]) -> list[Summary]:
+    """Lines of the headline table, those of a group together."""
+    groups: dict[str, list[Summary]] = {}
+    for summary in summaries:
+        if summary.tasks:
+            groups.setdefault(summary.group, []).append(summary)
+    return [summary for found in groups.values() for summary in found]
+
+
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
+    """Rates and medians over all categories for the console."""
+    shown = (
+        *(metrics.RANK_1, metrics.RANK_5, metrics.RECIPROCAL_RANK, metrics.SCORE),
+        *(metrics.NONE, metrics.SHAPE_DISTANCE, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+        *(metrics.MATCH_ROTATION, metrics.QUERY_MILLISECONDS),
+    )
+    return ConsoleTable(
+        title="Rates over the queries, medians of the best match",
+        labels=("protocol", "method"),
+        heads=("px", metrics.KEYPOINTS.symbol, "n", *(metric.symbol for metric in shown)),
+        rows=[
+            (
+                s["protocol"],
+                s.method,
+                *(f"{s['noise_px']:g}", str(s["keypoints"]), str(s["queries"])),
+                *(metric.text(s[metric.key]) for metric in shown),
+            )
+            for s in summaries
+            if s["category"] == ALL
+        ],
+        note="",
+        narrow=True,
+        grouped=False,
+    )
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    """Rates and medians against the number of keypoints, over all categories, for each noise."""
+    found = [[s for s in summarize(run) if s["category"] == ALL and s.tasks] for run in runs]
+    return [
+        _plot(metric, protocol, noise, found)
+        for metric, protocol in _PLOTS
+        for noise in sorted({s["noise_px"] for summaries in found for s in summaries})
+        if any(s["protocol"] == protocol and s["noise_px"] == noise for ss in found for s in ss)
+    ]
+
+
+def _plot(metric: Metric, protocol: str, noise: float, found: Sequence[Sequence[Summary]]) -> Plot:
+    chosen = [
+        [s for s in summaries if s["protocol"] == protocol and s["noise_px"] == noise]
+        for summaries in found
+    ]
+    traces = []
+    for index, summaries in enumerate(chosen):
+        for method in dict.fromkeys(s.method for s in summaries):
+            rows = [s for s in summaries if s.method == method]
+            y = [s[metric.key] for s in rows]
+            traces.append(Trace.of(index, method, [s["keypoints"] for s in rows], y, metric))
+    queries = sorted({s["queries"] for summaries in chosen for s in summaries})
+    count = f"{queries[0]:,} to {queries[-1]:,}" if len(queries) > 1 else f"{queries[0]:,}"
+    return Plot(
+        id=f"{metric.key}_{noise:g}",
+        x=_KEYPOINTS,
+        y=metric,
+        traces=traces,
+        note="over all categories",
+        caption=f"{protocol}; {metric.axis}; {count} queries each",
+        figure=f"{protocol.replace('-', '_')}_{metric.key}",
+        variant=f"{noise:g} px",
+        title=f"{metric.label}, {noise:g} px of noise, {protocol}",
+    )
+
+
+def _summarize(
+    cells: Cells, category: str, protocol: str, method: str, noise: float, keypoints: int
+) -> Summary:
+    chosen = (
+        (cells["protocol"] == protocol)
+        & (cells["method"] == method)
+        & (cells["noise_px"] == noise)
+        & (cells["keypoints"] == keypoints)
+    )
+    if category != ALL:
+        chosen &= cells["category"] == category
+    solved = chosen & (cells["status"] == OK)
+    made = chosen & (cells["status"] != NO_VIEW)
+    queries = int(made.sum())
+    ranks = cells["rank"][made].astype(float)  # NaN beyond 50
+    up_to_scale = cells.get("box_iou_up_to_scale", np.full(len(solved), np.nan))
+    none = cells.get("none_probability", np.full(len(solved), np.nan))
+    known = solved & np.isfinite(none)
+    ranked = queries and protocol == LEAVE_IN
+    values = {
+        "queries": queries,
+        "failed": queries - int(solved.sum()),
+        "rank_1": float((ranks == 1).mean()) if ranked else np.nan,
+        "rank_5": float((ranks <= 5).mean()) if ranked else np.nan,
+        "reciprocal_rank": float(np.nan_to_num(1 / ranks).mean()) if ranked else np.nan,
+        "score": mean_of(cells["score"][solved]),
+        "none": float((none > 0.5)[known].mean()) if known.any() else np.nan,
+        "shape_distance": median_of(cells["shape_distance"][solved]),
+        "box_iou": median_of(cells["box_iou"][solved]),
+        "box_iou_up_to_scale": median_of(up_to_scale[solved]),
+        "mean_box_iou": mean_of(cells["box_iou"][solved]),
+        "rotation_error_deg": median_of(cells["rotation_error_deg"][solved]),
+        "milliseconds": median_of(1e3 * cells["seconds"][solved]),
+    }
+    names = {
+        "category": category,
+        "protocol": protocol,
+        "method": method,
+        "noise_px": noise,
+        "keypoints": keypoints,
+    }
+    group = f"{category}, {protocol}, {noise:g} px, {keypoints} keypoints"
+    return Summary(group, names, values, tasks=queries)
+
 
 _CHUNK = 16
 
@@ -37,7 +203,7 @@ def plan(options: RetrievalRunOptions, folder: RunFolder) -> Plan[RetrievalTask]
         "root": str(options.root.absolute()),
         "library": name,
     }
-    return Plan(RetrievalExperiment(str(file.absolute()), options), tasks, config, _CHUNK)
+    return Plan(retrieval_benchmark(str(file.absolute()), options), tasks, config, _CHUNK)
 
 
 def _library_of(options: RetrievalRunOptions) -> Library:

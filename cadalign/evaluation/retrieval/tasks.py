@@ -31,9 +31,9 @@ class RetrievalTask:
     noise_px: float
     keypoints: int
 
-    def names(self, protocol: str, method: str) -> Row:
-        """The cells that name the row of a protocol and method."""
-        return {**asdict(self), "protocol": protocol, "method": method}
+    def names(self, protocol: str) -> Row:
+        """The cells that name the rows of a protocol, but for the method."""
+        return {**asdict(self), "protocol": protocol}
 
 
 def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:

@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from cadalign.arrays import is_number
 from cadalign.errors import DataError
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import (
     DONE_ANEW,
@@ -24,7 +25,7 @@ from cadalign.evaluation.runs.tables import (
     read_table,
     uncompressed_bytes,
 )
-from cadalign.io.documents import read_json
+from cadalign.io.documents import convert, in_file, read_json
 
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
@@ -97,6 +98,12 @@ class Run:
     def methods(self) -> list[str]:
         """Names of the methods in the run's order."""
         return list(dict.fromkeys(self.results["method"].to_pylist()))
+
+    @cached_property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Registered metrics, as the run's configuration describes them."""
+        with in_file(self.folder.config_file):
+            return convert(self.config.get("metrics") or (), tuple[Metric, ...], "metrics")
 
     @property
     def noise_px(self) -> float | None:

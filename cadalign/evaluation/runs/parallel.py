@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import os
+import pickle
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -207,6 +208,8 @@ def _check_life(
     deadly: tuple[type[BaseException], ...],
 ) -> None:
     """Let one worker compile what all will need, and see that it lives."""
+    if deadly:
+        pickle.dumps(experiment)  # says which function cannot be sent, where an executor does not
     for attempt in range(3):
         try:
             executor().submit(experiment.warm_up).result()

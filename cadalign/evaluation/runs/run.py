@@ -130,8 +130,9 @@ def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> No
 def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Columns]:
     """The columns of a run's tables by file."""
     tables = {folder.timings: experiment.timing_columns}
-    if hasattr(experiment, "record_columns"):
-        tables[folder.records] = experiment.record_columns
+    records: Columns | None = getattr(experiment, "record_columns", None)
+    if records is not None:
+        tables[folder.records] = records
     # The results last: they say that a chunk, or the run, is done.
     return {**tables, folder.results: experiment.columns}
 

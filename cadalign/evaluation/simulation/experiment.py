@@ -6,21 +6,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
 
-import numpy as np
-
-from cadalign.errors import CadalignError
-from cadalign.estimation.fit import fit, fit_batch
-from cadalign.evaluation import metrics
-from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
-from cadalign.evaluation.accuracy.methods import LIMIT, fit_options
-from cadalign.evaluation.outcome import Outcome, alignment_errors
+from cadalign.estimation.result import Result
+from cadalign.evaluation.benchmark import Benchmark, Case, Pair, Setting
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Rows
 from cadalign.evaluation.simulation.options import SweepKind
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
@@ -49,45 +45,62 @@ def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
 
 
 @dataclass(frozen=True)
-class SweepExperiment:
-    """Evaluates methods on random problems."""
+class SweepProblems(Setting):
+    """Random problems: the setting of the simulation."""
 
     columns = COLUMNS
     # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
-    timing_columns = (*(("points", int), ("run", int), ("method", str), ("seconds", float)),)
+    names = (("points", int), ("run", int), ("method", str))
 
     kind: SweepKind
     seed: int
 
-    def warm_up(self) -> None:
-        """Compile the solvers."""
-        self.evaluate([SweepTask(self.kind.values[0], 0)])
+    def warm_up(self) -> Sequence[SweepTask]:
+        """A task whose evaluation compiles the solvers."""
+        return [SweepTask(self.kind.values[0], 0)]
 
-    def evaluate(self, tasks: Sequence[SweepTask]) -> Rows:
-        """A row for every task and method."""
-        return Rows.of(
-            outcome
-            for _, some in groupby(tasks, lambda task: task.value)
-            for outcome in self._evaluate_same(list(some))
+    def cases(self, tasks: Sequence[SweepTask]) -> list[Case]:
+        """The problem of every task."""
+        return [Case(self._names(task), instance=self._told(task)) for task in tasks]
+
+    def failed(self, task: SweepTask) -> list[Case]:
+        """The case of a task without a problem."""
+        return [Case(self._names(task))]
+
+    def given(self, instance: tuple[Problem, float]) -> MethodInput:
+        """The points of the problem: methods are told the standard deviation of the noise."""
+        problem, sigma = instance
+        inliers = None if problem.outliers is None else ~problem.outliers
+        return MethodInput(
+            problem.points_3d,
+            problem.points_2d,
+            problem.camera,
+            sigma,
+            gt=problem.alignment,
+            inliers=inliers,
         )
 
-    def failure(self, task: SweepTask, reason: str) -> Rows:
-        """A failed row for every method."""
-        return Rows.of(
-            Outcome.failure(reason, self._names(task, method)) for method in self.kind.methods
-        )
+    def answered(
+        self, method: Method, instance: tuple[Problem, float], answer: Alignment | Result
+    ) -> Alignment:
+        """The alignment."""
+        return answer if isinstance(answer, Alignment) else answer.alignment
+
+    def compared(self, instance: tuple[Problem, float], estimate: Alignment) -> Compared:
+        """The estimated and the true alignment."""
+        return Compared(estimate, instance[0].alignment)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Errors of pose and stretch."""
+        return [alignment_errors(est=est, gt=problem.alignment) for (problem, _), est in pairs]
 
     def problem(self, task: SweepTask) -> Problem:
         """The problem of a task."""
         rng = instance_rng(self.seed, self.kind.name, repr(float(task.value)), str(task.run))
         return simulate_problem(rng, **self._setting(task))
 
-    def _evaluate_same(self, tasks: Sequence[SweepTask]) -> list[Outcome]:
-        """Outcomes of tasks of one value: methods are told the standard deviation of the noise."""
-        problems = [self.problem(task) for task in tasks]
-        sigma = self._setting(tasks[0])["noise_px"] or 1.0
-        per_method = [self._run(method, tasks, problems, sigma) for method in self.kind.methods]
-        return [outcome for outcomes in zip(*per_method, strict=True) for outcome in outcomes]
+    def _told(self, task: SweepTask) -> tuple[Problem, float]:
+        return self.problem(task), self._setting(task)["noise_px"] or 1.0
 
     def _setting(self, task: SweepTask) -> Row:
         """Points, noise and outliers of a task."""
@@ -95,69 +108,15 @@ class SweepExperiment:
         setting = {**held, self.kind.column: task.value}
         return {**setting, "points": int(setting["points"])}
 
-    def _run(
-        self, method: str, tasks: Sequence[SweepTask], problems: Sequence[Problem], sigma: float
-    ) -> list[Outcome]:
-        """One method's outcome of every task."""
-        if self.kind.is_timed:
-            timed = [_timed(method, problem, sigma) for problem in problems]
-        else:
-            start = time.perf_counter()
-            estimates = _estimates(method, problems, sigma)
-            share = (time.perf_counter() - start) / len(problems)
-            timed = [(estimate, share) for estimate in estimates]
-        outcomes = []
-        for task, problem, (est, seconds) in zip(tasks, problems, timed, strict=True):
-            names = self._names(task, method)
-            if isinstance(est, CadalignError):
-                outcome = Outcome.failure(str(est), names)
-            else:
-                outcome = Outcome(names, alignment_errors(est=est, gt=problem.alignment))
-            outcomes.append(replace(outcome, seconds=seconds))
-        return outcomes
-
-    def _names(self, task: SweepTask, method: str) -> Row:
-        return {**self._setting(task), "run": task.run, "method": method}
+    def _names(self, task: SweepTask) -> Row:
+        return {**self._setting(task), "run": task.run}
 
 
-def _estimates(
-    method: str, problems: Sequence[Problem], sigma: float
-) -> list[Alignment | CadalignError]:
-    """A method's estimate of every problem."""
-    if method == LIMIT:
-        return [_bound(problem) for problem in problems]
-    batch = fit_batch(
-        [problem.points_3d for problem in problems],
-        [problem.points_2d for problem in problems],
-        problems[0].camera,
-        **fit_options(method, sigma=sigma, ransac=None),
-    )
-    return [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
-
-
-def _timed(
-    method: str, problem: Problem, sigma: float
-) -> tuple[Alignment | CadalignError, float | None]:
-    """An estimate, and the time of the quickest of some calls."""
-    if method == LIMIT:
-        return _bound(problem), None
-    best, how = np.inf, fit_options(method, sigma=sigma, ransac=None)
-    try:
-        for _ in range(_REPEATS):
-            start = time.perf_counter()
-            result = fit(problem.points_3d, problem.points_2d, problem.camera, **how)
-            best = min(best, time.perf_counter() - start)
-    except CadalignError as error:
-        return error, None
-    return result.alignment, best
-
-
-def _bound(problem: Problem) -> Alignment | CadalignError:
-    """The bound of an estimator that knows the outliers."""
-    kept = slice(None) if problem.outliers is None else ~problem.outliers
-    try:
-        return limit_estimate(
-            problem.points_3d[kept], problem.points_2d[kept], problem.camera, problem.alignment
-        )
-    except CadalignError as error:
-        return error
+def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
+    """The methods of a sweep on its problems: in batches, or timed alone and several times."""
+    methods = choose_methods(kind.methods)
+    setting, further = SweepProblems(kind, seed), choose_metrics(metrics, COLUMNS)
+    if kind.is_timed:
+        return Benchmark(setting, methods, repeats=_REPEATS, metrics=further)
+    batched = frozenset(each.name for each in methods)
+    return Benchmark(setting, methods, batched, metrics=further)

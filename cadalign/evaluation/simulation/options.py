@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import FunctionOptions
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS, _RUNTIME)}
 
 
 @dataclass(frozen=True)
-class SweepOptions(ExperimentOptions):
+class SweepOptions(FunctionOptions):
     """Repeat the AEPnP paper's simulation: a table, a page, and figures as PNG and PDF."""
 
     experiment = "simulate"
@@ -98,12 +98,16 @@ class SweepOptions(ExperimentOptions):
                 fix=f"known are {', '.join(SWEEPS)}",
             )
         if self.methods is not None:
-            from cadalign.evaluation.accuracy.methods import check_methods
+            from cadalign.evaluation.methods.registry import checked_names
 
-            object.__setattr__(self, "methods", check_methods(self.methods))
+            object.__setattr__(self, "methods", checked_names(self.methods))
         if self.values is not None:
             object.__setattr__(self, "values", tuple(float(value) for value in self.values))
         _check_values(self.kind)
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods beside the sweep's own."""
+        return replace(self, methods=(*self.kind.methods, *names))
 
     @property
     def kind(self) -> SweepKind:

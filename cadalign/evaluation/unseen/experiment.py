@@ -36,28 +36,29 @@ The metrics of failed rows are empty.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Pair, Setting, attempt
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
-from cadalign.evaluation.outcome import Outcome, overlap, overlap_up_to_scale, reason_of
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared, choose_metrics
+from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Rows
-from cadalign.evaluation.unseen.calibration import probability_level
-from cadalign.evaluation.unseen.learned import LearnedFiles
-from cadalign.evaluation.unseen.methods import ShapeEstimate, estimate_shape
+from cadalign.evaluation.shape_files import LearnedFiles
+from cadalign.evaluation.unseen.methods import OWN_METHODS, ShapeEstimate, UnseenInstance
 from cadalign.evaluation.unseen.options import UnseenOptions
 from cadalign.evaluation.unseen.records import keep_preview, sighting_record
 from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTask, observe_object
@@ -70,10 +71,52 @@ from cadalign.geometry.metrics import (
 )
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import probability_within
 
-_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
+# Of a covariance's largest eigenvalue, and of the square of the largest length [units squared].
+_NO_VARIANCE = 1e-12
+
+
+def probability_level(
+    error: FloatArray, covariance: FloatArray, degrees_of_freedom: float | None = None
+) -> float | None:
+    """Probability of the smallest ellipsoid about the estimate that holds the truth.
+
+    Parameters
+    ----------
+    error : (k,) float
+        Estimate minus truth.
+    covariance : (k, k) float
+        As the estimator states it. Directions without variance are held to be known.
+    degrees_of_freedom : float, optional
+        Of a t distribution; None for a Gaussian.
+
+    Returns
+    -------
+    float or None
+        In [0, 1], uniform where the covariance is that of the errors; 1 if the error has a part in
+        a direction without variance; None if there is no variance at all.
+
+    Examples
+    --------
+    >>> round(probability_level(np.array([1.0]), np.array([[1.0]])), 4)
+    0.6827
+    >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
+    True
+    """
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
+    if not np.isfinite(values).all() or not free.any():
+        return None
+    parts = vectors.T @ error
+    if (parts[~free] ** 2 > 1e-6 * values[-1]).any():
+        return 1.0
+    square = float((parts[free] ** 2 / values[free]).sum())
+    return float(probability_within(square, int(free.sum()), degrees_of_freedom))
+
+
 COLUMNS: Columns = (
-    *(*_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int)),
     *(("rotation_error_deg", float), ("best_rotation_error_deg", float)),
     *(("translation_error", float), ("translation_error_up_to_scale", float), ("box_iou", float)),
     *(("box_iou_up_to_scale", float), ("stated_box_iou_up_to_scale", float)),
@@ -86,18 +129,18 @@ _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class UnseenExperiment:
-    """Evaluates methods on objects with what was learned from others."""
+class UnseenObjects(Setting):
+    """Objects with what was learned from others: the setting of the experiment."""
 
+    names = VIEW_NAMES
     columns = COLUMNS
-    timing_columns = (*_NAMES, ("seconds", float))
     record_columns = RECORD_COLUMNS
 
     learned: LearnedFiles
     options: UnseenOptions
     previews: RunFolder | None = None  # of the objects' meshes
 
-    def warm_up(self) -> None:
+    def warm_up(self) -> Sequence[UnseenTask]:
         """Compile the kernels."""
         rng = np.random.default_rng(0)
         points = rng.uniform(-0.3, 0.3, (9, 3))
@@ -109,40 +152,74 @@ class UnseenExperiment:
             _coverage(align(model, view), sighting, ids, ids)
         box = Box.from_model(sighting.bounds, pose)
         overlap_up_to_scale(est=box, gt=box)
+        return ()
 
-    def evaluate(self, tasks: Sequence[UnseenTask]) -> Rows:
-        """A row for every task and method, and a record for every task."""
-        return Rows.joined([self._rows(task) for task in tasks])
+    def cases(self, tasks: Sequence[UnseenTask]) -> list[Case]:
+        """The view of every object, or why there is none."""
+        return [self._case(task) for task in tasks]
 
-    def failure(self, task: UnseenTask, reason: str) -> Rows:
-        """A failed row for every method."""
-        return Rows.of(Outcome.failure(reason, task.names(name)) for name in self.options.methods)
+    def failed(self, task: UnseenTask) -> list[Case]:
+        """The case of an object that is not seen."""
+        return [Case(task.names)]
 
-    def _rows(self, task: UnseenTask) -> Rows:
-        try:
-            sighting = observe_object(task, self.options)
-        except Exception as error:
-            return self.failure(task, reason_of(error))
-        answers = [self._answer(task, sighting, method) for method in self.options.methods]
-        outcomes, estimates = zip(*answers, strict=True)
-        sigma = self.options.noise_px or 1.0
-        if self.previews is not None and task.view == 0:
-            keep_preview(self.previews, self.options.root, task)
-        return Rows.of(outcomes, [sighting_record(sighting, outcomes, estimates, sigma=sigma)])
+    def _case(self, task: UnseenTask) -> Case:
+        sighting = attempt(observe_object, task, self.options)
+        if isinstance(sighting, Exception):
+            return Case(task.names, error=sighting)
+        facts = {"keypoints": len(sighting.points_2d)}
+        return Case(task.names, facts, UnseenInstance(task, sighting, self.learned, self.options))
 
-    def _answer(
-        self, task: UnseenTask, sighting: UnseenSighting, method: str
-    ) -> tuple[Outcome, ShapeEstimate | CadalignError]:
-        names, facts = task.names(method), {"keypoints": len(sighting.points_2d)}
-        start = time.perf_counter()
-        try:
-            found = estimate_shape(method, task, sighting, self.learned, self.options)
-            seconds = time.perf_counter() - start
-            values = facts | _errors(found, sighting)
-        except Exception as error:
-            reason = reason_of(error)
-            return Outcome.failure(reason, names, **facts), DegenerateError(reason)
-        return Outcome(names, values, seconds=seconds), found
+    def given(self, instance: UnseenInstance) -> MethodInput:
+        """The category's learned shape and the view; as points, its mean."""
+        shape, sighting = instance.shape, instance.sighting
+        known = np.isin(sighting.semantic_ids, shape.ids)
+        rows = shape.rows(sighting.semantic_ids[known].tolist())
+        return MethodInput(
+            shape.mean[rows],
+            sighting.points_2d[known],
+            KEYPOINT_CAMERA,
+            instance.sigma,
+            bounds=shape.mean[-2:],
+            make_views=lambda: (shape, [instance.view_of(shape)]),
+        )
+
+    def answered(
+        self, method: Method, instance: UnseenInstance, answer: Alignment | Result
+    ) -> ShapeEstimate:
+        """The estimate of the mean shape, or of a result's own."""
+        shape = instance.shape
+        ids = np.array(shape.ids, dtype=np.int64)
+        if isinstance(answer, Result) and tuple(answer.ids) == tuple(shape.ids):
+            return ShapeEstimate(answer.alignment, answer.bounds, ids, answer.points_3d, answer)
+        found = answer if isinstance(answer, Alignment) else answer.alignment
+        return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
+
+    def compared(self, instance: UnseenInstance, estimate: ShapeEstimate) -> Compared:
+        """The estimated alignment of the method's model, and the true one of the object."""
+        return Compared(estimate.alignment, instance.sighting.gt, estimate.result)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Errors and coverage by column."""
+        return [attempt(_errors, estimate, instance.sighting) for instance, estimate in pairs]
+
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row]:
+        """The record of the object, and once the preview of its mesh."""
+        instance: UnseenInstance = case.instance
+        if self.previews is not None and instance.task.view == 0:
+            keep_preview(self.previews, self.options.root, instance.task)
+        sigma = instance.sigma
+        return outcomes, sighting_record(instance.sighting, outcomes, estimates, sigma=sigma)
+
+
+def unseen_benchmark(
+    learned: LearnedFiles, options: UnseenOptions, previews: RunFolder | None = None
+) -> Benchmark:
+    """The methods of the options on unseen objects."""
+    methods = choose_methods(options.methods, OWN_METHODS)
+    metrics = choose_metrics(options.metrics, COLUMNS)
+    return Benchmark(UnseenObjects(learned, options, previews), methods, metrics=metrics)
 
 
 def _errors(found: ShapeEstimate, sighting: UnseenSighting) -> Row:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -15,13 +17,16 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.unseen.learned import LearnedFiles
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.evaluation.unseen.options import (
     EXACT,
     LIMIT,
     MEAN_RIGID,
+    MEAN_STRETCHED,
     NEAREST,
     RANDOM_RIGID,
+    RANDOM_STRETCHED,
     SHAPE,
     UnseenOptions,
 )
@@ -67,64 +72,77 @@ class ShapeEstimate:
         return (self.alignment, *(other.alignment for other in others))
 
 
-def estimate_shape(
-    method: str,
-    task: UnseenTask,
-    sighting: UnseenSighting,
-    learned: LearnedFiles,
-    options: UnseenOptions,
-) -> ShapeEstimate:
-    """The estimate of a method; raises CadalignError where it has none."""
-    if method == LIMIT:
-        return _bound(sighting)
-    if method == NEAREST:
-        return _nearest(task, sighting, learned, options)
-    shape = learned.shape(task.category)
-    if method == SHAPE:
-        return _aligned(shape, sighting, options, misfit_px=0.0)
-    if method == EXACT:
-        own = Model(points_3d=sighting.xyz, ids=sighting.all_ids.tolist())
-        return _aligned(own, sighting, options, misfit_px=0.0)
-    stretch = "none" if method in (RANDOM_RIGID, MEAN_RIGID) else None
-    if method.startswith("mean"):
-        rows = shape.mean
-        model = Model(points_3d=rows[:-2], ids=shape.ids, bounds=rows[-2:], stretch=stretch)
-    else:
-        other = _random_model(task, sighting, learned, options)
-        ids = other.semantic_ids.tolist()
-        model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
-    return _aligned(model, sighting, options, misfit_px=_MISFIT_PX)
+@dataclass(frozen=True, eq=False)
+class UnseenInstance:
+    """A view of an object, and what was learned of its category from others."""
+
+    task: UnseenTask
+    sighting: UnseenSighting
+    learned: LearnedFiles
+    options: UnseenOptions
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the keypoints that methods are told [px]."""
+        return self.options.noise_px or 1.0
+
+    @property
+    def shape(self) -> ShapeModel:
+        """The shape model of the category."""
+        return self.learned.shape(self.task.category)
+
+    def view_of(self, model: Model | ShapeModel) -> View:
+        """Those given keypoints that a model has."""
+        seen = self.sighting
+        shared = np.isin(seen.semantic_ids, np.array(model.ids, dtype=np.int64))
+        ids = seen.semantic_ids[shared].tolist()
+        return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.sigma)
+
+
+def _of_shape(instance: UnseenInstance) -> ShapeEstimate:
+    return _aligned(instance.shape, instance, misfit_px=0.0)
+
+
+def _of_own_model(instance: UnseenInstance) -> ShapeEstimate:
+    seen = instance.sighting
+    own = Model(points_3d=seen.xyz, ids=seen.all_ids.tolist())
+    return _aligned(own, instance, misfit_px=0.0)
+
+
+def _of_mean(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
+    shape = instance.shape
+    rows = shape.mean
+    model = Model(points_3d=rows[:-2], ids=shape.ids, bounds=rows[-2:], stretch=stretch)
+    return _aligned(model, instance, misfit_px=_MISFIT_PX)
+
+
+def _of_random_model(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
+    other = _random_model(instance)
+    ids = other.semantic_ids.tolist()
+    model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
+    return _aligned(model, instance, misfit_px=_MISFIT_PX)
 
 
 def _aligned(
-    model: Model | ShapeModel, sighting: UnseenSighting, options: UnseenOptions, *, misfit_px: float
+    model: Model | ShapeModel, instance: UnseenInstance, *, misfit_px: float
 ) -> ShapeEstimate:
     """Align a model with those given keypoints that it has."""
-    sigma = options.noise_px or 1.0
+    bound = max(_INLIER_BOUND * instance.sigma, misfit_px)
+    ransac = RansacOptions(max_reproj_error=bound) if instance.options.outliers else None
+    result = align(model, instance.view_of(model), ransac=ransac)
     ids = np.array(model.ids, dtype=np.int64)
-    shared = np.isin(sighting.semantic_ids, ids)
-    view = View(
-        KEYPOINT_CAMERA,
-        sighting.points_2d[shared],
-        ids=sighting.semantic_ids[shared].tolist(),
-        sigma=sigma,
-    )
-    bound = max(_INLIER_BOUND * sigma, misfit_px)
-    ransac = RansacOptions(max_reproj_error=bound) if options.outliers else None
-    result = align(model, view, ransac=ransac)
     return ShapeEstimate(result.alignment, result.bounds, ids, result.points_3d, result)
 
 
-def _nearest(
-    task: UnseenTask, sighting: UnseenSighting, learned: LearnedFiles, options: UnseenOptions
-) -> ShapeEstimate:
-    library = learned.opened_library()
+def _nearest(instance: UnseenInstance) -> ShapeEstimate:
+    """The best match of the library."""
+    library, options = instance.learned.opened_library(), instance.options
     first = library.retrieve(
-        sighting.points_2d,
-        sighting.semantic_ids,
+        instance.sighting.points_2d,
+        instance.sighting.semantic_ids,
         KEYPOINT_CAMERA,
         top=1,
-        category=task.category,
+        category=instance.task.category,
         sigma=max(options.noise_px, _LEAST_SIGMA),
         shape_sigma=_SIMILAR,
         loss="cauchy" if options.outliers else "linear",
@@ -134,26 +152,40 @@ def _nearest(
     return ShapeEstimate(first.alignment, first.bounds, model.semantic_ids, model.xyz)
 
 
-def _random_model(
-    task: UnseenTask, sighting: UnseenSighting, learned: LearnedFiles, options: UnseenOptions
-) -> LibraryModel:
+def _random_model(instance: UnseenInstance) -> LibraryModel:
     """A random model of the category, among those that share enough keypoints with the image."""
-    library = learned.opened_library()
+    library, task = instance.learned.opened_library(), instance.task
+    given = instance.sighting.semantic_ids
     keys = [key for key in library.keys if key[0] == task.category]
     names = (task.category, task.model_id, str(task.view))
-    rng = instance_rng(options.seed, *names, "another model")
-    least = min(_LEAST_SHARED, len(sighting.semantic_ids))
+    rng = instance_rng(instance.options.seed, *names, "another model")
+    least = min(_LEAST_SHARED, len(given))
     for place in rng.permutation(len(keys)).tolist():
         model = library[keys[place]]
-        if np.isin(sighting.semantic_ids, model.semantic_ids).sum() >= least:
+        if np.isin(given, model.semantic_ids).sum() >= least:
             return model
     raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
 
 
-def _bound(sighting: UnseenSighting) -> ShapeEstimate:
+def _bound(instance: UnseenInstance) -> ShapeEstimate:
     """The ideal estimate with the object's own model from the keypoints that are no outliers."""
-    kept = ~sighting.is_outlier
+    seen = instance.sighting
+    kept = ~seen.is_outlier
     alignment = limit_estimate(
-        sighting.xyz[sighting.rows[kept]], sighting.points_2d[kept], KEYPOINT_CAMERA, sighting.gt
+        seen.xyz[seen.rows[kept]], seen.points_2d[kept], KEYPOINT_CAMERA, seen.gt
     )
-    return ShapeEstimate(alignment, sighting.bounds, sighting.all_ids, sighting.xyz)
+    return ShapeEstimate(alignment, seen.bounds, seen.all_ids, seen.xyz)
+
+
+_SOLVERS: dict[str, Callable[[UnseenInstance], ShapeEstimate]] = {
+    RANDOM_RIGID: partial(_of_random_model, stretch="none"),
+    RANDOM_STRETCHED: partial(_of_random_model, stretch=None),
+    NEAREST: _nearest,
+    MEAN_RIGID: partial(_of_mean, stretch="none"),
+    MEAN_STRETCHED: partial(_of_mean, stretch=None),
+    SHAPE: _of_shape,
+    EXACT: _of_own_model,
+    LIMIT: _bound,
+}
+OWN_METHODS = {name: Method(name, solve) for name, solve in _SOLVERS.items()}
+"""The experiment's methods by name."""

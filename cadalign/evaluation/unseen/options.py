@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from cadalign.errors import InputError
-from cadalign.evaluation.options import ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 
 RANDOM_RIGID, RANDOM_STRETCHED = "random-rigid", "random-stretched"
 NEAREST = "nearest"
@@ -22,7 +22,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class UnseenOptions(ModelOptions, NoiseOption):
+class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
     Objects of one split of KeypointNet are aligned with what the other split tells of their
@@ -62,11 +62,9 @@ class UnseenOptions(ModelOptions, NoiseOption):
         self.check_least(keypoints=1, views_per_model=1)
         if not 0 <= self.outliers < 1:
             raise InputError(f"{self.outliers} is not a share below 1", where="outliers")
-        object.__setattr__(self, "methods", tuple(dict.fromkeys(self.methods)))
-        unknown = [name for name in self.methods if name not in METHODS]
-        if unknown or not self.methods:
-            what = f"unknown method {unknown[0]!r}" if unknown else "none is given"
-            raise InputError(what, where="methods", fix=f"known are {', '.join(METHODS)}")
+        from cadalign.evaluation.methods.registry import checked_names
+
+        object.__setattr__(self, "methods", checked_names(self.methods, METHODS))
         if self.split == self.train:
             what, fix = f"both are {self.split!r}", "objects must not be among the models"
             raise InputError(what, where="split, train", fix=fix)

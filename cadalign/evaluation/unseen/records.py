@@ -12,12 +12,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError, DataError
-from cadalign.evaluation.instances.aligned import (
-    AlignedAlternative,
-    AlignedShape,
-    Warp,
-    box_alignment,
-)
+from cadalign.evaluation.instances.aligned import AlignedShape, Warp, box_alignment, shape_of_result
 from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
 from cadalign.evaluation.instances.preview import write_preview
 from cadalign.evaluation.instances.record import record_row, record_stem
@@ -86,19 +81,14 @@ def _aligned(found: ShapeEstimate, sighting: UnseenSighting, sigma: float) -> Al
     known = np.flatnonzero([label in row_of for label in sighting.all_ids.tolist()])
     rows = np.array([row_of[label] for label in sighting.all_ids[known].tolist()], dtype=np.int64)
     alignment, warp = _warp(found.alignment, found.points_3d[rows], sighting, known)
-    result = found.result
-    alternatives = []
-    for other in () if result is None else result.alternatives:
-        pose, own = _warp(other.alignment, other.points_3d[rows], sighting, known)
-        alternatives.append(AlignedAlternative(pose, other.relative_likelihood, own))
-    return AlignedShape(
-        alignment,
-        None if result is None else result.std,
-        _rms(alignment, warp, sighting, known),
-        sigma,
-        () if result is None else result.warnings,
-        tuple(alternatives),
-        warp,
+    rms = _rms(alignment, warp, sighting, known)
+    if found.result is None:
+        return AlignedShape(alignment, None, rms, sigma, (), (), warp)
+    return shape_of_result(
+        found.result,
+        lambda each: _warp(each.alignment, each.points_3d[rows], sighting, known),
+        rms=rms,
+        sigma=sigma,
     )
 
 

@@ -40,10 +40,10 @@ class UnseenTask:
     semantic_ids: IntArray
     problem: str = ""
 
-    def names(self, method: str) -> Row:
-        """The cells that name the row of a method."""
-        model = {"category": self.category, "model_id": self.model_id}
-        return {**model, "view": self.view, "method": method}
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"category": self.category, "model_id": self.model_id, "view": self.view}
 
 
 class UnseenTasks(Sequence[UnseenTask]):

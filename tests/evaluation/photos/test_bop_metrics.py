@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import cadalign.datasets
 from cadalign.errors import InputError
-from cadalign.evaluation.photos.metrics.bop import (
+from cadalign.evaluation.metrics.bop import (
     TAUS,
     mspd,
     mspd_recall,

@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 import cadalign.datasets
 from cadalign.datasets.photos.kitti_keypoints import car_box
 from cadalign.errors import InputError
-from cadalign.evaluation.photos.metrics.kitti import kitti_errors
-from cadalign.evaluation.photos.metrics.nine_dof import (
+from cadalign.evaluation.metrics.kitti import kitti_errors
+from cadalign.evaluation.metrics.nine_dof import (
     degree_cm,
     degree_cm_shares,
     iou_shares,
     nine_dof_iou,
 )
-from cadalign.evaluation.photos.metrics.pascal3d import viewpoint_error_deg, viewpoint_scores
+from cadalign.evaluation.metrics.pascal3d import viewpoint_error_deg, viewpoint_scores
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.symmetry import Symmetry

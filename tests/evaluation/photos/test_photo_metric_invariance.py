@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Symmetry
-from cadalign.evaluation.photos.metrics.bop import mspd, mssd
-from cadalign.evaluation.photos.metrics.scan2cad import PlacedModel, scan2cad_errors
+from cadalign.evaluation.metrics.bop import mspd, mssd
+from cadalign.evaluation.metrics.scan2cad import PlacedModel, scan2cad_errors
 from cadalign.geometry.rotations import rotation_from_vector
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import cadalign.datasets
-from cadalign.evaluation.photos.metrics.scan2cad import (
+from cadalign.evaluation.metrics.scan2cad import (
     PlacedModel,
     scan2cad_accuracy,
     scan2cad_errors,

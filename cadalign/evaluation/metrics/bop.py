@@ -7,13 +7,21 @@ definitions of bop_toolkit's ``pose_error.py`` with the visibility of BOP 2019 a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
+from cadalign.datasets.photos.bop import MILLIMETRES
 from cadalign.errors import InputError
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.render.raycast.renderer import cast_geometry
@@ -246,3 +254,53 @@ def _vertices(vertices: npt.ArrayLike) -> FloatArray:
 def _symmetric(points: FloatArray, symmetry: Symmetry, max_step: float) -> list[FloatArray]:
     poses = symmetry.poses(max_step=max_step)
     return [points @ motion[:3, :3].T + motion[:3, 3] for motion in poses]
+
+
+MSSD = Metric("mssd", "MSSD", "diameters", 4)
+MSPD = Metric("mspd_px", "MSPD", "px", symbol="MSPD px")
+RECALLS = tuple(
+    metrics.rate(f"{name}_recall", f"average recall of {name.upper()}", name.upper())
+    for name in ("vsd", "mssd", "mspd")
+)
+AVERAGE_RECALL = metrics.rate("average_recall", "average recall", "AR")
+
+
+def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    cad, camera, metres = target.cad, target.photo.camera, target.found.truth.metres
+    if cad is None or not cad.has_mesh or camera is None:
+        return {}
+    given: dict[str, Any] = {"est": est, "gt": gt, "symmetry": target.found.symmetry}
+    diameter = cad.diameter
+    # The distance is a convex function of the vertex: largest on the hull.
+    surface = mssd(vertices=cad.hull_vertices, **given)
+    pixels = mspd(vertices=cad.scene.used_vertices, camera=camera, **given)
+    values = {
+        MSSD.key: surface / diameter,
+        MSPD.key: pixels if np.isfinite(pixels) else None,
+        "mssd_recall": mssd_recall([surface], [diameter]),
+        "mspd_recall": mspd_recall([pixels], width=camera.width),
+    }
+    if target.photo.depth is None or metres is None:
+        return values
+    discrepancies = vsd(
+        est=est,
+        gt=gt,
+        scene=cad.scene,
+        camera=camera,
+        depth=target.photo.depth.read(),
+        diameter=diameter,
+        delta=VSD_DELTA * MILLIMETRES / metres,
+    )
+    return values | {"vsd_recall": vsd_recall([discrepancies])}
+
+
+BOP = MetricSet(
+    "bop",
+    _measure,
+    columns=(MSSD.key, MSPD.key, "mssd_recall", "mspd_recall", "vsd_recall"),
+    medians=(MSSD, MSPD),
+    shares=RECALLS,
+    means=((AVERAGE_RECALL, RECALLS),),
+    headline=(AVERAGE_RECALL, *RECALLS, MSSD, MSPD),
+    console=(*RECALLS, AVERAGE_RECALL),
+)

@@ -13,7 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import scale_error
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 
@@ -196,3 +202,34 @@ def _matched(estimates: Sequence[PlacedModel], truths: Sequence[PlacedModel]) ->
 
 def _reported(category: str, categories: Collection[str]) -> str:
     return category if category in categories else OTHER
+
+
+TRANSLATION = Metric("scan2cad_translation_m", "translation error", "m", 3, symbol="t m")
+SCALE = Metric("scan2cad_scale", "mean scale error", "%", 1, factor=100.0, symbol="s %")
+ALIGNED = metrics.rate("scan2cad_aligned", "Scan2CAD accuracy", "acc %")
+ALIGNED_AXES = metrics.rate("scan2cad_aligned_axes", "Scan2CAD accuracy, each axis", "acc xyz %")
+
+
+def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    found, bounds = target.found, target.bounds
+    center = np.zeros(3) if bounds is None else -bounds.mean(axis=0)
+    truth = PlacedModel(found.category, gt, symmetry=found.symmetry, center=center)
+    errors = scan2cad_errors(est=est, gt=truth)
+    return {
+        TRANSLATION.key: errors.translation,
+        SCALE.key: errors.scale,
+        ALIGNED.key: float(errors.is_aligned),
+        ALIGNED_AXES.key: float(errors.is_aligned_on_each_axis),
+    }
+
+
+SCAN2CAD = MetricSet(
+    "scan2cad",
+    _measure,
+    columns=(TRANSLATION.key, SCALE.key, ALIGNED.key, ALIGNED_AXES.key),
+    medians=(TRANSLATION, SCALE),
+    shares=(ALIGNED, ALIGNED_AXES),
+    headline=(ALIGNED, ALIGNED_AXES),
+    details=(TRANSLATION, SCALE),
+    console=(ALIGNED,),
+)

@@ -5,11 +5,16 @@ Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and the benchm
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
+from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.metrics.table import BOX_IOU, Metric
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
 
@@ -81,3 +86,44 @@ def _footprint(box: Box) -> Box:
     width, length, _ = box.extents
     bottom = np.array([box.center[0], 0.0, box.center[2]])
     return car_box(np.array([1.0, width, length]), bottom, yaw_of_car(box.rotation))
+
+
+YAW = Metric("yaw_error_deg", "yaw error", "deg", symbol="yaw", limit=30.0)
+YAW_90 = replace(
+    YAW,
+    key="yaw_error_deg_90",
+    label="90th percentile of the yaw error",
+    head="yaw error, 90 %",
+    symbol="yaw90",
+)
+DEPTH = Metric(
+    "depth_error_relative", "depth error", "%", 1, factor=100.0, symbol="depth %", limit=50.0
+)
+IOU_3D = replace(BOX_IOU, key="iou_3d", label="3D IoU", head="3D IoU", symbol="IoU3D")
+IOU_BEV = replace(
+    BOX_IOU, key="iou_bev", label="bird's-eye IoU", head="bird's-eye IoU", symbol="BEV"
+)
+
+
+def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    if target.gt_box is None:
+        return {}
+    errors = kitti_errors(est=box, gt=target.gt_box)
+    return {
+        YAW.key: errors.yaw_deg,
+        "depth_error": errors.depth,
+        DEPTH.key: errors.depth_relative,
+        IOU_3D.key: errors.iou_3d,
+        IOU_BEV.key: errors.iou_bev,
+    }
+
+
+KITTI = MetricSet(
+    "kitti",
+    _measure,
+    columns=(YAW.key, "depth_error", DEPTH.key, IOU_3D.key, IOU_BEV.key),
+    medians=(YAW, DEPTH, IOU_3D, IOU_BEV),
+    tails=((YAW_90, YAW),),
+    headline=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
+    console=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
+)

@@ -1,4 +1,4 @@
-"""Errors of many estimates at once, by column of the result table."""
+"""Errors of estimates by column of the result table, of one or of many at once."""
 
 from __future__ import annotations
 
@@ -13,6 +13,14 @@ from cadalign.evaluation.instances.instance import Instance
 from cadalign.evaluation.instances.symmetry import InstanceSymmetry
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import (
+    box_iou,
+    box_iou_up_to_scale,
+    rotation_error,
+    scale_error,
+    translation_error,
+)
 from cadalign.geometry.pose_errors import (
     Alignments,
     Boxes,
@@ -24,6 +32,34 @@ from cadalign.geometry.pose_errors import (
     translation_errors_up_to_scale,
 )
 from cadalign.geometry.projection import perspective
+
+
+def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
+    """Errors of pose and stretch by column, the translation's over a length [model units]."""
+    _, scale_y, scale_z = scale_error(est=est, gt=gt).tolist()
+    return {
+        "rotation_error_deg": rotation_error(est=est, gt=gt),
+        "translation_error": translation_error(est=est, gt=gt) / length,
+        "scale_y_error": scale_y,
+        "scale_z_error": scale_z,
+    }
+
+
+def overlap(*, est: Box, gt: Box) -> float | None:
+    """Intersection over union of two boxes; None where one has no volume."""
+    try:
+        return box_iou(est=est, gt=gt)
+    except InputError:
+        return None
+
+
+def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
+    """Like `overlap`, after the estimate was scaled about the camera centre."""
+    try:
+        return box_iou_up_to_scale(est=est, gt=gt)
+    except InputError:
+        return None
+
 
 POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
 """Errors that the symmetries of a model bear on."""

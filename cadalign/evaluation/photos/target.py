@@ -1,4 +1,4 @@
-"""CAD models of a data set of photos, each read once while its photos come one after another."""
+"""Objects of photos with their truth and CAD models, each of which is read once for many photos."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.photo import CadModel, NamedPoints
+from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
+from cadalign.evaluation.instances.aligned import box_alignment
+from cadalign.evaluation.outcome import LeftOutError
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.scene import Scene
 
@@ -136,3 +142,85 @@ def farthest_points(points: FloatArray, count: int) -> FloatArray:
         gaps = np.linalg.norm(points - points[chosen[-1]], axis=1)
         nearest = distance = np.minimum(nearest, gaps)
     return points[chosen]
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoTarget:
+    """An object of a photo with its truth, as metrics need it.
+
+    Parameters
+    ----------
+    photo : Photo
+    found : PhotoObject
+    root : str
+        The data set's folder.
+    """
+
+    photo: Photo
+    found: PhotoObject
+    root: str
+
+    @property
+    def cad(self) -> Cad | None:
+        """The CAD model."""
+        model = self.found.model
+        return None if model is None else Cad(self.root, model.model_id, model)
+
+    @property
+    def bounds(self) -> FloatArray | None:
+        """The box (2, 3) of the CAD model; of an object without one, that of its truth."""
+        bounds = None if self.cad is None else self.cad.bounds
+        box = self.found.truth.box
+        if bounds is None and box is not None:
+            bounds = np.array([-box.extents / 2, box.extents / 2])
+        return bounds
+
+    @property
+    def gt(self) -> Alignment | None:
+        """The true alignment; where a box is known only, that of the model's box with it."""
+        truth = self.found.truth
+        if truth.cam_from_model is not None or truth.box is None or self.bounds is None:
+            return truth.cam_from_model
+        box = truth.box
+        pose = Alignment(box.rotation, box.center, np.ones(3))
+        own = np.array([-box.extents / 2, box.extents / 2])
+        return box_alignment(pose, own, model_bounds=self.bounds)
+
+    @property
+    def gt_box(self) -> Box | None:
+        """The true box."""
+        if self.found.truth.box is not None:
+            return self.found.truth.box
+        gt, bounds = self.gt, self.bounds
+        return None if gt is None or bounds is None else Box.from_model(bounds, gt)
+
+    @property
+    def camera(self) -> Camera | None:
+        """The photo's camera, or that of the annotation's convention at the object's rectangle.
+
+        Where the focal length is unknown, the true pose is of a camera whose principal point is at
+        the object; methods get the middle of its rectangle instead.
+        """
+        camera, annotated = self.photo.camera, self.found.truth.camera
+        if camera is None or camera.focal_known or annotated is None:
+            return camera
+        left, top, right, bottom = rectangle_of(self.found)
+        middle = (left + right) / 2, (top + bottom) / 2
+        return Camera(camera.width, camera.height, annotated.fx, annotated.fy, *middle)
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        found = self.found
+        model_id = f"{self.photo.name}/{found.object_id}"
+        return {"category": found.category, "model_id": model_id, "view": 0}
+
+
+def rectangle_of(found: PhotoObject) -> FloatArray:
+    """The object's rectangle [px], or that of its keypoints."""
+    if found.bbox is not None:
+        return found.bbox
+    if found.keypoints is None or not len(found.keypoints):
+        raise LeftOutError("the object's place in the photo is not known")
+    points = found.keypoints.points_2d
+    return np.concatenate([points.min(axis=0), points.max(axis=0)])

@@ -97,6 +97,7 @@ INSTANCES = Metric("instances", "instances", digits=0, better=None, symbol="n")
 FAILED = Metric("failed", "failed", digits=0, better=None)
 SKIPPED = Metric("skipped", "skipped", digits=0, better=None, symbol="skip")
 """Shown only where something was skipped."""
+LEFT_OUT = replace(FAILED, key="left_out", label="left out", head="left out", symbol="out")
 KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
 
 ROTATION = Metric(
@@ -156,6 +157,13 @@ SYM_TRANSLATION = replace(
 SYM_BOX_IOU = replace(BOX_IOU, key="sym_box_iou", label="box IoU, symmetry-aware")
 
 _RATE = Metric("", "", "%", 1, better=HIGH, factor=100.0, log=False)
+
+
+def rate(key: str, label: str, symbol: str) -> Metric:
+    """A share of objects, in per cent."""
+    return replace(_RATE, key=key, label=label, head=label, symbol=symbol)
+
+
 SUCCESS = replace(_RATE, key="success", label="success", head="success", symbol="succ%")
 SUCCESS_5 = replace(
     _RATE,

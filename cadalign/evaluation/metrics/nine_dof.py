@@ -7,11 +7,20 @@ Estimation" (NOCS), CVPR 2019, section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import as_floats
+from cadalign.arrays import BoolArray, as_floats
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.errors import overlap_up_to_scale
+from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.opened import Cells
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
@@ -109,3 +118,65 @@ def degree_cm_shares(
 def _share(found: npt.ArrayLike) -> float:
     flags = np.asarray(found, dtype=bool)
     return float(flags.mean()) if len(flags) else float("nan")
+
+
+TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm", limit=50.0)
+_IOUS = {
+    limit: metrics.rate(
+        f"iou_{100 * limit:.0f}", f"IoU over {100 * limit:.0f} %", f"IoU{100 * limit:.0f}"
+    )
+    for limit in IOU_THRESHOLDS
+}
+_DEGREE_CM = {
+    (deg, cm): metrics.rate(
+        f"deg_{deg:.0f}_cm_{cm:.0f}",
+        f"within {deg:.0f} deg, {cm:.0f} cm",
+        f"{deg:.0f}deg{cm:.0f}cm",
+    )
+    for deg, cm in DEGREE_CM
+}
+
+
+def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    found, gt_box = target.found, target.gt_box
+    values: Row = {}
+    if found.truth.metres is not None:
+        how: dict[str, Any] = {"symmetry": found.symmetry, "metres": found.truth.metres}
+        values[TRANSLATION.key] = degree_cm(est=est, gt=gt, **how)[1]
+    if gt_box is not None and min(box.volume, gt_box.volume) > 0:
+        iou = nine_dof_iou(est=box, gt=gt_box, symmetry=found.symmetry)
+        values[metrics.BOX_IOU.key] = iou
+        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=gt_box)
+    return values
+
+
+def _is_over(cells: Cells, *, limit: float) -> BoolArray:
+    return np.asarray(numbers(cells, metrics.BOX_IOU) > limit)
+
+
+def _is_within(cells: Cells, *, limits: tuple[float, float]) -> BoolArray:
+    rotation, translation = numbers(cells, metrics.ROTATION), numbers(cells, TRANSLATION)
+    return np.asarray((rotation <= limits[0]) & (translation <= limits[1]))
+
+
+NINE_DOF = MetricSet(
+    "nine_dof",
+    _measure,
+    columns=(TRANSLATION.key, metrics.BOX_IOU.key, metrics.BOX_IOU_UP_TO_SCALE.key),
+    medians=(TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    rates=(
+        *(
+            Rate(metric, metrics.BOX_IOU, partial(_is_over, limit=limit))
+            for limit, metric in _IOUS.items()
+        ),
+        *(
+            Rate(metric, TRANSLATION, partial(_is_within, limits=limits))
+            for limits, metric in _DEGREE_CM.items()
+        ),
+    ),
+    headline=(
+        *(*_IOUS.values(), TRANSLATION, *_DEGREE_CM.values()),
+        *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    ),
+    console=(TRANSLATION, _DEGREE_CM[10.0, 10.0], _IOUS[0.5]),
+)

@@ -6,15 +6,21 @@ Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import as_floats
 from cadalign.errors import InputError
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.symmetry import symmetric_rotation_error
 
 ACCURACY_DEG = 30.0
 """pi/6 [degrees]."""
@@ -89,3 +95,23 @@ def viewpoint_scores(errors_deg: Mapping[str, Sequence[float]]) -> ViewpointScor
 
 def _mean(values: Mapping[str, float]) -> float:
     return float(np.mean(list(values.values()))) if values else float("nan")
+
+
+ROTATION = replace(metrics.ROTATION, digits=2)
+ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
+
+
+def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    error = symmetric_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
+    return {ROTATION.key: error}
+
+
+VIEWPOINT = MetricSet(
+    "viewpoint",
+    _measure,
+    columns=(ROTATION.key,),
+    medians=(ROTATION,),
+    rates=(Rate(ACCURACY, ROTATION, lambda cells: numbers(cells, ROTATION) < ACCURACY_DEG),),
+    headline=(ROTATION, ACCURACY),
+    console=(ROTATION, ACCURACY),
+)

@@ -1,0 +1,282 @@
+"""Benchmarks: instances x methods x metrics, the one walk of all experiments.
+
+A `Setting` makes the instances of tasks, says what general methods are given of them, and measures
+estimates; `Benchmark` runs methods on them. An instance or an estimate that fails is a row with a
+reason, and never stops a run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from cadalign.errors import InputError
+from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.registry import fingerprints
+from cadalign.evaluation.metrics.registry import Compared, RegisteredMetric, metrics_config
+from cadalign.evaluation.outcome import FAILED, Outcome, reason_of, status_of
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import AbortError, Rows
+
+R = TypeVar("R")
+Pair = tuple[Any, Any]
+"""An instance, and an estimate of it."""
+VIEW_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
+"""The columns that name a row of a method on a view of a model."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """An instance with the cells that name its rows, or why there is none.
+
+    Parameters
+    ----------
+    names : dict
+        All but the method.
+    facts : dict
+        Cells that do not depend on the estimate.
+    instance : optional
+    error : Exception, optional
+        Why there is no instance.
+    status : str
+        Of the rows where there is no instance; by default the error's, see `status_of`.
+    without : tuple of str
+        Methods that are not run on it.
+    """
+
+    names: Row
+    facts: Row = field(default_factory=dict)
+    instance: Any = None
+    error: Exception | None = None
+    status: str = ""
+    without: tuple[str, ...] = ()
+
+
+class Setting(Protocol):
+    """Instances and metrics of a benchmark; picklable.
+
+    Methods with a body are defaults.
+    """
+
+    record_columns: ClassVar[Columns | None] = None
+    """The columns of the table of instance records; None of a setting without."""
+
+    @property
+    def names(self) -> Columns:
+        """The columns that name a row, the method's last."""
+
+    @property
+    def columns(self) -> Columns:
+        """All columns of the result table."""
+
+    def warm_up(self) -> Sequence[Any]:
+        """Compile what all workers need; returns tasks whose evaluation compiles the rest."""
+
+    def cases(self, tasks: Sequence[Any]) -> list[Case]:
+        """The instances of tasks, in their order."""
+
+    def failed(self, task: Any) -> list[Case]:
+        """The cases, without instances, of a task that could not be evaluated."""
+
+    def given(self, instance: Any) -> MethodInput:
+        """What general methods are given of an instance; an error of settings without them."""
+        raise InputError("there are no general methods", where="methods")
+
+    def answered(self, method: Method, instance: Any, answer: Any) -> Any:
+        """The estimate that `measure` takes, of a general method's alignment or result."""
+        return answer
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Cells of the result table for each estimate, or why there are none."""
+
+    def compared(self, instance: Any, estimate: Any) -> Compared:
+        """The estimated and the true alignment, for registered metrics."""
+        raise InputError("there are no registered metrics", where="metrics")
+
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """The outcomes of an instance and its record, once all methods were run; pictures."""
+        return outcomes, None
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Runs methods on the instances of a setting; an experiment of the engine.
+
+    Parameters
+    ----------
+    setting : Setting
+    methods : tuple of Method
+    batched : frozenset of str
+        Methods that are given all instances of a chunk at once, and share the time among them.
+    repeats : int
+        Calls of a method on one instance, of which the quickest is timed.
+    metrics : tuple of RegisteredMetric
+        Further columns of the result table.
+    """
+
+    setting: Setting
+    methods: tuple[Method, ...]
+    batched: frozenset[str] = frozenset()
+    repeats: int = 1
+    metrics: tuple[RegisteredMetric, ...] = ()
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of the result table."""
+        return (*self.setting.columns, *((each.metric.key, float) for each in self.metrics))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What a run's configuration has of users' functions; empty without any."""
+        return fingerprints(self.methods) | metrics_config(self.metrics)
+
+    @property
+    def timing_columns(self) -> Columns:
+        """The columns of the table of timings."""
+        return (*self.setting.names, ("seconds", float))
+
+    @property
+    def record_columns(self) -> Columns | None:
+        """The columns of the table of instance records."""
+        return self.setting.record_columns
+
+    def warm_up(self) -> None:
+        """Compile solvers and metrics; functions that users registered are not called."""
+        built_in = tuple(method for method in self.methods if not method.is_registered)
+        replace(self, methods=built_in).evaluate(self.setting.warm_up())
+
+    def evaluate(self, tasks: Sequence[Any]) -> Rows:
+        """A row for every instance and method, and a record for every instance."""
+        cases = self.setting.cases(tasks)
+        found: list[list[tuple[Outcome, Any]]] = [[] for _ in cases]
+        for method in self.methods:
+            places = [k for k, case in enumerate(cases) if method.name not in case.without]
+            answers = self._answers(method, [cases[k] for k in places])
+            for k, answer in zip(places, answers, strict=True):
+                found[k].append(answer)
+        all_outcomes: list[Outcome] = []
+        records: list[Row] = []
+        for case, each in zip(cases, found, strict=True):
+            outcomes = [outcome for outcome, _ in each]
+            if case.instance is not None and outcomes:
+                estimates = [estimate for _, estimate in each]
+                outcomes, record = self.setting.finish(case, outcomes, estimates)
+                records += [] if record is None else [record]
+            all_outcomes += outcomes
+        return Rows.of(all_outcomes, records)
+
+    def failure(self, task: Any, reason: str) -> Rows:
+        """A failed row for every method."""
+        return Rows.of(
+            Outcome({**case.names, "method": method.name}, case.facts, FAILED, reason)
+            for case in self.setting.failed(task)
+            for method in self.methods
+            if method.name not in case.without
+        )
+
+    def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
+        """One method's outcome of every case, and its estimate or why there is none."""
+        instances = [case.instance for case in cases if case.instance is not None]
+        solved = self._solved(method, instances)
+        pairs = [
+            (instance, estimate)
+            for instance, (estimate, _) in zip(instances, solved, strict=True)
+            if not isinstance(estimate, Exception)
+        ]
+        rows = iter(self._measured(method, pairs))
+        estimates = iter(solved)
+        answers: list[tuple[Outcome, Any]] = []
+        for case in cases:
+            names = {**case.names, "method": method.name}
+            if case.instance is None:
+                error = case.error or ValueError("there is no instance")
+                status = case.status or status_of(error)
+                answers.append((Outcome(names, case.facts, status, reason_of(error)), error))
+                continue
+            estimate, seconds = next(estimates)
+            row = estimate if isinstance(estimate, Exception) else next(rows)
+            if isinstance(row, Exception):
+                outcome = Outcome(names, case.facts, status_of(row), reason_of(row), seconds)
+                answers.append((outcome, row))
+            else:
+                answers.append((Outcome(names, case.facts | row, seconds=seconds), estimate))
+        return answers
+
+    def _measured(self, method: Method, pairs: Sequence[Pair]) -> Sequence[Row | Exception]:
+        """The cells of each estimate; one that cannot be measured does not stop the others."""
+        if not pairs:
+            return []
+        found = attempt(self.setting.measure, method, pairs)
+        if not isinstance(found, Exception):
+            if not self.metrics:
+                return found
+            return [self._further(*each) for each in zip(pairs, found, strict=True)]
+        if len(pairs) == 1:
+            return [found]
+        return [row for pair in pairs for row in self._measured(method, [pair])]
+
+    def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
+        """The cells of an estimate with those of registered metrics."""
+        if isinstance(row, Exception):
+            return row
+        instance, estimate = pair
+        found = attempt(self.setting.compared, instance, estimate)
+        if isinstance(found, Exception):
+            return found
+        given = self.setting.given(instance)
+        for each in self.metrics:
+            value = attempt(each.measure, found, given)
+            if isinstance(value, Exception):
+                return value
+            row[each.metric.key] = value
+        return row
+
+    def _solved(self, method: Method, instances: Sequence[Any]) -> list[tuple[Any, float | None]]:
+        """A method's estimate of every instance, or why there is none, and its seconds."""
+        if method.name not in self.batched or method.solve_many is None:
+            return [self._timed(method, instance) for instance in instances]
+        start = time.perf_counter()
+        if not method.is_general:
+            found = method.solve_many(instances)
+        else:
+            answers = method.solve_many([self.setting.given(each) for each in instances])
+            found = [
+                answer
+                if isinstance(answer, Exception)
+                else self.setting.answered(method, instance, answer)
+                for instance, answer in zip(instances, answers, strict=True)
+            ]
+        share = (time.perf_counter() - start) / max(len(instances), 1)
+        return [(estimate, share) for estimate in found]
+
+    def _timed(self, method: Method, instance: Any) -> tuple[Any, float | None]:
+        """An estimate of one instance, and the seconds of the quickest call."""
+        given = attempt(self.setting.given, instance) if method.is_general else instance
+        if isinstance(given, Exception):
+            return given, None
+        is_measured = self.repeats == 1 or method.name != LIMIT
+        best = float("inf")
+        for _ in range(self.repeats if is_measured else 1):
+            start = time.perf_counter()
+            answer = attempt(method.solve, given)
+            best = min(best, time.perf_counter() - start)
+            if isinstance(answer, Exception):
+                return answer, best if self.repeats == 1 else None
+        if method.is_general:
+            answer = attempt(self.setting.answered, method, instance, answer)
+        return answer, best if is_measured else None
+
+
+def attempt(function: Callable[..., R], *arguments: Any) -> R | Exception:
+    """What a function returns, or the error that it raises; `AbortError` stops the run."""
+    try:
+        return function(*arguments)
+    except AbortError:
+        raise
+    except Exception as error:
+        return error

@@ -1,0 +1,141 @@
+"""Sets of metrics: what a data set's protocol measures of each object, and shows of many.
+
+A new metric of photos is a column and a line of one set, in the module with its formula; a new set
+is a module, and its place in `cadalign.evaluation.photos.protocols`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import BoolArray
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.runs.opened import Cells
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.summary import known, median_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+
+PERCENTILE = 90
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A share of objects within thresholds, of those that have a value of a column."""
+
+    metric: Metric
+    column: Metric
+    is_within: Callable[[Cells], BoolArray]
+
+
+@dataclass(frozen=True)
+class MetricSet:
+    """Metrics of a protocol.
+
+    Parameters
+    ----------
+    name : str
+    measure : callable
+        Errors by column, some of which may be None: of an object, an estimate of the data set's
+        model, the true one, and the estimated box.
+    columns : tuple of str
+        Columns of the result table, numbers.
+    medians : tuple of Metric
+        Columns whose medians are shown.
+    tails : tuple of (Metric, Metric)
+        90th percentiles, each of a column.
+    rates : tuple of Rate
+    shares : tuple of Metric
+        Columns between 0 and 1 whose means over all objects are shown.
+    means : tuple of (Metric, tuple of Metric)
+        Means of such shares.
+    headline, details, console : tuple of Metric
+        Columns of the headline table, first and last ones, and of the console's.
+    """
+
+    name: str
+    measure: Callable[[PhotoTarget, Alignment, Alignment, Box], Row]
+    columns: tuple[str, ...]
+    medians: tuple[Metric, ...]
+    tails: tuple[tuple[Metric, Metric], ...] = ()
+    rates: tuple[Rate, ...] = ()
+    shares: tuple[Metric, ...] = ()
+    means: tuple[tuple[Metric, tuple[Metric, ...]], ...] = ()
+    headline: tuple[Metric, ...] = ()
+    details: tuple[Metric, ...] = ()
+    console: tuple[Metric, ...] = ()
+
+
+def score_columns(sets: Iterable[MetricSet]) -> Columns:
+    """The columns of some sets in the result table."""
+    return tuple((name, float) for each in sets for name in each.columns)
+
+
+def score_alignment(
+    target: PhotoTarget, sets: Sequence[MetricSet], est: Alignment, box: Box
+) -> Row:
+    """Errors of an estimate by column; none where the truth is not known.
+
+    Parameters
+    ----------
+    target : PhotoTarget
+        The object.
+    sets : sequence of MetricSet
+        Those of its data set.
+    est : Alignment
+        Of the data set's model, in the frame of the photo's camera.
+    box : Box
+        The estimated box in that frame.
+    """
+    gt = target.gt
+    if gt is None:
+        return {}
+    return {
+        name: value
+        for each in sets
+        for name, value in each.measure(target, est, gt, box).items()
+        if value is not None
+    }
+
+
+def medians_of(sets: Sequence[MetricSet], solved: Cells, *further: Metric) -> dict[str, float]:
+    """Medians, and 90th percentiles, over the objects that did not fail."""
+    medians = (*(metric for each in sets for metric in each.medians), *further)
+    found = {metric.key: median_of(solved[metric.key]) for metric in medians}
+    for metric, column in (pair for each in sets for pair in each.tails):
+        values = known(solved[column.key])
+        found[metric.key] = float(np.percentile(values, PERCENTILE)) if len(values) else np.nan
+    return found
+
+
+def shares_of(sets: Sequence[MetricSet], rated: Cells, solved: Cells) -> dict[str, float]:
+    """Shares of all objects whose truth is known, of which failures count as misses."""
+    failures = int((rated["status"] == FAILED).sum())
+    found = {}
+    for rate in (rate for each in sets for rate in each.rates):
+        count = int(np.isfinite(solved[rate.column.key].astype(float)).sum())
+        within = float(rate.is_within(solved).sum())
+        found[rate.metric.key] = _share(within, count, failures)
+    for metric in (metric for each in sets for metric in each.shares):
+        values = known(solved[metric.key])
+        found[metric.key] = _share(float(values.sum()), len(values), failures)
+    for metric, parts in (pair for each in sets for pair in each.means):
+        shares = [found[part.key] for part in parts]
+        found[metric.key] = float(np.nanmean(shares)) if np.isfinite(shares).any() else np.nan
+    return found
+
+
+def numbers(cells: Cells, metric: Metric) -> Any:
+    """A column of numbers, NaN where one is missing."""
+    return cells[metric.key].astype(float)
+
+
+def _share(total: float, count: int, failures: int) -> float:
+    """A mean over values and failures, which count as 0; NaN where no value is known."""
+    return total / (count + failures) if count else np.nan

@@ -1,0 +1,421 @@
+"""Methods of one's own: registered, given as functions, plugins and entry points."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.pages import embedded_payload
+from support.refusals import refusal_line
+
+import cadalign
+from cadalign import Alignment, Camera, Model, Result, View
+from cadalign.cli import main
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation import register_method
+from cadalign.evaluation.accuracy.style import look_of
+from cadalign.evaluation.methods import registry
+from cadalign.evaluation.methods.method import MethodInput
+from cadalign.evaluation.methods.registry import choose_methods, registered_method
+from cadalign.evaluation.photos.experiment import photos_benchmark
+from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.simulation.problems import simulate_problem
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget what a test registers."""
+    registry.known_names(())  # the examples stay
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
+
+
+def linear(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+    return cadalign.fit(points_3d, points_2d, camera, method="aepnp").alignment
+
+
+def joint(model: Any, views: list[View]) -> Result:
+    return cadalign.align(model, views)
+
+
+def weighted(points_3d: Any, points_2d: Any, camera: Camera, *, sigma: float) -> Result:
+    assert sigma == 2.0
+    return cadalign.fit(points_3d, points_2d, camera, sigma=sigma)
+
+
+def raising(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+    raise RuntimeError("out of luck")
+
+
+def leaving(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+    raise SystemExit(4)
+
+
+def of_one(points: Any) -> Alignment:
+    raise AssertionError
+
+
+def mapping(points_3d: Any, points_2d: Any, camera: Camera) -> Any:
+    return {"R": np.eye(3)}
+
+
+def unchecked(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+    points_2d *= np.nan
+    return Alignment(points_3d[:3] * np.nan, np.zeros(3), np.ones(3), is_valid=True)
+
+
+BAD = {
+    raising: "RuntimeError: out of luck",
+    leaving: "it called for an exit (4)",
+    of_one: "TypeError: of_one() takes 1 positional argument but 3 were given",
+    mapping: "method: it returned dict, no alignment; return a cadalign.Alignment, or the result "
+    "of cadalign.fit or cadalign.align",
+    unchecked: "rotation: NaN or infinite values in rows 0, 1, 2; remove or repair these",
+}
+
+
+def simulate(methods: Any, **options: Any) -> Any:
+    options = {"values": [20], "runs": 3, "workers": 0, **options}
+    return cadalign.simulate("points", methods=methods, **options)
+
+
+# --- functions as methods ----------------------------------------------------------------------
+
+
+def test_a_registered_function_stands_beside_built_in_methods() -> None:
+    register_method("mine", linear)
+    table = simulate(["mine", "aepnp"])
+    assert table.method.tolist() == ["mine", "aepnp"] * 3
+    mine, built_in = (table[table.method == name] for name in ("mine", "aepnp"))
+    np.testing.assert_allclose(mine.rotation_error_deg, built_in.rotation_error_deg, rtol=1e-6)
+
+
+def test_functions_are_methods_by_their_names() -> None:
+    table = simulate([linear, joint, "optimal"])
+    assert (table.status == "ok").all()
+    assert set(table.method) == {"linear", "joint", "optimal"}
+    table = table.set_index("method")
+    np.testing.assert_allclose(
+        table.loc["joint"].rotation_error_deg, table.loc["optimal"].rotation_error_deg, rtol=1e-4
+    )
+
+
+def test_a_function_is_told_the_noise_if_it_asks_for_it() -> None:
+    assert (simulate([weighted], noise_px=2.0).status == "ok").all()
+    assert set(simulate([weighted], noise_px=1.0).status) == {"failed"}
+
+
+@pytest.mark.parametrize("bad", BAD, ids=lambda bad: bad.__name__)
+def test_what_a_bad_function_does_is_its_own_failure(bad: Any) -> None:
+    table = simulate([bad, "aepnp"])
+    failed = table[table.method == bad.__name__]
+    assert set(failed.status) == {"failed"}
+    assert set(failed.reason) == {BAD[bad]}
+    good = table[table.method == "aepnp"].drop(columns="seconds").reset_index(drop=True)
+    alone = simulate(["aepnp"]).drop(columns="seconds")
+    assert good.equals(alone)
+
+
+def test_what_is_given_to_functions_of_views_is_what_align_takes() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (8, 3))
+    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
+    given = MethodInput(points, problem.points_2d, problem.camera, 2.0)
+    model, (view,) = given.model_and_views()
+    assert isinstance(model, Model)
+    assert view.sigma == 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "message"),
+    [
+        ("optimal", linear, "'optimal' is a built-in method; choose another name"),
+        ("", linear, "'' is not a name"),
+        ("mine", 3, "3 is not a function"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(name: str, function: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        register_method(name, function)
+
+
+def test_functions_without_a_name_of_their_own_are_refused() -> None:
+    with pytest.raises(InputError, match="a function that is called <lambda> has no name"):
+        simulate([lambda a, b, c: None])
+    with pytest.raises(InputError, match="'linear' is the name of more than one function"):
+        simulate([linear, partial(linear)])
+
+
+def test_names_that_are_unknown_are_refused_with_all_that_are_known() -> None:
+    register_method("mine", linear)
+    with pytest.raises(InputError, match=r"unknown method 'mime', did you mean 'mine'\?") as caught:
+        simulate(["mime"])
+    for name in ("optimal", "limit", "opencv-sqpnp", "poselib", "mine"):
+        assert name in str(caught.value)
+
+
+def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
+    register_method("shape", linear)
+    with pytest.raises(InputError, match="'shape' is a method of the experiment; register"):
+        cadalign.evaluate(tmp_path, "unseen", methods=["shape"])
+    register_method("rigid", linear)
+    options = PhotosOptions(tmp_path, methods=("rigid",))
+    with pytest.raises(InputError, match="'rigid' is a method of the experiment; register"):
+        photos_benchmark(options, (), RunFolder(tmp_path))
+    with pytest.raises(InputError, match="unknown: 'linear'; known are optimal, optimal-"):
+        cadalign.evaluate(tmp_path, "retrieval", methods=["linear"])
+
+
+# --- every experiment --------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_on_views_of_models_with_tables_and_page(sample_root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    table = cadalign.evaluate(sample_root, methods=[linear, joint, "optimal"], workers=0, out=out)
+    assert (table.status == "ok").all()
+    assert main(["evaluate", "show", str(out)]) == 0
+    assert main(["report", str(out)]) == 0
+    page = embedded_payload(out / "report.html")
+    methods = {each["key"]: each for each in page["methods"]}
+    assert list(methods) == ["linear", "joint", "optimal"]
+    assert len({each["color"] for each in methods.values()}) == 3
+    assert {row["method"] for row in page["headline"]["rows"]} == set(methods)
+    assert look_of("linear") == look_of("linear")
+
+
+@pytest.mark.long
+def test_on_evidence_and_photos(sample_root: Path, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"categories": ["car"], "workers": 0}
+    table = cadalign.evaluate(
+        sample_root, "evidence", methods=[joint, linear, "keypoints"], **options
+    )
+    assert (table.status == "ok").all()
+    errors = table.set_index("method").rotation_error_deg
+    assert errors["joint"] < errors["keypoints"]  # it is given all evidence
+
+
+@pytest.mark.long
+def test_on_unseen_objects_functions_get_the_learned_shape(real_data: Path) -> None:
+    options: dict[str, Any] = {"categories": ["mug"], "max_models": 4, "workers": 0}
+    table = cadalign.evaluate(
+        real_data / "keypointnet", "unseen", methods=[joint, linear, "shape"], **options
+    )
+    table = table[table.status == "ok"].set_index("method")
+    joint_errors, shape_errors = (table.loc[name].rotation_error_deg for name in ("joint", "shape"))
+    np.testing.assert_allclose(joint_errors, shape_errors)
+    assert len(table.loc["linear"])
+
+
+@pytest.mark.long
+def test_on_photos_and_correspondences(real_data: Path) -> None:
+    options: dict[str, Any] = {"workers": 0, "methods": [joint, linear]}
+    table = cadalign.evaluate(
+        real_data / "real/scan2cad", "photos", categories=["chair"], **options
+    )
+    assert table[table.method == "joint"].status.tolist().count("ok") == 2
+    assert set(table.method) == {"joint", "linear"}
+    table = cadalign.evaluate(
+        real_data / "sfm/balbianello",
+        "correspondences",
+        outliers=[0.0],
+        draws=1,
+        max_images=1,
+        **options,
+    )
+    assert (table.status == "ok").all()
+
+
+# --- processes and clusters --------------------------------------------------------------------
+
+
+def run_bytes(out: Path, **options: Any) -> bytes:
+    simulate([linear, *BAD, "aepnp"], out=out, runs=130, **options)
+    return (out / "results.parquet").read_bytes()
+
+
+@pytest.mark.long
+def test_worker_processes_get_functions_of_this_file(tmp_path: Path) -> None:
+    alone = run_bytes(tmp_path / "alone")
+    assert run_bytes(tmp_path / "processes", workers=2) == alone
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.long
+def test_a_dask_cluster_gets_functions_of_this_file(tmp_path: Path, cluster: Any) -> None:
+    alone = run_bytes(tmp_path / "alone")
+    dask = cluster.scheduler_address
+    assert run_bytes(tmp_path / "dask", workers=None, dask=dask) == alone
+
+
+@pytest.mark.long
+def test_a_function_that_cannot_be_sent_is_named() -> None:
+    lock = threading.Lock()
+
+    def locked(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+        with lock:
+            return linear(points_3d, points_2d, camera)
+
+    assert (simulate([locked]).status == "ok").all()
+    with pytest.raises(InputError, match="'locked' cannot be sent to worker processes"):
+        simulate([locked], workers=1)
+
+
+def test_a_run_does_not_go_on_with_another_function(tmp_path: Path) -> None:
+    module = tmp_path / "changing.py"
+    code = "import cadalign\ndef solve(a, b, c):\n    return cadalign.fit(a, b, c)\n"
+    module.write_text(code)
+    command = ["simulate", "points", "--values", "8", "--runs", "2", "--methods", "aepnp"]
+    command += ["--workers", "0", "--out", str(tmp_path / "run"), "--plugin", f"{module}:solve"]
+    assert main(command) == 0
+    assert main(command) == 0
+    module.write_text(f"{code}# changed\n")
+    assert main(command) == 1
+    config = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert list(config["functions"]) == ["solve"]
+
+
+def test_runs_without_functions_are_as_they_were(tmp_path: Path) -> None:
+    simulate(["aepnp", "opencv-epnp"], out=tmp_path / "run")
+    assert "functions" not in json.loads((tmp_path / "run" / "run.json").read_text())
+
+
+# --- plugins and entry points ------------------------------------------------------------------
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module in the working directory."""
+    (tmp_path / "my_plugin.py").write_text(
+        "import cadalign\n"
+        "def solve(points_3d, points_2d, camera):\n"
+        "    return cadalign.fit(points_3d, points_2d, camera, method='aepnp')\n"
+        "number = 3\n"
+    )
+    (tmp_path / "broken.py").write_text("import no_such_module\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def command(*options: str) -> list[str]:
+    return ["simulate", "points", "--values", "8", "--runs", "2", "--workers", "0", *options]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("my_plugin:solve", "solve"),
+        ("mine=my_plugin:solve", "mine"),
+        ("my_plugin.py:solve", "solve"),
+    ],
+)
+def test_a_plugin_runs_beside_the_methods(
+    plugin: Path, capsys: pytest.CaptureFixture[str], text: str, name: str
+) -> None:
+    assert main(command("--plugin", text, "--methods", "epnp", "--json")) == 0
+    found = json.loads(capsys.readouterr().out)["summary"]
+    assert {each["method"] for each in found} == {"epnp", name}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("my_plugin:nothing", "the module 'my_plugin' has no function 'nothing'; "),
+        ("my_plugin:number", "the module 'my_plugin' has no function 'number'; "),
+        ("none_such:solve", "'none_such' cannot be imported (ModuleNotFoundError: No module "),
+        ("broken:solve", "'broken' cannot be imported (ModuleNotFoundError: No module named "),
+        ("optimal=my_plugin:solve", "'optimal' is a built-in method; name it otherwise: "),
+    ],
+)
+def test_plugins_that_cannot_be_used_are_refused(
+    plugin: Path, capsys: pytest.CaptureFixture[str], text: str, message: str
+) -> None:
+    line = refusal_line(capsys, *command("--plugin", text))
+    assert line.startswith(f"--plugin: {message}")
+
+
+def test_photos_need_the_other_methods_with_a_plugin(
+    plugin: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["evaluate", "photos", str(plugin), "--plugin", "my_plugin:solve"]
+    assert refusal_line(capsys, *arguments).startswith("--plugin: the other methods are not given")
+
+
+@pytest.mark.slow
+def test_entry_points_are_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "installed_solver.py").write_text(
+        "import cadalign\ndef solve(model, views):\n    return cadalign.align(model, views)\n"
+    )
+    info = tmp_path / "installed_solver-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: installed-solver\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[cadalign.methods]\ninstalled = installed_solver:solve\nbroken = no_such_module:solve\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert (simulate(["installed"]).status == "ok").all()
+    with pytest.raises(InputError, match="the entry point 'broken' cannot be loaded"):
+        simulate(["broken"])
+    with pytest.raises(InputError, match=r"known are .*installed, broken"):
+        simulate(["unknown"])
+
+
+# --- the examples ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["opencv-epnp", "opencv-sqpnp", "opencv-iterative", "poselib"])
+def test_foreign_solvers_find_the_pose_of_a_model_as_it_is(name: str) -> None:
+    if name == "poselib":
+        pytest.importorskip("poselib", reason="PoseLib is not installed")
+    rng = np.random.default_rng(1)
+    problem = simulate_problem(rng, points=12, noise_px=0.0, stretch=(1.0, 1.0))
+    given = MethodInput(problem.points_3d, problem.points_2d, problem.camera, 1.0)
+    found = registered_method(name).solve(given)
+    np.testing.assert_allclose(found.rotation, problem.alignment.rotation, atol=1e-4)
+    np.testing.assert_allclose(found.translation, problem.alignment.translation, atol=1e-3)
+
+
+def test_foreign_solvers_without_a_pose_fail_with_a_reason() -> None:
+    table = simulate(["opencv-iterative"], values=[4], runs=1)
+    assert table.status.tolist() == ["failed"]
+    assert table.reason[0].startswith("OpenCV: ")
+
+
+def test_a_missing_poselib_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "poselib", None)
+    table = simulate(["poselib"])
+    assert set(table.reason) == {"PoseLib is not installed; pip install poselib"}
+
+
+def test_all_built_in_methods_are_of_the_registry() -> None:
+    names = ["optimal", "aepnp", "ransac-optimal", "limit"]
+    assert [method.name for method in choose_methods(names)] == names
+    with pytest.raises(DataError):
+        cadalign.evaluate("no_such_folder", methods=names)
+
+
+@pytest.mark.long
+def test_the_how_to_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = Path(__file__).parents[2] / "docs" / "how_to" / "own_method.md"
+    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    monkeypatch.chdir(tmp_path)
+    exec(block, {})
+    assert "trimmed" in capsys.readouterr().out

@@ -16,7 +16,7 @@ import pytest
 from llvmlite import binding
 
 from cadalign.compile import files
-from cadalign.compile.progress import kernels_needed
+from cadalign.compile.decorators import kernels_needed
 
 pytestmark = pytest.mark.slow
 

@@ -2,8 +2,14 @@
 
 from numba.core import event
 
-from cadalign.compile.decorators import KernelFamily, borrowing, fast_sums, inlined, kernel
-from cadalign.compile.progress import CompileProgress
+from cadalign.compile.decorators import (
+    CompileProgress,
+    KernelFamily,
+    borrowing,
+    fast_sums,
+    inlined,
+    kernel,
+)
 
 __all__ = ["KernelFamily", "borrowing", "fast_sums", "inlined", "kernel"]
 

@@ -28,9 +28,8 @@ from cadalign.solvers.constants import (
     TOO_FEW,
     UNKNOWNS,
 )
-from cadalign.solvers.covariance import focal_covariance
 from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
-from cadalign.solvers.focal import FocalObjective, linear_focal, refine_focal
+from cadalign.solvers.focal import FocalObjective, focal_covariance, linear_focal, refine_focal
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
 from cadalign.solvers.unknowns import orthonormalize, uncenter

@@ -100,7 +100,7 @@ class InputFile(io.BufferedReader):
         self.status = os.fstat(self.fileno())
         self.size = self.status.st_size
 
-    def read(self, size: int | None = -1, /) -> bytes:
+    def read(self, size: int | None = -1) -> bytes:
         """Read so many bytes, or all."""
         return super().read(self.size if size is None or size < 0 else min(size, self.size))
 

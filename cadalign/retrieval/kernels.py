@@ -24,7 +24,7 @@ from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS
 from cadalign.solvers.evidence import Keypoints, ScalePrior
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.refine import refine
+from cadalign.solvers.search import refine
 from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
 
 LEAST_SHARED = 4

@@ -23,7 +23,7 @@ from cadalign.solvers.evidence import (
     scale_prior_cost,
 )
 from cadalign.solvers.linalg import cholesky, solve_cholesky
-from cadalign.solvers.system import (
+from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,

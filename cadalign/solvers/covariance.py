@@ -7,9 +7,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, evaluate_alignment, room_for, with_points
-from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, UNOBSERVABLE
-from cadalign.solvers.evidence import LogFocalPrior
-from cadalign.solvers.focal import FocalObjective, evaluate_focal
+from cadalign.solvers.constants import UNKNOWNS, UNOBSERVABLE
 from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
 from cadalign.solvers.unknowns import uncenter
 
@@ -23,37 +21,9 @@ def covariance_of(objective: Objective, pose: FloatArray, covariance: FloatArray
     center, unit = center_and_unit(objective.keypoints.points)
     local = with_points(objective, (objective.keypoints.points - center) / unit)
     equations = room_for(UNKNOWNS)
-    evaluate_alignment(local, _centered(pose, center, unit), equations)
-    undetermined = _invert(equations.hessian, objective.free, 0.0, covariance)
-    _uncenter_covariance(pose, center, unit, covariance)
-    return undetermined
-
-
-@kernel
-def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: FloatArray) -> int:
-    """Write the covariance of all 9 unknowns, at log_ratio 0, into (9, 9).
-
-    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
-    number of an unknown that the points do not determine; the focal length is never one, its
-    deviation is then as large as rounding errors let it be known. Bounds don't count.
-    """
-    points = system.objective.keypoints.points
-    center, unit = center_and_unit(points)
-    local = with_points(system.objective, (points - center) / unit)
-    state = np.zeros(POSE_SIZE + 1)
-    state[:POSE_SIZE] = _centered(pose, center, unit)
-    equations = room_for(UNKNOWNS + 1)
-    unbounded = LogFocalPrior(-np.inf, np.inf, system.prior.center, system.prior.weight)
-    evaluate_focal(FocalObjective(local, system.slopes, unbounded), state, equations)
-    hessian, distance = equations.hessian, state[11]
-    least = UNOBSERVABLE * hessian[5, 5] * distance * distance
-    undetermined = _invert(hessian, system.objective.free, least, covariance)
-    # The distance follows the focal length, see `cadalign.solvers.focal`.
-    for k in range(UNKNOWNS + 1):
-        covariance[5, k] += distance * covariance[UNKNOWNS, k]
-    for k in range(UNKNOWNS + 1):
-        covariance[k, 5] += distance * covariance[k, UNKNOWNS]
-    _uncenter_covariance(pose, center, unit, covariance)
+    evaluate_alignment(local, centered(pose, center, unit), equations)
+    undetermined = invert(equations.hessian, objective.free, 0.0, covariance)
+    uncenter_covariance(pose, center, unit, covariance)
     return undetermined
 
 
@@ -73,7 +43,7 @@ def center_and_unit(points: FloatArray) -> tuple[FloatArray, float]:
 
 
 @kernel
-def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
+def centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
     """The pose of points (x - center) / unit, in these units."""
     centered = pose.copy()
     uncenter(centered, -center, 1.0)
@@ -83,7 +53,7 @@ def _centered(pose: FloatArray, center: FloatArray, unit: float) -> FloatArray:
 
 
 @kernel
-def _invert(information: FloatArray, free: FloatArray, least: float, covariance: FloatArray) -> int:
+def invert(information: FloatArray, free: FloatArray, least: float, covariance: FloatArray) -> int:
     """Write the inverse of an information matrix (U, U), whose factor takes its place.
 
     An unknown beyond the first 8 has at least the information ``least`` left by the others.
@@ -120,7 +90,7 @@ def _invert(information: FloatArray, free: FloatArray, least: float, covariance:
 
 
 @kernel
-def _uncenter_covariance(
+def uncenter_covariance(
     pose: FloatArray, center: FloatArray, unit: float, covariance: FloatArray
 ) -> None:
     """Carry the covariance from points (x - center) / unit to points x, at the pose of x.

@@ -20,11 +20,14 @@ from cadalign.solvers.alignment import (
     Objective,
     are_same_poses,
     evaluate_cost,
+    room_for,
     room_for_two,
     solve_damped,
     with_keypoints,
+    with_points,
 )
-from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS
+from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, UNOBSERVABLE
+from cadalign.solvers.covariance import center_and_unit, centered, invert, uncenter_covariance
 from cadalign.solvers.evidence import (
     BLOCK,
     Keypoints,
@@ -37,13 +40,13 @@ from cadalign.solvers.evidence import (
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import affine_rows
 from cadalign.solvers.projection import project_point, scalars_of
-from cadalign.solvers.refine import refine
-from cadalign.solvers.system import (
+from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
     is_estimate,
     move,
+    refine,
     room_of,
     score_of,
     solve,
@@ -238,3 +241,31 @@ def refine_focal(
     cost, iterations, _ = refine(system, max_iterations, state)
     copy_into(pose, state[:POSE_SIZE])
     return cost, state[POSE_SIZE], iterations
+
+
+@kernel
+def focal_covariance(system: FocalObjective, pose: FloatArray, covariance: FloatArray) -> int:
+    """Write the covariance of all 9 unknowns, at log_ratio 0, into (9, 9).
+
+    The order is rotation vector, translation, log scales, log focal length. Returns -1, or the
+    number of an unknown that the points do not determine; the focal length is never one, its
+    deviation is then as large as rounding errors let it be known. Bounds don't count.
+    """
+    points = system.objective.keypoints.points
+    center, unit = center_and_unit(points)
+    local = with_points(system.objective, (points - center) / unit)
+    state = np.zeros(POSE_SIZE + 1)
+    state[:POSE_SIZE] = centered(pose, center, unit)
+    equations = room_for(UNKNOWNS + 1)
+    unbounded = LogFocalPrior(-np.inf, np.inf, system.prior.center, system.prior.weight)
+    evaluate_focal(FocalObjective(local, system.slopes, unbounded), state, equations)
+    hessian, distance = equations.hessian, state[11]
+    least = UNOBSERVABLE * hessian[5, 5] * distance * distance
+    undetermined = invert(hessian, system.objective.free, least, covariance)
+    # The distance follows the focal length, see the module.
+    for k in range(UNKNOWNS + 1):
+        covariance[5, k] += distance * covariance[UNKNOWNS, k]
+    for k in range(UNKNOWNS + 1):
+        covariance[k, 5] += distance * covariance[k, UNKNOWNS]
+    uncenter_covariance(pose, center, unit, covariance)
+    return undetermined

@@ -34,8 +34,8 @@ from cadalign.solvers.minimal import (
     solve_subset,
 )
 from cadalign.solvers.projection import scalars_of
-from cadalign.solvers.refine import refine
-from cadalign.solvers.sampling import (
+from cadalign.solvers.search import refine
+from cadalign.solvers.starts import (
     draw_sample,
     grow_pool,
     next_subset,

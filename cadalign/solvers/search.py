@@ -1,4 +1,22 @@
-"""The one search for minima: probe starts, refine the promising ones, tell minima apart."""
+"""Systems of unknowns, their one refinement and their one search for minima.
+
+A system is a NamedTuple of all that is known about one object: evidence and priors. A state of it
+is a row of numbers (D,), whose layout the system knows; a step is one of its unknowns (U,). Each of
+the functions here is a family of kernels with a member for each system, in that system's module:
+
+=========================  =====================================================================
+`alignment.Objective`       pose and stretch from the keypoints of one view
+`focal.FocalObjective`      the same, and the focal length
+`marginal.equations.Posed`  a pose, the shape integrated out
+`joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
+=========================  =====================================================================
+
+Costs are -2 log of a likelihood times a prior, up to a constant; equations hold half the cost's
+gradient, J' W r, and its Gauss-Newton matrix, J' W J. A cost is infinite behind a camera.
+
+`refine` is the one Levenberg-Marquardt loop; a search probes starts, refines the promising ones and
+tells minima apart.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +25,148 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import KernelFamily, borrowing, kernel
 from cadalign.solvers.linalg import copy_into
-from cadalign.solvers.refine import refine
-from cadalign.solvers.system import (
-    are_same,
-    cost_at,
-    integrating,
-    is_estimate,
-    score_of,
-)
+
+
+@KernelFamily
+def room_of(system: Any) -> Any:
+    """Room for the equations that steps are from and for those of a trial, which take turns.
+
+    Their ``gradient`` has one entry for each unknown. They may share scratch space.
+    """
+    raise NotImplementedError
+
+
+@KernelFamily
+def evaluate(system: Any, state: FloatArray, equations: Any) -> float:
+    """Write the normal equations at a proposed state; returns the cost."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def cost_at(system: Any, state: FloatArray) -> float:
+    """The cost at a state, without derivatives."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def solve(system: Any, equations: Any, damping: float, step: FloatArray) -> float:
+    """Write the damped Gauss-Newton step.
+
+    Returns the decrease of the cost that the equations predict for it, NaN where they have no
+    solution.
+    """
+    raise NotImplementedError
+
+
+@KernelFamily
+def move(
+    system: Any,
+    state: FloatArray,
+    equations: Any,
+    damping: float,
+    step: FloatArray,
+    moved: FloatArray,
+) -> None:
+    """Write the state that a step leads to; what the equations eliminate follows it."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def score_of(system: Any, state: FloatArray, cost: float) -> float:
+    """-2 log of the evidence by Laplace's approximation, up to a constant.
+
+    Infinite where the unknowns are not determined; ``cost`` where the system ranks by cost.
+    """
+    raise NotImplementedError
+
+
+@KernelFamily
+def are_same(system: Any, first: FloatArray, second: FloatArray) -> bool:
+    """True if two states lie at the same minimum."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def is_estimate(system: Any, state: FloatArray) -> bool:
+    """False for a state that no object has, such as one whose scales ran off to zero."""
+    raise NotImplementedError
+
+
+@KernelFamily
+def integrating(system: Any, integrates: bool) -> Any:
+    """The system with the shape integrated out of its objective, or with that of the cost alone.
+
+    Systems that have no shape have no member.
+    """
+    raise NotImplementedError
+
+
+_RELATIVE_DECREASE = 1e-12
+_ABSOLUTE_DECREASE = 1e-16
+_FIRST_DAMPING = 1e-4
+_LARGEST_DAMPING = 1e12
+_LEAST_DAMPING = 1e-12
+
+
+@kernel
+def refine(system: Any, max_iterations: int, state: FloatArray) -> tuple[float, int, bool]:
+    """Improve ``state`` in place; returns the cost, the iterations, and if they converged.
+
+    The cost is infinite if a point lies behind a camera at the start.
+    """
+    current, new = room_of(system)
+    step = np.zeros(current.gradient.shape[0])
+    return _descend(system, max_iterations, state, state.copy(), step, current, new)
+
+
+@borrowing
+def _descend(
+    system: Any,
+    max_iterations: int,
+    state: FloatArray,
+    trial: FloatArray,
+    step: FloatArray,
+    current: Any,
+    new: Any,
+) -> tuple[float, int, bool]:
+    """Improve ``state``; ``trial`` is a copy of it, the others are room for equations and step."""
+    cost = np.inf
+    damping = _FIRST_DAMPING
+    growth = 4.0
+    expected = 0.0  # decrease of the cost by the step, on the quadratic model
+    done = False
+    iterations = 0
+    while True:
+        trial_cost = evaluate(system, trial, new)
+        accepted = trial_cost <= cost or (done and trial_cost <= cost * (1 + 1e-9))
+        if accepted and trial_cost < np.inf:
+            copy_into(state, trial)
+            current, new = new, current
+            if cost < np.inf:
+                iterations += 1
+                gain = (cost - trial_cost) / expected if expected > 0 else 1.0
+                change = 0.1 if gain > 0.5 else 0.5 if gain > 0.1 else 2.0
+                damping = max(damping * change, _LEAST_DAMPING)
+            growth = 4.0
+            cost = trial_cost
+        else:
+            damping *= growth
+            growth *= 2.0
+        if not cost < np.inf or done or iterations >= max_iterations:
+            return cost, iterations, done
+        while True:
+            if damping > _LARGEST_DAMPING:
+                return cost, iterations, False
+            expected = solve(system, current, damping, step)
+            if expected == expected:
+                break
+            damping *= growth
+            growth *= 2.0
+        # A small step counts as the end only where it is not the damping that made it small.
+        done = damping < 1e-2 and expected <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost
+        move(system, state, current, damping, step, trial)
 
 
 class Effort(NamedTuple):
@@ -35,7 +185,7 @@ class Effort(NamedTuple):
 class Minima(NamedTuple):
     """Distinct minima, the best score first, and how many there are.
 
-    ``states`` (M, D), ``costs`` (M,), ``scores`` (M,), see `cadalign.solvers.system.score_of`, and
+    ``states`` (M, D), ``costs`` (M,), ``scores`` (M,), see `score_of`, and
     the ``label`` (M,) of the system that each is of. ``counts`` (2,) are the number of minima, and
     of iterations that were spent.
     """

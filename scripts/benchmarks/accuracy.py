@@ -38,7 +38,7 @@ from cadalign.evaluation.simulation.problems import (
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
-from cadalign.solvers.refine import refine
+from cadalign.solvers.search import refine
 
 _ROWS = ((6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0))
 _SPEED_SIZES = (10, 100, 1024, 4096)

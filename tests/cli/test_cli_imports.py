@@ -24,7 +24,7 @@ HEAVY = {
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *("starlette", "trimesh", "uvicorn"),
 }
-MODULES_OF_A_FIT = 65  # of cadalign
+MODULES_OF_A_FIT = 60  # of cadalign
 IN_EVERY_FIT = {"numba", "numpy"}
 
 

@@ -75,7 +75,7 @@ def test_truth_is_among_the_solutions() -> None:
 def test_solver_is_as_complete_as_an_exhaustive_search() -> None:
     """No exact alignment that a local search from many starts finds is left out."""
     from cadalign.solvers.alignment import keypoint_objective
-    from cadalign.solvers.refine import refine
+    from cadalign.solvers.search import refine
 
     rng = np.random.default_rng(0)
     found = missed = 0

@@ -29,8 +29,7 @@ from cadalign.solvers.joint.evidence import (
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.search import refine_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
-from cadalign.solvers.refine import refine
-from cadalign.solvers.system import evaluate, move
+from cadalign.solvers.search import evaluate, move, refine
 
 POINTS, MODES, VIEWS = 7, 3, 2
 

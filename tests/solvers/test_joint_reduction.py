@@ -25,7 +25,7 @@ from cadalign.solvers.joint.evidence import (
 from cadalign.solvers.joint.reduction import reduce_modes, used_points
 from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.system import Joint
-from cadalign.solvers.system import evaluate
+from cadalign.solvers.search import evaluate
 
 POINTS, SEEN, MODES, RANK = 9, 6, 24, 15
 NONE, NO_VALUE = np.empty(0, dtype=np.int64), np.empty(0)

@@ -22,8 +22,7 @@ from cadalign.solvers.marginal.equations import (
 from cadalign.solvers.marginal.posterior import posterior_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at, target_of
 from cadalign.solvers.marginal.search import search_view
-from cadalign.solvers.refine import refine
-from cadalign.solvers.system import move, solve
+from cadalign.solvers.search import move, refine, solve
 from cadalign.solvers.unknowns import move_rigid
 
 KEYPOINTS, COMPONENTS = 9, 2

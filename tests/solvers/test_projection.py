@@ -16,7 +16,7 @@ from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior
 from cadalign.solvers.focal import FocalObjective
 from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
-from cadalign.solvers.system import cost_at, evaluate, move, room_of
+from cadalign.solvers.search import cost_at, evaluate, move, room_of
 from cadalign.solvers.unknowns import move_pose
 
 PLAIN = Camera(640, 480, 600, 620, 315, 245)

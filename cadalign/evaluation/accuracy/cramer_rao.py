@@ -15,9 +15,9 @@ from cadalign.geometry.projection import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.alignment import keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.covariance import covariance_of, focal_covariance
+from cadalign.solvers.covariance import covariance_of
 from cadalign.solvers.evidence import LogFocalPrior
-from cadalign.solvers.focal import FocalObjective
+from cadalign.solvers.focal import FocalObjective, focal_covariance
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0

@@ -10,8 +10,7 @@ from cadalign.arrays import FloatArray
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
 from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
-from cadalign.solvers.refine import refine
-from cadalign.solvers.search import Effort, descend, room_for_minima, search
+from cadalign.solvers.search import Effort, descend, refine, room_for_minima, search
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200

@@ -32,7 +32,7 @@ from cadalign.solvers.joint.displacements import eliminate, follow, shift
 from cadalign.solvers.joint.equations import JointEquations, joint_room, with_turns
 from cadalign.solvers.joint.evidence import Evidence, State, unpacked
 from cadalign.solvers.joint.rows import count_equations, write_rows
-from cadalign.solvers.system import (
+from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
@@ -71,7 +71,7 @@ def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
 @evaluate.of(Joint)
 @kernel
 def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) -> float:
-    """Write the normal equations at a state; see `cadalign.solvers.system.evaluate`."""
+    """Write the normal equations at a state; see `cadalign.solvers.search.evaluate`."""
     evidence, arrow = system.evidence, equations.arrow
     state = unpacked(evidence, row)
     poses = state.poses.shape[0]

@@ -50,7 +50,7 @@ from cadalign.solvers.projection import (
     turn_back,
     write_motion,
 )
-from cadalign.solvers.system import (
+from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,

@@ -1,4 +1,4 @@
-"""What commands have in common: options of the library's functions, consoles, output folders."""
+"""Common parts of commands: options of the library's functions, consoles, output folders."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the stages of an estimate have found, of which `result_of` makes the result.
+    """Findings of an estimate's stages, of which `result_of` makes the result.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ _LEAST_INLIERS = 3
 _OUTLIER_COST = 5.0  # beyond the square of its threshold
 
 
-class Consensus(NamedTuple):
+class JointConsensus(NamedTuple):
     """Sightings (N,) that agree, the estimate from them, and its score."""
 
     inliers: BoolArray
@@ -68,7 +68,7 @@ def robust_starts(
 
 def robust_minima(
     evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool
-) -> tuple[list[Consensus], int]:
+) -> tuple[list[JointConsensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
     Each of the starts is refined under a robust loss, then on its inliers alone until these don't
@@ -96,8 +96,8 @@ def robust_minima(
 
 def _settle(
     evidence: Evidence, state: State, threshold: FloatArray, rounds: int
-) -> Consensus | None:
-    best: Consensus | None = None
+) -> JointConsensus | None:
+    best: JointConsensus | None = None
     inliers = whitened_lengths(evidence, state) < threshold
     for _ in range(rounds):
         if inliers.sum() < _LEAST_INLIERS:
@@ -111,7 +111,7 @@ def _settle(
         left_out = threshold[~inliers] ** 2 + _OUTLIER_COST
         score = float(minima.scores[0]) + float(left_out.sum())
         if best is None or score < best.score:
-            best = Consensus(inliers, some, state, float(minima.costs[0]), score)
+            best = JointConsensus(inliers, some, state, float(minima.costs[0]), score)
         again = whitened_lengths(evidence, state) < threshold
         if (again == inliers).all():
             break

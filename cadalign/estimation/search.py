@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.joint_robust import (
-    Consensus,
+    JointConsensus,
     robust_minima,
     robust_starts,
     whitened_lengths,
@@ -156,11 +156,11 @@ def _starts(
     return Starts(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _search(evidence: Evidence, starts: Starts) -> tuple[list[Consensus], int]:
+def _search(evidence: Evidence, starts: Starts) -> tuple[list[JointConsensus], int]:
     minima, iterations = search_joint(evidence, *starts)
     all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
     found = [
-        Consensus(all_of_them, evidence, state, float(cost), float(score))
+        JointConsensus(all_of_them, evidence, state, float(cost), float(score))
         for state, cost, score in zip(*minima, strict=True)
     ]
     return found, iterations

@@ -82,7 +82,7 @@ class Setting(Protocol):
         """The cases, without instances, of a task that could not be evaluated."""
 
     def given(self, instance: Any) -> MethodInput:
-        """What general methods are given of an instance; an error of settings without them."""
+        """The instance as general methods are given it; an error of settings without them."""
         raise InputError("there are no general methods", where="methods")
 
     def answered(self, method: Method, instance: Any, answer: Any) -> Any:
@@ -132,7 +132,7 @@ class Benchmark:
 
     @property
     def config(self) -> dict[str, Any]:
-        """What a run's configuration has of users' functions; empty without any."""
+        """Users' functions in a run's configuration; empty without any."""
         return fingerprints(self.methods) | metrics_config(self.metrics)
 
     @property
@@ -273,7 +273,7 @@ class Benchmark:
 
 
 def attempt(function: Callable[..., R], *arguments: Any) -> R | Exception:
-    """What a function returns, or the error that it raises; `AbortError` stops the run."""
+    """The value of a function, or the error that it raises; `AbortError` stops the run."""
     try:
         return function(*arguments)
     except AbortError:

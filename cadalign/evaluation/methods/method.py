@@ -27,7 +27,7 @@ POINTS, VIEWS = "points", "views"
 
 @dataclass(frozen=True, eq=False)
 class MethodInput:
-    """What general methods are given of an instance.
+    """An instance as general methods are given it.
 
     Parameters
     ----------

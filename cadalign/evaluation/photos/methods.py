@@ -117,7 +117,7 @@ def estimate_object(method: str, instance: PhotoInstance) -> PhotoEstimate:
 
 
 def given_of(instance: PhotoInstance) -> MethodInput:
-    """What general methods are given of an object."""
+    """An object as general methods are given it."""
     sighting = instance.sighting
     return MethodInput(
         sighting.points_3d * sighting.width,

@@ -45,6 +45,8 @@ class Case:
         Of the rows where there is no instance; by default the error's, see `status_of`.
     without : tuple of str
         Methods that are not run on it.
+    seconds : float, optional
+        Spent on it where there is no instance.
     """
 
     names: Row
@@ -53,6 +55,7 @@ class Case:
     error: Exception | None = None
     status: str = ""
     without: tuple[str, ...] = ()
+    seconds: float | None = None
 
 
 class Setting(Protocol):
@@ -196,7 +199,8 @@ class Benchmark:
             if case.instance is None:
                 error = case.error or ValueError("there is no instance")
                 status = case.status or status_of(error)
-                answers.append((Outcome(names, case.facts, status, reason_of(error)), error))
+                outcome = Outcome(names, case.facts, status, reason_of(error), case.seconds)
+                answers.append((outcome, error))
                 continue
             estimate, seconds = next(estimates)
             row = estimate if isinstance(estimate, Exception) else next(rows)

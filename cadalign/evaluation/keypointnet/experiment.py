@@ -36,6 +36,7 @@ the status ``skipped``; they count in no share and no median.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -135,11 +136,13 @@ class KeypointViews(Setting):
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         """The instance of every task, or why there is none."""
         sigma = self.options.noise_px or 1.0
-        found = []
-        for task, instance in zip(tasks, self._instances(tasks), strict=True):
+        start, found = time.perf_counter(), []
+        instances = self._instances(tasks)
+        share = (time.perf_counter() - start) / max(len(tasks), 1)
+        for task, instance in zip(tasks, instances, strict=True):
             (case,) = self.failed(task)
             if isinstance(instance, Exception):
-                found.append(replace(case, error=instance))
+                found.append(replace(case, error=instance, seconds=share))
             else:
                 view = KeypointView(task, instance, sigma, self.shapes)
                 found.append(Case(case.names, _facts(task, instance), view, without=case.without))

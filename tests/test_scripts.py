@@ -64,13 +64,13 @@ import sys
 from dataclasses import dataclass
 
 import bench
-from benchmarks.section import Table, figure
+from benchmarks.section import RatioTable, figure
 
 @dataclass
 class Toy:
     def run(self, given):
-        yield Table("sizes", [{"points": 7, "R": (0.5, 1.25)}])
-        yield Table("times", [figure("fit", 9.0, "us", 1.19)])
+        yield RatioTable("sizes", [{"points": 7, "R": (0.5, 1.25)}])
+        yield RatioTable("times", [figure("fit", 9.0, "us", 1.19)])
 
 bench.SECTIONS = {"toy": Toy}
 sys.exit(bench.main(sys.argv[1:]))

@@ -41,7 +41,8 @@ def named(page: Path) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", [p for p in pages() if blocks(p, "python")], ids=named)
-def test_snippets_run(page: Path) -> None:
+def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # where some of them write
     names: dict[str, Any] = {}
     for block in blocks(page, "python"):
         exec(compile(block, named(page), "exec"), names)

@@ -127,8 +127,8 @@ def test_what_is_impossible_is_refused_with_its_reason(request_: Request) -> Non
 
 
 @pytest.mark.parametrize("model", ["held", "similar", "learned", "mixture"])
-def test_the_focal_length_of_a_far_flat_object_is_uncertain(model: str) -> None:
-    problem = problem_of(Cell(model, "keypoints", "known", "number", "linear"), Path())
+def test_the_focal_length_of_a_far_flat_object_is_uncertain(model: str, folder: Path) -> None:
+    problem = problem_of(Cell(model, "keypoints", "known", "number", "linear"), folder)
     rows = [0, 1, 2, 3, 8, 9, 10]
     camera = Camera(480, 360, 8000.0, 8000.0, 239.5, 179.5)
     far = Alignment(problem.truths[0].rotation, [0.0, 0.0, 60.0], np.ones(3))

@@ -24,6 +24,7 @@ Vehicles from a Single Image: Shape Priors for Road Scene Understanding", ICRA 2
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -220,7 +221,8 @@ def car_box(dims_hwl: FloatArray, location: FloatArray, rotation_y: float) -> Bo
     height, width, length = dims_hwl.tolist()
     if not min(height, width, length) > 0:
         raise InputError(f"{dims_hwl.tolist()} are not positive", where="dimensions")
-    turn = rotation_from_vector(np.array([0.0, rotation_y, 0.0]))
+    angle = math.remainder(rotation_y, math.tau)  # of a number whose square overflows, too
+    turn = rotation_from_vector(np.array([0.0, angle, 0.0]))
     center = location - np.array([0, height / 2, 0])
     return Box(center, turn @ _OBJECT_FROM_CAR, np.array([width, length, height]))
 

@@ -179,3 +179,10 @@ def test_the_mean_car_in_the_true_box_lies_on_the_sample_keypoints(real_data):
     assert len(gaps) == 62
     assert np.median(gaps) < 8
     assert sum(photo.image is not None for photo in dataset) == 3
+
+
+def test_angles_beyond_all_turns_give_a_box() -> None:
+    dims, place = np.array([1.5, 1.7, 4.2]), np.array([1.0, 1.6, 20.0])
+    whole = car_box(dims, place, 0.3 + 4 * np.pi)
+    np.testing.assert_allclose(whole.rotation, car_box(dims, place, 0.3).rotation, atol=1e-12)
+    assert np.isfinite(car_box(dims, place, 1e300).rotation).all()

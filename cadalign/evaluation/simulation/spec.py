@@ -7,9 +7,11 @@ and ``failed``, the number of problems and of those that the method did not solv
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 
+from cadalign.errors import DataError
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import OK
@@ -40,6 +42,8 @@ def kind_of(run: Run) -> SweepKind:
     stated = {**asdict(SWEEPS["noise"]), **given} if isinstance(given, dict) else given
     with in_file(run.folder.config_file):
         found: SweepKind = convert(stated, SweepKind, "sweep")
+        if any(abs(value) > sys.float_info.max for value in found.values):
+            raise DataError("a value is beyond all numbers", where="sweep.values")
     return found
 
 

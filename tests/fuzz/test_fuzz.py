@@ -50,3 +50,8 @@ def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [seed for _, seed in outcome.failures] == list(range(20))
     for what, seed in outcome.failures:
         assert ("broken on purpose" if kinds[seed] == "exact" else "took more than") in what
+
+
+def test_a_prior_beside_keypoints_that_determine_nothing_leaves_a_covariance() -> None:
+    """Of one stretch in a photo whose keypoints lie anywhere; its variances were negative."""
+    fits.run_case(draw_case(1182))

@@ -27,6 +27,7 @@ from cadalign.geometry.symmetry import Symmetry
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
+_MOST_ASYMMETRY = 1e-3  # of a covariance, relative to its standard deviations
 _DRAWS = (500, 500, 1000, 2000, 4000)
 _ENOUGH_EFFECTIVE = 300.0  # effective draws of a round that end the sampling
 _FREEDOM = 5.0  # degrees of freedom of the Student proposals
@@ -243,7 +244,13 @@ def _with_noise_times(widening: float, covariance: FloatArray, options: FitOptio
         widened[free] = np.linalg.inv(of_keypoints / widening + prior)
     except np.linalg.LinAlgError:
         return covariance * widening
-    return widened
+    # Where the keypoints determine hardly anything, rounding is all that the difference leaves.
+    variances = widened[free].diagonal()
+    if not (variances > 0).all():
+        return covariance * widening
+    deviations = np.sqrt(variances)
+    asymmetry = np.abs(widened[free] - widened[free].T) / np.outer(deviations, deviations)
+    return widened if asymmetry.max() < _MOST_ASYMMETRY else covariance * widening
 
 
 @np.errstate(all="ignore")  # draws that overflow have no weight

@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.errors import DataError
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.evidence import ImageEvidence, Size
+from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 
@@ -114,7 +114,7 @@ def _place_of(photo: Path, views: tuple[ObservedImage, ...], *, where: Path) -> 
 
 
 def _lengths(size: Size) -> list[str]:
-    return [name for name in ("width", "height", "length") if getattr(size, name) is not None]
+    return [name for name in LENGTHS if getattr(size, name) is not None]
 
 
 def known_depths(depths: list[float | None]) -> np.ndarray | None:

@@ -17,7 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.prior import ShapePrior
-from cadalign.io.evidence import EvidenceField, Size, register_fields, remove_fields
+from cadalign.io.evidence import LENGTHS, EvidenceField, Size, register_fields, remove_fields
 from cadalign.solvers.joint.evidence import Directions, Offsets
 
 SIZE = "size"
@@ -226,8 +226,7 @@ def _lengths(size: Size | None, prior: ShapePrior) -> list[Known]:
     for axis in np.flatnonzero(np.isfinite(size.lengths)).tolist():
         if not prior.lengths[axis] > 0:
             what = f"the model has no extent along its {'xyz'[axis]}"
-            where = f"size.{('width', 'height', 'length')[axis]}"
-            raise InputError(what, where=where, fix="leave it away")
+            raise InputError(what, where=f"size.{LENGTHS[axis]}", fix="leave it away")
         sigma = float(np.sqrt(size.deviations[axis] ** 2 + own))
         ends = (corners, corners + 1)
         found.append(KnownDistance(ends, np.eye(3)[axis], float(size.lengths[axis]), sigma))

@@ -88,8 +88,7 @@ def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
 
 
 def _check_view(view: View, number: int) -> None:
-    is_something = view.mask is not None or is_told(view.given)
-    if not len(view.keypoint_ids) and not is_something:
+    if not len(view.keypoint_ids) and view.mask is None and not is_told(view.given):
         fix = "give keypoints, a mask or a direction, or leave the view away"
         raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
 

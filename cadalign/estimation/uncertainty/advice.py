@@ -27,7 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
-from cadalign.io.evidence import Size
+from cadalign.io.evidence import LENGTHS, Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
@@ -36,7 +36,6 @@ from cadalign.solvers.joint.evidence import Evidence, Shape, State
 TURN_DEG = 25.0  # of another view about the object
 _MASK_SIGMA = 1.5  # of a contour as segmentation gives it [px]
 LENGTH_SIGMA = 0.01
-_LENGTHS = ("width", "height", "length")
 _LEAST_SPREAD = 1e-6  # of points whose displacements a shape leaves out [model units]
 
 
@@ -176,9 +175,9 @@ def _lengths(scene: KnownScene) -> Iterator[Advice]:
             continue
         all_of_them = known.copy()
         all_of_them[new] = lengths[new]
-        told = dict(zip(_LENGTHS, all_of_them.tolist(), strict=True))
+        told = dict(zip(LENGTHS, all_of_them.tolist(), strict=True))
         size = Size(**{name: value for name, value in told.items() if value == value}, sigma=sigma)
-        detail = " and ".join(_LENGTHS[axis] for axis in new)
+        detail = " and ".join(LENGTHS[axis] for axis in new)
         found.append(_advice("lengths", detail, replace(scene, size=size)))
     if found:
         yield _best(found)

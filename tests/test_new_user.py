@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from support import readme
 from support.wheels import ROOT, Environment, build_wheel
 
 import cadalign
@@ -104,6 +105,7 @@ def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
 
 @pytest.mark.long
 def test_snippets_of_readme_and_site_run(user: Environment) -> None:
+    readme.write_files(user.home)
     ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
     assert ran.count("ran ") >= len(PAGES) > 5
 

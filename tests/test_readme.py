@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import readme
 from support.layers import layers
 
 import cadalign
@@ -23,7 +24,11 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.long
-def test_python_snippets_run_and_find_the_stretch() -> None:
+def test_python_snippets_run_and_find_the_stretch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    readme.write_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), names)
@@ -32,12 +37,13 @@ def test_python_snippets_run_and_find_the_stretch() -> None:
     deviation = np.array(result.std.scale[1:])
     np.testing.assert_array_less(np.abs(result.alignment.scale[1:] / [1.3, 0.8] - 1), 4 * deviation)
     assert not result.warnings
+    assert (tmp_path / "chair.glb").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 def test_named_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
     commands = set(re.findall(r"^cadalign ([a-z]+)", "\n".join(blocks("sh")), flags=re.MULTILINE))
-    assert {"demo", "fit"} <= commands
+    assert {"annotate", "fit", "export"} <= commands
     for command in commands:
         with pytest.raises(SystemExit) as stop:
             main([command, "--help"])

@@ -12,12 +12,14 @@ from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
 from operator import or_
-from types import ModuleType
-from typing import Annotated, Any, NamedTuple
+from types import ModuleType, NoneType
+from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 from tyro.constructors import (
     ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
     StructConstructorSpec,
     StructFieldSpec,
     StructTypeInfo,
@@ -33,10 +35,28 @@ _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 def plain_help() -> ConstructorRegistry:
     """Rules by which tyro adds neither line breaks nor "(default: None)" to an option's text.
 
-    The text of an option that is unset or empty by default says what then holds.
+    The text of an option that is unset or empty by default says what then holds, and its form is
+    that of a value, ``PATH`` rather than ``{None}|PATH``.
     """
     registry = ConstructorRegistry()
     asked: list[StructTypeInfo] = []
+    asked_unions: list[PrimitiveTypeInfo] = []
+
+    @registry.primitive_rule
+    def optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if asked_unions or NoneType not in get_args(info.type):
+            return None
+        asked_unions.append(info)
+        try:
+            spec = ConstructorRegistry.get_primitive_spec(info)
+        finally:
+            asked_unions.pop()
+        if not isinstance(spec, PrimitiveConstructorSpec):
+            return None
+        metavar = spec.metavar.removeprefix("{None}|").replace("{None,", "{")
+        if metavar.startswith("{") and metavar.find("}") == len(metavar) - 1 and " " in metavar:
+            metavar = metavar[1:-1]  # several values; a choice keeps its braces
+        return replace(spec, metavar=metavar)
 
     @registry.struct_rule
     def plain(info: StructTypeInfo) -> StructConstructorSpec | None:

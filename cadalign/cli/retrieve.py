@@ -31,13 +31,16 @@ class _RetrievalOptions(RetrievalOptions):
     """Ranking of the models; the observation file supplies the standard deviation."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
+    method: str = RetrievalOptions.method
+    """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without
+    stretch)."""
 
     def __post_init__(self) -> None:
         with named_as_flags(self, kind=OptionError):
             super().__post_init__()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Retrieve(ObservationCommand):
     """Find the models of a library that explain an image's keypoints best.
 
@@ -54,8 +57,9 @@ class Retrieve(ObservationCommand):
     """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
     shape estimated from the keypoints, for objects that are not in the library. An unknown focal
     length is estimated with it, with the photo's EXIF data as a prior."""
-    robust: bool = False
-    """Not available here: use --loss cauchy against outliers."""
+    out: Path | None = None
+    """Folder for matches.json, the matches' overlays and index.html; by default none is
+    written."""
     mask: Path | None = None
     """Image of the object's pixels in white: ranks the matches again by their silhouettes."""
     silhouette: bool = False
@@ -72,12 +76,6 @@ class Retrieve(ObservationCommand):
         from cadalign.retrieval.page import none_text, write_retrieval
         from cadalign.retrieval.query import read_mask, read_opacity, read_query
 
-        if self.robust:
-            raise InputError(
-                "the robust search (RANSAC) is an option of `cadalign fit` only",
-                where="--robust",
-                fix="use --loss cauchy",
-            )
         query = read_query(self.observation)
         assert query.semantic_ids is not None
         library = Library.open(self.library)

@@ -285,8 +285,9 @@ class ResultData:
         probability : float
             Between 0 and 1.
         dimension : int
-            Number of coordinates that the region has: 1 for an interval, 3 for a rotation or a
-            keypoint, whose regions are ellipsoids.
+            Number of coordinates that the region has: 1 for the interval of one number, 3 for the
+            ellipsoid of a rotation, translation or keypoint, along the principal axes of its
+            covariance. ``std.rotation_deg`` is a total over three axes and takes neither.
 
         Raises
         ------

@@ -27,13 +27,13 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.summary import misfits
+from cadalign.estimation.uncertainty.held_out import SeenShape, ShapeTails, keypoint_misfits
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.marginal.equations import POSE, POSE_UNKNOWNS, force_of
+from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture, Seen
 from cadalign.solvers.marginal.search import search_view
@@ -140,7 +140,23 @@ def align_single(
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
     pose, force = minima.states[0, :POSE].copy(), force_of(minima.states[0])
-    is_linear = seen.loss == LINEAR
+    warnings: tuple[str, ...] = ()
+    if seen.loss == LINEAR:
+        beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
+        warnings = keypoint_misfits(
+            SeenShape(
+                likely.points[0][rows],
+                means[component].reshape(-1, 3)[rows],
+                covariances[component][np.ix_(beside, beside)],
+                estimates[0].poses[0],
+                seen.rays,
+                seen.whitening,
+            ),
+            cost,
+            view.keypoint_ids,
+            tails=ShapeTails(inflation, model.degrees_of_freedom),
+            focal=view.camera.fx,
+        )
     return result_of(
         Found(
             model,
@@ -149,7 +165,7 @@ def align_single(
             estimates,
             [np.ones(len(rows), dtype=bool)],
             is_curved=bool(covariances.any()),
-            warnings=misfits(cost, 2 * len(rows) - POSE_UNKNOWNS) if is_linear else (),
+            warnings=warnings,
             evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
             basis=SingleBasis(model, view, options, component, pose, force),
             cost=cost,

@@ -346,6 +346,18 @@ def test_residuals_beyond_their_sigma_are_reported() -> None:
     assert any("times as large as sigma" in text for text in align(model, view).warnings)
 
 
+def test_keypoint_that_contradicts_a_learned_shape_is_named() -> None:
+    model, rng = spreads(0.01), np.random.default_rng(0)
+    noise = rng.normal(0, 1, (10, 2))
+    right = align(model, seen(keypoints(), truth_of((1, 1, 1)), np.eye(4), noise=noise))
+    assert not right.warnings
+    noise[4] += (30, 20)
+    (warning,) = align(
+        model, seen(keypoints(), truth_of((1, 1, 1)), np.eye(4), noise=noise)
+    ).warnings
+    assert warning.startswith(("keypoint 4 is 3", "keypoint 4 is 4"))
+
+
 def test_a_result_survives_json() -> None:
     model, rng = spreads(0.05), np.random.default_rng(0)
     noise = rng.normal(0, 3, (10, 2))

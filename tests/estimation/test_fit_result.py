@@ -151,7 +151,7 @@ def test_warnings_look_at_the_inliers_alone() -> None:
     statistics = KeypointStatistics(
         points, np.zeros((7, 2)), inliers, POSE, SIMULATION_CAMERA, options, 1.0, COVARIANCE
     )
-    vars(statistics)["covariance"] = COVARIANCE
+    vars(statistics)["covariance"] = 100 * COVARIANCE
     assert statistics.warnings == (
-        "s_z is known only to +-15 %: the keypoints lie nearly in the plane z = 0.25",
+        "s_z is known only to +-150 %: the keypoints lie nearly in the plane z = 0.25",
     )

@@ -94,12 +94,12 @@ def test_rotations_about_the_axis_count_for_nothing():
     """Deviations are those of the axis; a bottle's keypoints give no warning of its rotation."""
     symmetry = Symmetry.around(UP, fold=None, offset=OFFSET)
     points, pixels = observed(1.0, fold=None)
-    slim = (points - OFFSET) * [0.05, 1, 0.05] + OFFSET  # its rotation is hardly seen
+    slim = (points - OFFSET) * [0.015, 1, 0.015] + OFFSET  # its rotation is hardly seen
     pixels = CAMERA.project(truth_of(1.0).apply(slim))
     options = {"stretch": "none", "sigma": 2.0}
     plain = fit(slim, pixels, CAMERA, **options)
     result = fit(slim, pixels, CAMERA, **options, symmetry=symmetry)
-    assert plain.std.rotation_deg > 10
+    assert plain.std.rotation_deg > 30
     assert any("rotation" in text for text in plain.warnings)
     assert result.std.rotation_deg < 0.5 * plain.std.rotation_deg
     assert not any("rotation is known only" in text for text in result.warnings)

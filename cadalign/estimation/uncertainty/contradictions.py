@@ -223,14 +223,25 @@ def _rank(hessian: FloatArray) -> int:
     return int((values > _LEAST_INFORMATION * len(values)).sum())
 
 
-def warnings_of(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
-    """Warnings about evidence that contradicts the rest, and residuals beyond their sigma."""
+def warnings_of(
+    evidence: Evidence,
+    state: State,
+    cost: float,
+    *,
+    inflation: float,
+    degrees_of_freedom: float | None,
+) -> tuple[str, ...]:
+    """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
+
+    ``inflation`` and ``degrees_of_freedom`` are those of the shape's prior.
+    """
     contradicting = contradictions(evidence, state, cost)
     warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
     if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
         redundancy = count_equations(evidence) - len(evidence.shape.modes)
         redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-        warnings.extend(misfits(cost, redundancy))
+        tails = {"inflation": inflation, "degrees_of_freedom": degrees_of_freedom}
+        warnings.extend(misfits(cost, redundancy, **tails))
     return tuple(warnings)
 
 

@@ -20,7 +20,7 @@ from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.distributions import chi_square_tail
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
-from cadalign.estimation.uncertainty.summary import WEAK_SCALE, Misfit, percent, uncertainty_of
+from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
@@ -28,6 +28,7 @@ from cadalign.solvers.projection import ray_derivatives
 
 _FALSE_ALARMS = 0.004
 _FALSE_STRETCH_ALARMS = 0.002
+_TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _UNKNOWNS = 10  # of a result's covariance, focal length included
@@ -90,7 +91,7 @@ def unverified_stretch(result: FittedKeypoints) -> str | None:
         return None
     assert free.fisher_covariance is not None
     scale = uncertainty_of(free.fisher_covariance).scale
-    doubtful = [axis for axis in sorted(held) if scale["xyz".index(axis)] > WEAK_SCALE]
+    doubtful = [axis for axis in sorted(held) if scale["xyz".index(axis)] > _TESTED_TO]
     if not doubtful:
         return None
     known = " and ".join(f"s_{axis} to +-{percent(scale['xyz'.index(axis)])}" for axis in doubtful)

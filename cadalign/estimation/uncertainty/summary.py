@@ -12,15 +12,16 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between
+from cadalign.shapes.tails import probability_within
 
-WEAK_SCALE = 0.1
-"""Relative standard deviation of a scale that is worth a warning."""
-_WEAK_FOCAL = 0.02
+UNDETERMINED = 1.0
+"""Relative standard deviation beyond which a length, distance or focal length is undetermined."""
+UNDETERMINED_ROTATION_DEG = 30.0
+_LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
 _SHALLOW = 0.5  # differences of depth over the distance
-WEAK_ROTATION_DEG = 10.0
-WEAK_DISTANCE = 0.1  # standard deviation of the translation over its length
 _THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
 _END_ON_DEG = 15.0
+_ANOTHER_DEG = 10.0
 _LIKELY = 0.1  # probability of an alternative that is worth a warning
 _LEAST_PROBABILITY = 0.005  # of residuals as large as these by chance
 _MOST_NAMED = 5  # outliers, in a sentence
@@ -33,7 +34,7 @@ class Uncertainty:
     Parameters
     ----------
     rotation_deg : float
-        Of the rotation about all axes together [degrees].
+        Of the rotation [degrees]: the root of the sum of the variances about three axes.
     translation : tuple of 3 float
         Along the camera's axes [model units].
     scale : tuple of 3 float
@@ -67,11 +68,13 @@ def weaknesses_of_keypoints(
     std: Uncertainty,
     *,
     redundancy: int,
+    scale_prior_sigma: float | None,
     doubt: str | None,
 ) -> tuple[str, ...]:
-    """Warn about stretch and motion that the keypoints leave uncertain, with the reason.
+    """Warn about stretch and motion that the keypoints do not determine, with the reason.
 
-    ``redundancy`` counts the equations minus the unknowns; ``doubt`` is a warning about an
+    ``redundancy`` counts the equations minus the unknowns; beside a prior on the scales the
+    keypoints must determine them better than the prior does; ``doubt`` is a warning about an
     estimated focal length that looks well determined.
     """
     warnings = []
@@ -80,18 +83,21 @@ def weaknesses_of_keypoints(
             f"{len(points_3d)} keypoints fit exactly whatever they are: "
             "the residuals say nothing about the quality of the fit"
         )
-    if std.focal > _WEAK_FOCAL:
+    if std.focal > UNDETERMINED:
         why = _why_focal_is_weak(points_3d, alignment)
         warnings.append(_known_only("the focal length", percent(std.focal), why))
     if doubt is not None:
         warnings.append(doubt)
+    most = UNDETERMINED
+    if scale_prior_sigma is not None:
+        most = min(most, _LEAST_GAIN * scale_prior_sigma)
     for axis, relative in enumerate(std.scale):
-        if relative > WEAK_SCALE:
+        if relative > most:
             why = _why_scale_is_weak(points_3d, alignment, axis)
             warnings.append(_known_only(f"s_{'xyz'[axis]}", percent(relative), why))
     warnings += _weak_rotation(std)
     distance, spread = _distance(alignment, std)
-    if spread > WEAK_DISTANCE * distance:
+    if spread > UNDETERMINED * distance:
         direction = "xyz"[int(np.argmax(std.translation))]
         share = f" ({percent(spread / distance)} of the distance)" if distance > 0 else ""
         size = f"{max(std.translation):.2g} model units{share}"
@@ -100,15 +106,15 @@ def weaknesses_of_keypoints(
 
 
 def weaknesses(alignment: Alignment, std: Uncertainty) -> tuple[str, ...]:
-    """Warn about rotation, lengths, distance and focal length that are known badly."""
+    """Warn about rotation, lengths, distance and focal length that are not determined."""
     warnings = _weak_rotation(std)
     for axis, relative in zip("xyz", std.scale, strict=True):
-        if relative > WEAK_SCALE:
+        if relative > UNDETERMINED:
             warnings.append(_known_only(f"the length along {axis}", percent(relative)))
     distance, spread = _distance(alignment, std)
-    if spread > WEAK_DISTANCE * distance > 0:
+    if spread > UNDETERMINED * distance > 0:
         warnings.append(_known_only("the distance", percent(spread / distance)))
-    if std.focal > WEAK_SCALE:
+    if std.focal > UNDETERMINED:
         warnings.append(_known_only("the focal length", percent(std.focal)))
     return tuple(warnings)
 
@@ -118,7 +124,7 @@ def _known_only(what: str, to: str, why: str = "") -> str:
 
 
 def _weak_rotation(std: Uncertainty) -> list[str]:
-    if std.rotation_deg <= WEAK_ROTATION_DEG:
+    if std.rotation_deg <= UNDETERMINED_ROTATION_DEG:
         return []
     return [_known_only("the rotation", f"{std.rotation_deg:.2g} deg")]
 
@@ -167,7 +173,7 @@ def another_pose(
     likeliest = int(np.argmax(likelihoods))
     share = likelihoods[likeliest] / (1 + sum(likelihoods))
     angle = angle_between(others[likeliest].rotation, best.rotation)
-    if share < _LIKELY or angle < WEAK_ROTATION_DEG:
+    if share < _LIKELY or angle < _ANOTHER_DEG:
         return ()
     return (
         f"another pose, {angle:.0f} deg away, has a probability of {100 * share:.0f} %: "
@@ -175,17 +181,26 @@ def another_pose(
     )
 
 
-def misfits(cost: float, redundancy: int) -> tuple[str, ...]:
+def misfits(
+    cost: float,
+    redundancy: int,
+    *,
+    inflation: float = 1.0,
+    degrees_of_freedom: float | None = None,
+) -> tuple[str, ...]:
     """Report residuals that are too large for their standard deviations.
 
     At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
-    prior adds one equation, every other takes one away.
+    prior adds one equation, every other takes one away. Of a learned shape it is distributed as
+    errors of held-out objects are: wider by ``inflation`` and with the tails of so many
+    ``degrees_of_freedom``.
     """
-    from scipy.special import chdtrc  # takes longer to import than all that is compiled
-
-    if redundancy <= 0 or chdtrc(redundancy, cost) >= _LEAST_PROBABILITY:
+    if redundancy <= 0 or cost < redundancy:
         return ()
-    ratio = np.sqrt(cost / redundancy)
+    squares = cost / inflation**2
+    if 1 - probability_within(squares, redundancy, degrees_of_freedom) >= _LEAST_PROBABILITY:
+        return ()
+    ratio = np.sqrt(squares / redundancy)
     return (
         f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
         "a keypoint, a sigma or the model is wrong",

@@ -240,8 +240,9 @@ def warnings_of(
     if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
         redundancy = count_equations(evidence) - len(evidence.shape.modes)
         redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-        tails = {"inflation": inflation, "degrees_of_freedom": degrees_of_freedom}
-        warnings.extend(misfits(cost, redundancy, **tails))
+        warnings += misfits(
+            cost, redundancy, inflation=inflation, degrees_of_freedom=degrees_of_freedom
+        )
     return tuple(warnings)
 
 

@@ -120,7 +120,7 @@ def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArra
     pose = by_pose.reshape(2 * count, _POSE)
     weighted = inverse @ pose
     weight = inverse - weighted @ np.linalg.solve(pose.T @ weighted, weighted.T)
-    return errors.ravel(), weight
+    return errors.ravel(), np.asarray(weight)
 
 
 def _whiteners(seen: SeenShape) -> FloatArray:

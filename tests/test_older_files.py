@@ -86,7 +86,9 @@ def test_fit_results(path: Path) -> None:
     np.testing.assert_array_equal(result.inliers, said["inliers"])
     assert result.rms == pytest.approx(said["rms"], rel=1e-12)
     assert result.sigma == said["sigma"]
-    assert result.warnings == tuple(said["warnings"])
+    # What is merely uncertain was warned of in those days.
+    assert set(result.warnings) <= set(said["warnings"])
+    assert all(text in result.warnings or "known only" in text for text in said["warnings"])
     assert (result.covariance is None) == (said["covariance"] is None)
     if result.covariance is not None:
         known = 6 + "xyz".index(said["known_axis"])

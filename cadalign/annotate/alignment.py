@@ -16,7 +16,8 @@ from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
+from cadalign.estimation.uncertainty.misfit import find_outliers
+from cadalign.estimation.uncertainty.tested import Rows
 from cadalign.geometry.camera import Camera
 
 LEAST_PAIRS = 4

@@ -14,7 +14,7 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.estimation.uncertainty.misfit import predicted_covariances, projection_jacobian
+from cadalign.estimation.uncertainty.prediction import predicted_covariances, projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import projected_covariances

@@ -103,6 +103,7 @@ class _Misfit(ForeignDocument):
     redundancy: int
     free_scale: Point3 | None
     outliers: list[_Outlier]
+    camera: dict[str, Any] | None = None
 
 
 class _Mask(ForeignDocument):
@@ -321,7 +322,8 @@ def _misfit(read: _Misfit | None) -> Misfit | None:
     if read is None:
         return None
     outliers = {each.row: each.distance_px for each in read.outliers}
-    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers)
+    camera = None if read.camera is None else Camera.from_dict(read.camera)
+    return Misfit(read.chi_square, read.redundancy, read.free_scale, outliers, camera)
 
 
 def _mask(read: _Mask | None) -> MaskResiduals | None:

@@ -16,7 +16,7 @@ from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
 from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
 from cadalign.errors import InputError
-from cadalign.estimation.uncertainty.misfit import projection_jacobian
+from cadalign.estimation.uncertainty.prediction import projection_jacobian
 from cadalign.evaluation.simulation.problems import Problem
 
 KNOWN = FocalChoice(known=True)

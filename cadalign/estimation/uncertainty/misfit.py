@@ -7,32 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.problems import pack_one
-from cadalign.estimation.solve import fitted_fields, solve_one
-from cadalign.estimation.uncertainty.distributions import chi_square_tail
-from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints
+from cadalign.estimation.uncertainty.prediction import predicted_covariances, projection_jacobian
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
+from cadalign.estimation.uncertainty.tested import (
+    Rows,
+    Tested,
+    contradicting_camera,
+    contradicting_scale,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import perspective
-from cadalign.solvers.projection import ray_derivatives
 
-_FALSE_ALARMS = 0.004
-_FALSE_STRETCH_ALARMS = 0.002
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
-_SCALES = 2  # unknown ones, of an alignment without constraints
-_UNKNOWNS = 10  # of a result's covariance, focal length included
-Rows = npt.NDArray[np.intp]
 
 
 class PoseFit(Protocol):
@@ -59,20 +55,24 @@ def find_misfit(result: FittedKeypoints) -> Misfit | None:
     The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
     at most the square, only makes the test more cautious, and so does the cut of RANSAC. Priors
     count as equations that are always met. A constraint on the scales is tested by the decrease of
-    the sum without it, which has one degree of freedom for each scale.
+    the sum without it, which has one degree of freedom for each scale, and so is the camera's focal
+    length.
     """
     if result.options.sigma is None:
         return None
     try:
-        tested = _Tested.of(result)
+        tested = Tested.of(result)
     except InputError:  # a depth that rounds to zero has no projection
         return None
-    free_scale = _contradicting_scale(tested)
+    free_scale = contradicting_scale(tested)
     if free_scale is not None:
         return Misfit(tested.chi_square, tested.redundancy, free_scale)
-    if tested.passes:
-        return None
-    return Misfit(tested.chi_square, tested.redundancy, outliers=_outliers(tested))
+    passes = tested.passes
+    outliers = {} if passes else _outliers(tested)
+    camera = contradicting_camera(tested) if len(outliers) != 1 else None
+    if camera is not None:
+        return Misfit(tested.chi_square, tested.redundancy, camera=camera)
+    return None if passes else Misfit(tested.chi_square, tested.redundancy, outliers=outliers)
 
 
 def unverified_stretch(result: FittedKeypoints) -> str | None:
@@ -86,7 +86,7 @@ def unverified_stretch(result: FittedKeypoints) -> str | None:
     if not held or options.sigma is None:
         return None
     try:
-        free = _Tested.of(result).fit(stretch=None)
+        free = Tested.of(result).fit(stretch=None)
     except CadalignError:
         return None
     assert free.fisher_covariance is not None
@@ -100,75 +100,7 @@ def unverified_stretch(result: FittedKeypoints) -> str | None:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Tested:
-    """A result's inliers, with their noise and the sum of their losses."""
-
-    points_3d: FloatArray
-    points_2d: FloatArray
-    covariances: FloatArray
-    rows: IntArray
-    camera: Camera
-    options: FitOptions
-    chi_square: float
-
-    @classmethod
-    def of(cls, result: FittedKeypoints) -> _Tested:
-        rows = np.flatnonzero(result.inliers)
-        points_3d, residuals = result.points_3d[rows], result.residuals[rows]
-        projected = result.camera.project(result.alignment.apply(points_3d))
-        likelihood = Likelihood.of(result)
-        covariances = np.linalg.inv(likelihood.information)
-        return cls(
-            points_3d,
-            projected - residuals,
-            np.broadcast_to(covariances, (len(rows), 2, 2)),
-            rows,
-            result.camera,
-            result.options,
-            float(likelihood.losses(residuals).sum()),
-        )
-
-    @property
-    def redundancy(self) -> int:
-        """Equations, of the priors too, minus unknowns."""
-        priors = int(self.options.focal_prior is not None)
-        if self.options.scale_prior_sigma is not None:
-            priors += len(self.options.stretched_axes)
-        return 2 * len(self.rows) - self.options.unknowns + priors
-
-    @property
-    def passes(self) -> bool:
-        """True if the noise explains the sum."""
-        redundancy = self.redundancy
-        return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
-
-    def fit(self, rows: Rows | slice = slice(None), **changes: Any) -> FittedKeypoints:
-        """Fit some of the keypoints anew, with changed options."""
-        options = replace(self.options, sigma=self.covariances[rows], **changes)
-        problems = pack_one(self.points_3d[rows], self.points_2d[rows], self.camera)
-        with np.errstate(all="ignore"):
-            solutions = solve_one(problems, options)
-        return FittedKeypoints(**fitted_fields(problems, solutions, options))
-
-
-def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
-    """The scales without the constraints on them, if these contradict the keypoints."""
-    options = tested.options
-    if len(options.stretched_axes) == _SCALES and options.scale_prior_sigma is None:
-        return None
-    try:
-        free = tested.fit(stretch=None, scale_prior_sigma=None)
-        decrease = tested.chi_square - _Tested.of(free).chi_square
-    except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
-        return None
-    if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
-        return None
-    x, y, z = free.alignment.scale.tolist()
-    return x, y, z
-
-
-def _outliers(tested: _Tested) -> dict[int, float]:
+def _outliers(tested: Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
     def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
@@ -186,7 +118,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
     rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
-    if not _Tested.of(rest).passes:
+    if not Tested.of(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}
 
@@ -324,44 +256,3 @@ def _f_quantile(chance: float, equations: float) -> float:
     if math.isinf(equations):
         return -math.log(chance)
     return equations / 2 * (math.pow(chance, -2 / equations) - 1)
-
-
-def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
-    """Derivatives (n, 2, 10) of projected points, in the order of `cadalign.Result.covariance`.
-
-    In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
-    """
-    in_camera = alignment.apply(points_3d)
-    if not (in_camera[:, 2] > 0).all():
-        raise InputError("a point lies behind the camera", where="points_3d")
-    rays = perspective(in_camera)
-    of_rays = np.zeros((len(rays), 2, _UNKNOWNS))
-    # The kernel knows the first axis, and gives the derivatives by the scales of the other two.
-    for order, last in (([0, 1, 2], [7, 8]), ([2, 0, 1], [6, 7])):
-        ordered = Alignment(
-            alignment.rotation[:, order],
-            alignment.translation,
-            alignment.scale[order],
-            is_valid=True,
-        )
-        of_rays[:, :, [0, 1, 2, 3, 4, 5, *last]] = ray_derivatives(
-            np.ascontiguousarray(points_3d[:, order], float), ordered.packed
-        )
-    to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
-    jacobian = to_pixels @ of_rays
-    jacobian[:, :, 9] = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
-    return np.asarray(jacobian)
-
-
-def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
-
-    Parameters
-    ----------
-    jacobian : (n, 2, 10) float
-        See `projection_jacobian`.
-    covariance : (9, 9) or (10, 10) float
-        Of the unknowns, without the focal length where that is known.
-    """
-    jacobian = jacobian[:, :, : len(covariance)]
-    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import angle_between
 from cadalign.shapes.tails import probability_within
 
@@ -298,12 +299,15 @@ class Misfit:
     outliers : mapping of int to float
         The keypoints without which the others fit, and their distances from where the others put
         them [px]; empty where no few keypoints are to blame.
+    camera : Camera, optional
+        The camera that the keypoints fit, where they contradict the given one.
     """
 
     chi_square: float
     redundancy: int
     free_scale: tuple[float, float, float] | None = None
     outliers: Mapping[int, float] = field(default_factory=dict)
+    camera: Camera | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for JSON."""
@@ -313,6 +317,7 @@ class Misfit:
             "redundancy": self.redundancy,
             "free_scale": None if self.free_scale is None else list(self.free_scale),
             "outliers": outliers,
+            "camera": None if self.camera is None else self.camera.to_dict(),
         }
 
     def __str__(self) -> str:
@@ -321,6 +326,12 @@ class Misfit:
             return (
                 f"the keypoints contradict the constraint on the stretch: without it they fit "
                 f"better, with the scale ({scale})"
+            )
+        if self.camera is not None:
+            camera = self.camera
+            return (
+                "the keypoints contradict the camera: they fit one better that has a focal length "
+                f"of {camera.fx:.4g} px and images of {camera.width} x {camera.height} px"
             )
         ratio = math.sqrt(self.chi_square / self.redundancy)
         text = f"the residuals are {ratio:.2g} times as large as sigma explains: "

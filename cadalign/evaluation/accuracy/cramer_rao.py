@@ -8,7 +8,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import Sigma
 from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
-from cadalign.estimation.uncertainty.misfit import projection_jacobian
+from cadalign.estimation.uncertainty.prediction import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective

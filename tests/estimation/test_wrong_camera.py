@@ -1,0 +1,65 @@
+"""Cameras that the keypoints contradict are named: another image size, another focal length."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, fit
+from cadalign.estimation.result import Result
+from cadalign.geometry.rotations import rotation_from_vector
+
+CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+COUNT = 30
+
+
+def fitted(seed: int, *, factor: float = 1.0, focal: float = 1.0, points: int = 20) -> Result:
+    """Fit keypoints in an image of ``factor`` times the camera's size, with a wrong focal length."""
+    rng = np.random.default_rng(seed)
+    model = rng.uniform(-0.3, 0.3, (points, 3))
+    place = [rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(1.5, 2.5)]
+    rotation = rotation_from_vector(rng.normal(0, 1.5, 3))
+    truth = Alignment(rotation, place, [1, *rng.uniform(0.5, 2, 2)])
+    pixels = CAMERA.project(truth.apply(model)) + rng.normal(0, 1, (points, 2))
+    pixels = (pixels + 0.5) * factor - 0.5
+    told = Camera(640, 480, focal * 935, focal * 935, 319.5, 239.5)
+    return fit(model, pixels, told, sigma=factor)
+
+
+def said(factor: float, focal: float) -> list[str]:
+    found = [fitted(seed, factor=factor, focal=focal).warnings for seed in range(COUNT)]
+    return [" ".join(texts) for texts in found]
+
+
+@pytest.mark.parametrize(
+    ("factor", "size"), [(0.5, "320 x 240"), (2.0, "1280 x 960")], ids=["half", "double"]
+)
+def test_images_of_another_size_are_named(factor: float, size: str) -> None:
+    texts = said(factor, 1.0)
+    assert sum(bool(text) for text in texts) >= 0.95 * COUNT
+    assert sum(f"images of {size} px" in text for text in texts) >= 0.6 * COUNT
+
+
+def test_another_focal_length_is_named() -> None:
+    texts = said(1.0, 1.3)
+    assert sum("contradict the camera" in text for text in texts) >= 0.6 * COUNT
+
+
+def test_right_cameras_are_not_blamed() -> None:
+    texts = [text for count in (6, 8, 20) for text in _right(count)]
+    assert sum("contradict the camera" in text for text in texts) <= 0.01 * len(texts)
+
+
+def _right(count: int) -> list[str]:
+    return [" ".join(fitted(seed, points=count).warnings) for seed in range(100)]
+
+
+def test_named_camera_is_kept_in_json() -> None:
+    result = next(each for each in map(_of_double_size, range(20)) if each.misfit is not None)
+    assert result.misfit is not None
+    again = Result.from_json(result.to_json()).misfit
+    assert again == result.misfit
+
+
+def _of_double_size(seed: int) -> Result:
+    return fitted(seed, factor=2.0)

@@ -66,7 +66,7 @@ print(f"{len(ids)} keypoints, ids {ids.tolist()}")
 # Pose and stretch
 # ----------------
 #
-# ``sigma=None`` estimates the keypoints' deviation from the residuals: two chairs do not agree to
+# ``sigma=None`` estimates the keypoints' noise from the residuals: two chairs do not agree to
 # the pixel, so 1 px would promise too much.
 
 result = cadalign.fit(points_3d, points_2d, camera, sigma=None)
@@ -74,7 +74,7 @@ print(result)
 
 # %%
 # The chair in the photo has the model's width, is about 0.76 times as high, and 0.78 times as deep.
-# The deviations say how well the keypoints tell that: look at them before you believe a number.
+# The standard deviations say how well the keypoints determine it: look at them before you believe a number.
 # ``result.warnings`` has a sentence for what the keypoints leave open; here it is empty.
 
 print(result.alignment.scale, result.std.scale, result.warnings)

@@ -56,7 +56,7 @@ print(result)
 
 # %%
 # ``result.points_3d`` holds *all* keypoints of the category as they are on this chair, the hidden
-# ones too, and ``result.points_covariance`` how well they are known. One image does not tell how
+# ones too, and ``result.points_covariance`` how well they are known. One image does not determine how
 # large the object is, so errors are measured after scaling about the camera centre.
 
 rotation_error = cadalign.metrics.rotation_error(est=result.alignment, gt=true_pose)

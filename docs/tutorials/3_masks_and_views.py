@@ -53,12 +53,12 @@ model = cadalign.Model(points_3d=bottle.keypoints.xyz, ids=ids, mesh=mesh)
 
 
 def report(name: str, result: cadalign.Result) -> None:
-    """One line of errors and deviations."""
+    """One line of errors and standard deviations."""
     iou = cadalign.metrics.box_iou(est=result.box, gt=true_box)
     turn = cadalign.metrics.rotation_error(est=result.alignment, gt=truth)
     stretch = ", ".join(
-        f"{value:.3f} +- {deviation:.3f}"
-        for value, deviation in zip(result.alignment.scale[1:], result.std.scale[1:], strict=True)
+        f"{value:.3f} +- {std:.3f}"
+        for value, std in zip(result.alignment.scale[1:], result.std.scale[1:], strict=True)
     )
     print(f"{name:18} rotation {turn:5.2f} deg off, stretch {stretch}, box IoU {iou:.2f}")
 
@@ -79,8 +79,8 @@ with_mask = cadalign.align(model, seen)
 report("keypoints, mask", with_mask)
 
 # %%
-# ``result.evidence`` tells how well each piece fits, in its own unit and in standard deviations,
-# and ``result.contributions()`` what the deviations would be without it:
+# ``result.evidence`` states how well each piece fits, in its own unit and in standard deviations,
+# and ``result.contributions()`` what the uncertainties would be without it:
 
 for piece in with_mask.evidence:
     print(piece)

@@ -55,7 +55,7 @@ class Probe:
     detail : str
         Device that draws, or the reason of the failure.
     versions : str
-        Of the packages that it needs.
+        Versions of the packages that it needs.
     milliseconds : float, optional
         The median time of a frame, 640 x 480 px with 20,480 triangles.
     """

@@ -37,11 +37,11 @@ def model_of(
     ----------
     observation : Observation
     options : FitOptions
-        Of these the known axis, the stretch and the prior on it count.
+        The known axis, the stretch and the prior on it count.
     shape_sigma : float, optional
         See `cadalign.Model`.
     mesh : Mesh, optional
-        That of the model.
+        Mesh of the model.
 
     Raises
     ------

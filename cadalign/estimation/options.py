@@ -21,7 +21,7 @@ METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
 FOCALS = ("known", "estimate")
 AXES = ("x", "y", "z")
 SIMILAR_SCALE_SIGMA = 0.2
-"""Default deviation of the log scales of an object that is only similar to its model."""
+"""Default standard deviation of the log scales of an object that is only similar to its model."""
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 

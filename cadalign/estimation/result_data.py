@@ -75,7 +75,7 @@ class ResultData:
         otherwise minima whose likelihood is at least 1/1000 of the best one's.
     stats : FitStats
     options : FitOptions, optional
-        Those of `cadalign.fit`.
+        As for `cadalign.fit`.
     symmetry : Symmetry, optional
         The model's, as given: of all equal alignments this is the canonical one.
     model : Model or ShapeModel, optional
@@ -167,17 +167,18 @@ class ResultData:
     def covariance(self) -> FloatArray | None:
         """Covariance (9, 9) or (10, 10) of the errors, calibrated.
 
-        Of the rotation vector in the first camera's frame [rad], the translation [model units], the
-        logarithms of the object's lengths along x, y, z and, where it was estimated, of the focal
-        length; zero for what is held. None for methods that are not statistical.
+        The unknowns are the rotation vector in the first camera's frame [rad], the translation
+        [model units], the logarithms of the object's lengths along x, y, z and, where it was
+        estimated, of the focal length; zero for what is held. None for methods that are not
+        statistical.
 
-        Of the keypoints of an exact model in one view it is the second moments of the posterior
+        For keypoints of an exact model in one view it is the second moments of the posterior
         about the alignment, from some thousand draws (always the same), scaled such that the 95 %
         ellipsoid holds what the likelihood ratio does not reject at 5 %. Where sigma was estimated,
         it is widened for the few degrees of freedom of that estimate. It does not reach to the
         ``alternatives``. Beyond 100 keypoints it is ``fisher_covariance`` but for that widening.
 
-        Of other evidence it is the inverse information of all evidence and priors, calibrated for
+        For other evidence it is the inverse information of all evidence and priors, calibrated for
         learned shapes, and where other estimates are likely too, it holds their distance.
 
         With a symmetry, rotations about its axes count nothing.
@@ -200,7 +201,7 @@ class ResultData:
 
     @property
     def degrees_of_freedom(self) -> float | None:
-        """Of the t distribution of the errors, whose covariance the stated ones are.
+        """Tails of the t distribution of the errors, whose covariance the stated ones are.
 
         None if they are Gaussian. `radius` depends on it.
         """
@@ -247,7 +248,7 @@ class ResultData:
     def bounds(self) -> FloatArray:
         """Least and greatest coordinates (2, 3) of the object in the model's frame.
 
-        Those of the keypoints where the model has no others.
+        The keypoints' bounds where the model has no others.
         """
         return extent(self.points_3d) if self.own_bounds is None else self.own_bounds
 
@@ -278,7 +279,7 @@ class ResultData:
         return 1 / (1 + sum(other.relative_likelihood for other in self.alternatives))
 
     def radius(self, probability: float, *, dimension: int = 1) -> float:
-        """Radius, in stated deviations, of the region that holds the truth with a probability.
+        """Radius, in standard deviations, of the region that holds the truth with a probability.
 
         Parameters
         ----------

@@ -67,7 +67,7 @@ class FitStats:
     inlier_ratio : float, optional
         Share of the keypoints that were kept, where they were searched for.
     score : float, optional
-        Of the robust search: sum of squared errors, each at most the threshold's square [px^2].
+        Sum of squared errors, each at most the threshold's square [px^2], of the robust search.
     """
 
     iterations: int

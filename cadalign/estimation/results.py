@@ -50,7 +50,7 @@ class Results(Sequence[Result | CadalignError]):
     fisher_covariance : (B, 9, 9) or (B, 10, 10) float or None
         See `cadalign.Result`.
     residuals : (n, 2) float
-        Of all problems, one after the other [px].
+        Residuals of all problems, one after the other [px].
     inliers : (n,) bool
         The keypoints that were fitted.
     offsets : (B + 1,) int
@@ -348,7 +348,7 @@ def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
     Parameters
     ----------
     results : Results or sequence of Result or CadalignError
-        Of `cadalign.fit_batch`, `cadalign.align_batch`, or of single calls.
+        Results of `cadalign.fit_batch`, `cadalign.align_batch`, or of single calls.
 
     Returns
     -------

@@ -216,7 +216,7 @@ def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -
 
 
 def checked_depth_sigma(sigma: npt.ArrayLike, depth: object, count: int) -> None:
-    """Check the relative deviation of depths.
+    """Check the relative standard deviation of depths.
 
     Raises
     ------
@@ -253,7 +253,7 @@ def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
 
 
 def checked_up_sigma(sigma: Any) -> None:
-    """Check the deviation of a direction, or its covariance (3, 3).
+    """Check the standard deviation of a direction, or its covariance (3, 3).
 
     Raises
     ------

@@ -137,9 +137,9 @@ def up_from_vertical_edges(
     Returns
     -------
     up : (3,) float
-        Of unit length, in the camera's frame; the one that points up in an upright photo.
+        Unit vector in the camera's frame; the one that points up in an upright photo.
     covariance : (3, 3) float
-        Of the direction [degrees squared], of rank 2: the ``up_sigma_deg`` of `cadalign.View`.
+        Covariance [degrees squared], of rank 2: the ``up_sigma_deg`` of `cadalign.View`.
 
     Raises
     ------

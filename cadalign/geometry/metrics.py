@@ -39,7 +39,7 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
     ----------
     est, gt : Alignment
     symmetry : Symmetry
-        Of the model.
+        Symmetry of the model.
 
     Raises
     ------

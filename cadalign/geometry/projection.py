@@ -22,7 +22,7 @@ def projected_covariances(
     points_cam : (n, 3) float
         In front of the camera, in its frame.
     covariances : (n, 3, 3) float
-        Of these points.
+        Covariances of these points.
     camera : Camera
 
     Examples

@@ -38,7 +38,7 @@ class SymmetryAxis:
     Parameters
     ----------
     direction : (3,) float
-        Of any length but 0; kept with length 1.
+        Direction, of any length but 0; kept with length 1.
     offset : (3,) float
         A point on the axis [model units].
 

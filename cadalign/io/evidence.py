@@ -225,7 +225,7 @@ class ImageEvidence(DeclaredEvidence):
     Raises
     ------
     InputError
-        If a number is not positive, a deviation or scale is given without what it is of, or an
+        If a number is not positive, a sigma or scale is given without its measurement, or an
         array has a wrong shape.
     """
 

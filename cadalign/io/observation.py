@@ -36,7 +36,7 @@ the first photo's EXIF data, unless another photo's differ); and ``shape_sigma``
 ``symmetry`` says what takes the model to itself, in any form of `cadalign.Symmetry.from_dict`:
 ``"__SYM_ROTATE_UP_4"``, ``{"axis": [0, 1, 0], "fold": null}``, or BOP's lists.
 
-Evidence beyond keypoints stands beside them, each field optional, deviations and scales as
+Evidence beyond keypoints stands beside them, each field optional, sigmas and scales as
 `cadalign.View` and `cadalign.Size` describe them::
 
       "mask": "photo.mask.png", "mask_sigma": 1.5,
@@ -100,7 +100,7 @@ class Observation(ObservedImage):
     Parameters
     ----------
     points_3d, points_2d, camera, sigma, semantic_ids, names, confidences, image, depths, evidence
-        Of the first image, as for `ObservedImage`.
+        Camera of the first image, as for `ObservedImage`.
     model : Path, optional
         The CAD model.
     fit_options : mapping
@@ -112,7 +112,7 @@ class Observation(ObservedImage):
     shape : Path, optional
         File of the learned shape that takes the model's place.
     symmetry : Symmetry, optional
-        Of the model.
+        Symmetry of the model.
     init : Alignment, optional
         Where to start, as for `cadalign.align`.
     object_name : str, optional

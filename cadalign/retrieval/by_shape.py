@@ -361,7 +361,7 @@ def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
 def _deviation(values: FloatArray, prior: Gaussians) -> float:
     """Deviation per coordinate of vectors (n, d) from their nearest ones, the median of all.
 
-    That of the prior if there is only one vector.
+    The prior's if there is only one vector.
     """
     values = values[:: -(-len(values) // _MOST_NEIGHBOURS)]
     floor = float(np.sqrt(prior.covariances.diagonal(axis1=1, axis2=2).min()))

@@ -69,7 +69,7 @@ def calibrate(
     sigma : float
         Standard deviation of the image's noise [model units].
     rng : Generator
-        Of the directions, the keypoints that are given, and the noise.
+        Source of the directions, the keypoints that are given, and the noise.
 
     Returns
     -------

@@ -70,8 +70,8 @@ class ShapeModel:
         was learned, the regions of held-out models held the truth as often as they said. Estimates
         don't depend on it.
     degrees_of_freedom : float, optional
-        Of the t distribution that the errors of estimates follow, found likewise: more than 2, None
-        if they are Gaussian. Covariances are those of the errors in any case.
+        Tails of the t distribution that the errors of estimates follow, found likewise: more
+        than 2, None if they are Gaussian. Covariances are those of the errors in any case.
     few_keypoints : FewKeypoints, optional
         Decrease of the inflation where few keypoints are given, found likewise; None for none.
     box_margins : BoxMargins, optional
@@ -359,7 +359,7 @@ class ShapeModel:
         mean : (m + 2, 3) float
             The keypoints, then the least and the greatest corner of the bounding box.
         covariance : (3 (m + 2), 3 (m + 2)) float
-            Of x, y, z of the first row, and so on [model units squared].
+            Covariance of x, y, z of the first row, and so on [model units squared].
         ids, names
             See `ShapeModel.from_basis`.
         modes : int, optional

@@ -39,7 +39,7 @@ def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolAr
     segmentation : list or dict
         As it is in the JSON.
     width, height : int
-        Of the image [px].
+        Size of the image [px].
 
     Returns
     -------

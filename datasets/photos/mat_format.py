@@ -127,7 +127,7 @@ class _Elements:
     def matrix(self, *, names: Collection[str] | None = None, depth: int = 0) -> tuple[str, Any]:
         """The name and the value of an array of any kind, whose parts these elements are.
 
-        Of a name that is not among ``names`` the value is not read.
+        The value of a name that is not among ``names`` is not read.
         """
         if not self.is_more:
             return "", _NOTHING

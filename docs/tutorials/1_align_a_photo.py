@@ -74,7 +74,8 @@ print(result)
 
 # %%
 # The chair in the photo has the model's width, is about 0.76 times as high, and 0.78 times as deep.
-# The standard deviations say how well the keypoints determine it: look at them before you believe a number.
+# The standard deviations say how well the keypoints determine it: look at them before you believe
+# a number.
 # ``result.warnings`` has a sentence for what the keypoints leave open; here it is empty.
 
 print(result.alignment.scale, result.std.scale, result.warnings)

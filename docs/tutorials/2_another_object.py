@@ -56,8 +56,8 @@ print(result)
 
 # %%
 # ``result.points_3d`` holds *all* keypoints of the category as they are on this chair, the hidden
-# ones too, and ``result.points_covariance`` how well they are known. One image does not determine how
-# large the object is, so errors are measured after scaling about the camera centre.
+# ones too, and ``result.points_covariance`` how well they are known. One image leaves the object's
+# size open, so errors are measured after scaling about the camera centre.
 
 rotation_error = cadalign.metrics.rotation_error(est=result.alignment, gt=true_pose)
 true_box = Box.from_model(scene.bounds, true_pose)

@@ -120,7 +120,7 @@ def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatA
     Returns
     -------
     (k, 48, 2) float
-        Those of at least 3 px across.
+        Outlines of the ellipses that are at least 3 px across.
 
     Examples
     --------

@@ -34,7 +34,7 @@ class OverlayStyle:
         The model in its own colours, lit; as a red veil; its visible outline and creases alone; or
         not at all, for the box alone.
     opacity : float
-        Of the shaded or translucent model, 0 to 1.
+        Opacity of the shaded or translucent model, 0 to 1.
     lines, box, axes : bool
         Whether to draw outline and creases over the model, its box, and its x, y and z axes.
 

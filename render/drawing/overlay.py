@@ -94,7 +94,7 @@ def draw_overlay(
         How to show it: ``shaded``, in its own colours, ``translucent``, as a red veil, or
         ``lines`` for outline and edges alone.
     model_opacity : float
-        Of the model where it is no mere lines, 0 to 1.
+        Opacity of the model where it is not drawn as lines, 0 to 1.
     model_lines : bool
         Whether to draw its outline and edges.
     observed, reprojected : (k, 2) float, optional

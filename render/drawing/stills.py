@@ -140,7 +140,7 @@ def turntable(
     scene : Scene
     camera : Camera
     angles : Angles
-        Of the first pose.
+        Direction of the first pose.
     count : int
         Number of poses.
     scale : (3,) float

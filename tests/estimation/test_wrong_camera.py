@@ -14,7 +14,7 @@ COUNT = 30
 
 
 def fitted(seed: int, *, factor: float = 1.0, focal: float = 1.0, points: int = 20) -> Result:
-    """Fit keypoints in an image of ``factor`` times the camera's size, with a wrong focal length."""
+    """Fit keypoints of an image of ``factor`` times the camera's size."""
     rng = np.random.default_rng(seed)
     model = rng.uniform(-0.3, 0.3, (points, 3))
     place = [rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(1.5, 2.5)]

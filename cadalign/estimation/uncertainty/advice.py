@@ -51,9 +51,9 @@ class Advice:
     rotation_deg : float
         Standard deviation of the rotation with the piece [degrees].
     position : float
-        Of the translation, over the distance.
+        Standard deviation of the translation, over the distance.
     stretch : tuple of 3 float
-        Of the lengths along x, y, z, relative.
+        Relative standard deviations of the lengths along x, y, z.
     view : int
         Number of the view that a keypoint or a mask is added to.
     """

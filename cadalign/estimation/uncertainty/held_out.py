@@ -33,7 +33,7 @@ class ShapeTails(NamedTuple):
     inflation : float
         Factor on the standard deviations of the shape.
     degrees_of_freedom : float, optional
-        Those of the tails; None for Gaussian ones.
+        Tails; None for Gaussian ones.
     """
 
     inflation: float = 1.0
@@ -49,7 +49,7 @@ class SeenShape(NamedTuple):
         The keypoints of the estimate [model units].
     mean : (n, 3) float
     covariance : (3 n, 3 n) float
-        Of the keypoints about the mean.
+        Covariance of the keypoints about the mean.
     pose : Alignment
         The estimate, without a stretch.
     rays : (n, 2) float

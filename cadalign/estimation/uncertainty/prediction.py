@@ -49,7 +49,7 @@ def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> Float
     jacobian : (n, 2, 10) float
         See `projection_jacobian`.
     covariance : (9, 9) or (10, 10) float
-        Of the unknowns, without the focal length where that is known.
+        Covariance of the unknowns, without the focal length where that is known.
     """
     jacobian = jacobian[:, :, : len(covariance)]
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

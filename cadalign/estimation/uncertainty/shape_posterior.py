@@ -36,8 +36,8 @@ class ShapePosterior:
     Parameters
     ----------
     shapes : Gaussians
-        Of the stacked rows: x, y, z of each keypoint of the shape model, then of the least and the
-        greatest corner of the box [model units].
+        Mixture over the stacked rows: x, y, z of each keypoint of the shape model, then of the
+        least and the greatest corner of the box [model units].
     log_evidence : float
         Log of the probability density of the image's whitened keypoints, up to a constant, given
         that the object is of the category: it compares shape models that have all of them.
@@ -59,7 +59,7 @@ def shape_posterior(
     view : View
         The keypoints; depths and directions are not used.
     loss, loss_scale
-        Those of the alignment: they weight the keypoints by their residuals.
+        Loss of the alignment: it weights the keypoints by their residuals.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def shape_posterior(
 
     Examples
     --------
-    Of a box as deep as it is wide, the front side alone tells the depth:
+    The front side of a box that is as deep as it is wide determines the depth:
 
     >>> from cadalign import Alignment, Camera, align
     >>> corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)

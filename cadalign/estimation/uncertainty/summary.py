@@ -35,13 +35,13 @@ class Uncertainty:
     Parameters
     ----------
     rotation_deg : float
-        Of the rotation [degrees]: the root of the sum of the variances about three axes.
+        Rotation [degrees]: the root of the sum of the variances about three axes.
     translation : tuple of 3 float
         Along the camera's axes [model units].
     scale : tuple of 3 float
-        Of the scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known.
+        Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known.
     focal : float
-        Of the focal length, relative; 0 where it is known.
+        Focal length, relative; 0 where it is known.
     """
 
     rotation_deg: float

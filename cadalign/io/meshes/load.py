@@ -41,7 +41,7 @@ FLAT_TOLERANCE = 1e-5
 def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh with its faces in file order.
 
-    Of OBJ and PLY files, ``Mesh.polygon`` holds each triangle's face number in the file, which is
+    ``Mesh.polygon`` of OBJ and PLY files holds each triangle's face number in the file, which is
     what keypoint annotations refer to. In GLB and glTF scenes every node is placed by its
     transform and all become one mesh.
 

@@ -24,7 +24,7 @@ from cadalign.solvers.joint.system import Joint, evaluate_joint
 class JointCovariance(NamedTuple):
     """Covariances of the unknowns, and of every point in two frames.
 
-    Those of every pose (P, 6, 6), of poses with the border (P, 6, b) and of the ``border`` (b, b):
+    Blocks of every pose (P, 6, 6), of poses with the border (P, 6, b) and of the ``border`` (b, b):
     log focal lengths, log scales, coefficients. ``points`` (m, 3, 3) in the model's frame are those
     of the shape, scales and displacements included; ``seen`` (m, 3, 3) in the first view's camera
     include the pose.

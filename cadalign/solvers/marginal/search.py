@@ -112,7 +112,7 @@ def _chosen(starts: FloatArray, given: int, first: int, end: int) -> IntArray:
 def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
     """Poses (S, 12) of the mean, the likeliest first.
 
-    Of poses at evenly spread rotations the best are improved by a few steps. The shape's
+    The best of poses at evenly spread rotations are improved by a few steps. The shape's
     uncertainty widens the keypoints' own.
     """
     center, unit = center_and_unit(target.mean)

@@ -24,10 +24,10 @@ from cadalign.errors import InputError, quote
 from cadalign.estimation.model import checked_ids
 from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import read_grey
 
-_ROTATION_TOLERANCE = 1e-6
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
 _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
@@ -125,7 +125,8 @@ class View(DeclaredEvidence):
             object.__setattr__(self, "camera_height", height)
         as_positive(self.camera_height_sigma, name="camera_height_sigma")
         if self.cam_from_rig is not None:
-            object.__setattr__(self, "cam_from_rig", read_only(_rigid(self.cam_from_rig)))
+            motion = nearest_rigid(self.cam_from_rig, where="cam_from_rig")
+            object.__setattr__(self, "cam_from_rig", read_only(motion))
         if self.mask is not None:
             object.__setattr__(self, "mask", read_only(checked_mask(self.mask, self.camera)))
         if self.mask_sigma is not None:
@@ -164,19 +165,6 @@ class View(DeclaredEvidence):
 def _check_camera(camera: object) -> None:
     if not isinstance(camera, Camera):
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
-
-
-def _rigid(pose: npt.ArrayLike) -> FloatArray:
-    """A checked rigid motion (4, 4)."""
-    matrix = as_floats(pose, name="cam_from_rig", shape=(4, 4))
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        fix = "its upper left 3 x 3 must be a rotation, without scale"
-        raise InputError("not a rigid motion", where="cam_from_rig", fix=fix)
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
-        raise InputError("its last row must be 0, 0, 0, 1", where="cam_from_rig")
-    return matrix
 
 
 def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:

@@ -23,6 +23,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.images import ByteImage, read_image
 
 Frame = Literal["camera", "rig", "world", "model"]
@@ -132,8 +133,7 @@ class AlignedObject:
         object.__setattr__(self, "points_3d", points)
         object.__setattr__(self, "metres", as_positive(self.metres, name="metres"))
         if self.world_from_cam is not None:
-            world = as_floats(self.world_from_cam, name="world_from_cam", shape=(4, 4))
-            _check_rigid(world)
+            world = nearest_rigid(self.world_from_cam, where="world_from_cam")
             object.__setattr__(self, "world_from_cam", world)
         poses = [view.cam_from_model for view in self.views]
         poses += [] if self.rig_from_model is None else [self.rig_from_model]
@@ -238,11 +238,3 @@ def photos_of(
         name = view.image_name or f"{number}.png"
         photos.append(Photo(name, image, view.camera, (found,)))
     return tuple(photos)
-
-
-def _check_rigid(matrix: FloatArray) -> None:
-    rotation = matrix[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > 1e-4 or np.linalg.det(rotation) < 0 or (matrix[3] != (0, 0, 0, 1)).any():
-        fix = "give a rotation and a translation, with the last row 0 0 0 1"
-        raise InputError("is not a rigid motion", where="world_from_cam", fix=fix)

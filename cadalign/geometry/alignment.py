@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points, read_only
 from cadalign.errors import InputError
+from cadalign.geometry.rotations import nearest_rotation
 
 _FIELDS = ("rotation", "translation", "scale")
-_ORTHONORMAL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Alignment:
     Parameters
     ----------
     rotation : (3, 3) float
-        Orthonormal, determinant +1.
+        Orthonormal to 1e-2, with determinant +1; the nearest rotation is taken.
     translation : (3,) float
         The model's origin in the camera frame [model units].
     scale : (3,) float
@@ -63,14 +63,7 @@ class Alignment:
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         translation = as_floats(self.translation, name="translation", shape=(3,))
         scale = as_floats(self.scale, name="scale", shape=(3,))
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not error <= _ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise InputError(
-                "not a rotation matrix",
-                where="rotation",
-                fix="its rows must be orthonormal and its determinant +1",
-            )
+        rotation = nearest_rotation(rotation)
         if (scale <= 0).any():
             raise InputError(f"{scale.tolist()} is not positive", where="scale")
         for name, value in zip(_FIELDS, (rotation, translation, scale), strict=True):

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, read_only
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import nearest_rotation
 
 # Corner i lies at the high side of axis k where bit k of i is set.
 _CORNER_SIGNS = np.array([[1 if i >> k & 1 else -1 for k in range(3)] for i in range(8)]) / 2
@@ -51,10 +52,8 @@ class Box:
                 array.flags.writeable = False
             return
         center = as_floats(self.center, name="center", shape=(3,))
-        rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
+        rotation = nearest_rotation(as_floats(self.rotation, name="rotation", shape=(3, 3)))
         extents = as_floats(self.extents, name="extents", shape=(3,))
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6:
-            raise InputError("its columns are not orthonormal", where="rotation")
         if (extents < 0).any():
             raise InputError(f"{extents.tolist()} is negative", where="extents")
         for name, value in (("center", center), ("rotation", rotation), ("extents", extents)):

@@ -13,6 +13,7 @@ from cadalign.arrays import FloatArray, as_floats, as_positive, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.geometry.rotations import nearest_rotation
 
 _AXES = {"opencv": np.ones(3), "opengl": OPENGL_AXES}
 _LEAST_ANGLE = 1e-6  # between two edges' planes, at which they have no direction in common [rad]
@@ -74,10 +75,8 @@ def up_from_pose(
     [0.0, -1.0, 0.0]
     """
     size = 3 if np.shape(world_from_cam) == (3, 3) else 4
-    rotation = as_floats(world_from_cam, name="world_from_cam", shape=(size, size))[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        fix = "give the rotation of the camera in the world, without scale"
-        raise InputError("not a rotation", where="world_from_cam", fix=fix)
+    given = as_floats(world_from_cam, name="world_from_cam", shape=(size, size))
+    rotation = nearest_rotation(given[:3, :3], where="world_from_cam")
     up = as_floats(world_up, name="world_up", shape=(3,))
     return up_from_gravity(-(rotation.T @ up), axes=axes)
 

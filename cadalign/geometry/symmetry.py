@@ -13,9 +13,8 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, read_only
 from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, rotation_from_vector
+from cadalign.geometry.rotations import angle_between, nearest_rigid, rotation_from_vector
 
-_ORTHONORMAL_TOLERANCE = 1e-3
 _UP = (0.0, 1.0, 0.0)
 SCAN2CAD_FOLDS: dict[str, int | None] = {
     "__SYM_NONE": 1,
@@ -95,12 +94,8 @@ class Symmetry:
 
     def __post_init__(self) -> None:
         motions = as_floats(self.motions, name="motions", shape=(None, 4, 4))
-        rotations = motions[:, :3, :3]
-        error = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3))
-        proper = (np.linalg.det(rotations) > 0).all() and (motions[:, 3] == (0, 0, 0, 1)).all()
-        if len(motions) and not (proper and error.max() <= _ORTHONORMAL_TOLERANCE):
-            raise InputError("not rigid motions", where="motions", fix="give rotations with shifts")
-        object.__setattr__(self, "motions", read_only(motions))
+        exact = [nearest_rigid(each, where=f"motions[{k}]") for k, each in enumerate(motions)]
+        object.__setattr__(self, "motions", read_only(np.reshape(exact, (-1, 4, 4))))
 
     @classmethod
     def none(cls) -> Symmetry:

@@ -128,9 +128,7 @@ class SymmetryGroup:
             If motions and axes share no fixed point, or make more than 240 rotations.
         """
         center = _fixed_point(symmetry)
-        generators = [
-            nearest_rotation(motion[:3, :3], tolerance=1e-2) for motion in symmetry.motions
-        ]
+        generators = [motion[:3, :3] for motion in symmetry.motions]
         identity = np.eye(3)[None]
         if not symmetry.axes:
             return cls(center, read_only(_closure(generators)))

@@ -187,5 +187,5 @@ def test_unknown_options_are_refused(tmp_path: Path) -> None:
         ExportOptions(frame="moon")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="scene_id: -1 is not a whole number"):
         ExportOptions(scene_id=-1)
-    with pytest.raises(InputError, match="world_from_cam: is not a rigid motion"):
+    with pytest.raises(InputError, match="world_from_cam: not a rigid motion"):
         aligned(tmp_path, world_from_cam=2 * np.eye(4))

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cadalign import Alignment
+from cadalign import Alignment, Camera, View
 from cadalign.errors import InputError
 
 
@@ -144,6 +144,26 @@ def test_arrays_cannot_be_written_and_are_not_the_callers() -> None:
 def test_copies_and_pickles_are_equal(duplicate: Any) -> None:
     alignment = Alignment(np.eye(3), [0, 0, 4], [1, 2, 3])
     assert duplicate(alignment) == alignment
+
+
+@pytest.mark.parametrize("error", [1e-8, 1.3e-3, 4e-3])
+def test_nearly_rigid_rotations_are_made_exact(error: float) -> None:
+    rng = np.random.default_rng(0)
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    nearly = rotation + rng.uniform(-error / 2, error / 2, (3, 3))
+    alignment = Alignment(nearly, [0, 0, 4], [1, 1, 1])
+    made = alignment.rotation
+    np.testing.assert_allclose(made @ made.T, np.eye(3), atol=1e-12)
+    assert np.abs(made - rotation).max() <= 2 * error
+    motion = np.eye(4)
+    motion[:3, :3] = nearly
+    view = View(
+        Camera(640, 480, 900, 900, 319.5, 239.5),
+        [[300, 200], [320, 220], [350, 240]],
+        ids=[0, 1, 2],
+        cam_from_rig=motion,
+    )
+    np.testing.assert_array_equal(view.cam_from_rig[:3, :3], made)
 
 
 NOT_A_ROTATION = "not a rotation matrix; its rows must be orthonormal and its determinant +1"

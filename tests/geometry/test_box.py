@@ -84,7 +84,10 @@ def test_arrays_cannot_be_written_and_are_not_the_callers() -> None:
     ("arguments", "text"),
     [
         (([0, 0], np.eye(3), [1, 1, 1]), "center: shape (2,), expected (3)"),
-        (([0, 0, 0], np.ones((3, 3)), [1, 1, 1]), "rotation: its columns are not orthonormal"),
+        (
+            ([0, 0, 0], np.ones((3, 3)), [1, 1, 1]),
+            "rotation: not a rotation matrix; its rows must be orthonormal and its determinant +1",
+        ),
         (([0, 0, 0], np.eye(3), [1, -1, 1]), "extents: [1.0, -1.0, 1.0] is negative"),
         (
             ([0, np.nan, 0], np.eye(3), [1, 1, 1]),

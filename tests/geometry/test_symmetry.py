@@ -66,9 +66,9 @@ def test_without_symmetry_it_is_the_rotation_error():
 
 
 def test_what_is_no_motion_is_refused():
-    with pytest.raises(InputError, match="not rigid"):
+    with pytest.raises(InputError, match="not a rigid"):
         Symmetry(np.diag([1.0, 1, -1, 1])[None])
-    with pytest.raises(InputError, match="not rigid"):
+    with pytest.raises(InputError, match="not a rigid"):
         Symmetry(np.diag([2.0, 1, 1, 1])[None])
     with pytest.raises(InputError, match="no direction"):
         SymmetryAxis(np.zeros(3), np.zeros(3))

@@ -13,7 +13,7 @@ from cadalign.arrays import FloatArray, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.camera_form import read_form, read_matrix, write_form
-from cadalign.geometry.pixels import PixelOrigin, distort, perspective, undistort
+from cadalign.geometry.pixels import PixelOrigin, distort, perspective, rescaled_pixels, undistort
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -221,6 +221,34 @@ class Camera:
         if not is_number(focal):
             raise InputError(f"{quote(focal)} is not a finite number", where="focal")
         return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the image after it was resized to so many pixels.
+
+        Examples
+        --------
+        >>> Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5).resized(8, 4).cx
+        3.5
+        """
+        factors = np.array([width / self.width, height / self.height])
+        cx, cy = rescaled_pixels(np.array([self.cx, self.cy]), factors).tolist()
+        fx, fy = (factors * (self.fx, self.fy)).tolist()
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a part of the image whose first pixel is (``left``, ``top``).
+
+        The part may reach beyond the image, as a crop with a border does.
+
+        Examples
+        --------
+        >>> camera = Camera(640, 480, fx=900, fy=900, cx=319.5, cy=239.5)
+        >>> part = camera.cropped(100, 50, 200, 300)
+        >>> part.cx, part.cy, part.width
+        (219.5, 189.5, 200)
+        """
+        cx, cy = self.cx - left, self.cy - top
+        return replace(self, width=width, height=height, cx=cx, cy=cy)
 
     @property
     def matrix(self) -> FloatArray:

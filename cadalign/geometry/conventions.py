@@ -7,8 +7,6 @@ cadalign's begins at the pixel's centre, `PIXEL_CENTRE` from there in x and y.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from cadalign.arrays import FloatArray
@@ -34,18 +32,8 @@ _FLIP = np.diag([*OPENGL_AXES, 1.0])
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of an image that was resized to so many pixels.
-
-    Examples
-    --------
-    >>> from cadalign import Camera
-    >>> resized_camera(Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5), 8, 4).cx
-    3.5
-    """
-    across, down = width / camera.width, height / camera.height
-    cx, cy = rescaled_pixels(np.array([camera.cx, camera.cy]), np.array([across, down])).tolist()
-    fx, fy = camera.fx * across, camera.fy * down
-    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    """The camera of an image that was resized to so many pixels; see `Camera.resized`."""
+    return camera.resized(width, height)
 
 
 def opengl_from_model(cam_from_model: Alignment) -> FloatArray:

@@ -46,6 +46,15 @@ def test_a_resized_camera_renders_where_the_resized_pixels_are(factor: float) ->
         np.testing.assert_allclose(centroid(resized, center), expected, atol=0.02)
 
 
+@pytest.mark.parametrize("offset", [(10, 20), (-5, 3)])
+def test_a_cropped_camera_renders_the_part_of_the_image(offset: tuple[int, int]) -> None:
+    center = 3.0 * np.append(CAMERA.normalize([[60.0, 50.0]])[0], 1.0)
+    part = CAMERA.cropped(*offset, 100, 80)
+    expected = CAMERA.project(center[None])[0] - offset
+    np.testing.assert_allclose(part.project(center[None])[0], expected, atol=1e-9)
+    assert (part.width, part.height, part.distortion) == (100, 80, CAMERA.distortion)
+
+
 def test_pixels_move_as_opencv_resizes_an_image() -> None:
     image = np.zeros((120, 160), dtype=np.float32)
     image[40:44, 90:96] = 1

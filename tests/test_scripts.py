@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
 import subprocess
 import sys
@@ -54,6 +56,19 @@ def test_the_worked_photo_aligns_as_its_page_says(
     printed = capsys.readouterr().out
     for line in page.partition("```text\n")[2].partition("```")[0].splitlines():
         assert line in printed
+
+
+def test_mutants_are_programs_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    mutants = importlib.import_module("mutants")
+    (path,) = [path for path in mutants.sources(("geometry",)) if path.name == "rotations.py"]
+    places = list(mutants.places_of(path))
+    assert len(places) > 30
+    original = (ROOT / path).read_text(encoding="utf-8")
+    for _, place in places:
+        mutant = mutants.mutated(path, place)
+        assert ast.dump(ast.parse(mutant.text)) != ast.dump(ast.parse(original))
+        assert mutants.difference(mutant).count("\n+") >= 1
 
 
 class TestComparingRatios:

@@ -1,0 +1,231 @@
+"""Mutation testing: change the code at random places, and count the changes that tests notice.
+
+    python scripts/mutants.py --count 200              # what `make mutants` runs
+    python scripts/mutants.py --rooms geometry io      # of two rooms
+    python scripts/mutants.py --whole                  # by the whole suite
+
+Each mutant swaps an operator, a comparison, a condition or a number at one place of a copy of the
+checkout. Survivors are printed as differences: each wants a test, or changes nothing that matters.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import difflib
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("cadalign", "datasets", "render")
+COPIED = (
+    *FOLDERS,
+    "tests",
+    "docs",
+    "scripts",
+    "pyproject.toml",
+    "README.md",
+    "LICENSE",
+    "Makefile",
+)
+SWAPS: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+}
+
+
+@dataclass(kw_only=True)
+class Arguments:
+    """Mutation testing with a fixed seed."""
+
+    count: int = 200
+    """Number of mutants."""
+    seed: int = 0
+    """Seed of their places."""
+    rooms: tuple[str, ...] = ()
+    """Rooms to mutate, such as geometry; by default all."""
+    whole: bool = False
+    """Run the whole suite on each mutant rather than the tests of its room."""
+    timeout: float = 900.0
+    """Seconds after which a mutant counts as caught: it hangs."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A changed file: ``path`` relative to the checkout, its ``line`` and its ``text``."""
+
+    path: Path
+    line: int
+    text: str
+
+
+def main(arguments: Arguments) -> int:
+    """Test the mutants; returns 1 if one survived."""
+    places = [place for path in sources(arguments.rooms) for place in places_of(path)]
+    chosen = random.Random(arguments.seed).sample(places, min(arguments.count, len(places)))
+    survivors = []
+    with tempfile.TemporaryDirectory() as folder:
+        checkout = Path(folder) / "checkout"
+        copy_to(checkout)
+        for number, (path, place) in enumerate(chosen, start=1):
+            mutant = mutated(path, place)
+            is_caught = caught(checkout, mutant, arguments)
+            print(f"{number:4} {'caught  ' if is_caught else 'SURVIVED'} {path}:{mutant.line}")
+            sys.stdout.flush()
+            if not is_caught:
+                survivors.append(mutant)
+    for mutant in survivors:
+        print(difference(mutant))
+    share = 100 * (1 - len(survivors) / max(len(chosen), 1))
+    print(f"caught {len(chosen) - len(survivors)} of {len(chosen)} mutants ({share:.0f} %)")
+    return int(bool(survivors))
+
+
+def sources(rooms: tuple[str, ...]) -> list[Path]:
+    """Modules of the chosen rooms, relative to the checkout."""
+    found = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+    inside = [path.relative_to(ROOT) for path in found if not path.is_symlink()]
+    inside = [
+        path
+        for path in inside
+        if path.parts[:2] not in (("cadalign", "datasets"), ("cadalign", "render"))
+    ]
+    return [path for path in inside if not rooms or room_of(path) in rooms]
+
+
+def room_of(path: Path) -> str:
+    """Folder of the tests that are about a module; empty for modules beside the rooms."""
+    parts = path.parts[1:] if path.parts[0] == "cadalign" else path.parts
+    return parts[0] if len(parts) > 1 else ""
+
+
+def places_of(path: Path) -> Iterator[tuple[Path, int]]:
+    """Numbers of a module's nodes, in the order of `ast.walk`, that can be mutated."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    hidden = set(unmutated(tree))
+    for number, node in enumerate(ast.walk(tree)):
+        if node not in hidden and swapped(node) is not None:
+            yield path, number
+
+
+def unmutated(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes inside annotations, texts and conditions about types, which no test can notice."""
+    for node in ast.walk(tree):
+        parts: list[ast.AST | None] = []
+        if isinstance(node, ast.JoinedStr):
+            parts = [node]
+        elif isinstance(node, ast.arg | ast.AnnAssign):
+            parts = [node.annotation]
+        elif isinstance(node, ast.FunctionDef):
+            parts = [node.returns]
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            parts = [node]
+        for part in parts:
+            if part is not None:
+                yield from ast.walk(part)
+
+
+def swapped(node: ast.AST) -> ast.expr | None:
+    """The expression in place of a node, or None if there is none."""
+    if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in SWAPS:
+        changed = copy.deepcopy(node)
+        changed.ops = [SWAPS[type(node.ops[0])]()]  # type: ignore[list-item]
+        return changed
+    if isinstance(node, ast.BinOp | ast.BoolOp) and type(node.op) in SWAPS:
+        either = copy.deepcopy(node)
+        either.op = SWAPS[type(node.op)]()  # type: ignore[assignment]
+        return either
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+        return node.operand
+    if isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
+        value = not node.value if isinstance(node.value, bool) else node.value + 1
+        return ast.Constant(value)
+    return None
+
+
+def mutated(path: Path, place: int) -> Mutant:
+    """The file with the node of that number swapped."""
+    text = (ROOT / path).read_text(encoding="utf-8")
+    node = next(node for number, node in enumerate(ast.walk(ast.parse(text))) if number == place)
+    new = swapped(node)
+    assert isinstance(node, ast.expr)
+    assert new is not None
+    assert node.end_lineno is not None
+    assert node.end_col_offset is not None
+    lines = text.encode().splitlines(keepends=True)
+    start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+    changed = text.encode()[:start] + f"({ast.unparse(new)})".encode() + text.encode()[end:]
+    return Mutant(path, node.lineno, changed.decode())
+
+
+def copy_to(checkout: Path) -> None:
+    """Copy the checkout with its compiled kernels, which keep the times of their sources."""
+    checkout.mkdir()
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            ignore = shutil.ignore_patterns("node_modules", "_build", "*.pyc")
+            shutil.copytree(source, checkout / name, symlinks=True, ignore=ignore)
+        else:
+            shutil.copy2(source, checkout / name)
+
+
+def caught(checkout: Path, mutant: Mutant, arguments: Arguments) -> bool:
+    """True if a test fails on the mutant; the copy is as before afterwards."""
+    target = checkout / mutant.path
+    tests = checkout / "tests" / room_of(mutant.path)
+    chosen = ["tests"] if arguments.whole or not tests.is_dir() else [f"tests/{tests.name}"]
+    marks = "not timing" if arguments.whole else "not long and not timing"
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", marks]
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
+    target.write_text(mutant.text, encoding="utf-8")
+    try:
+        done = subprocess.run(
+            [*command, *chosen],
+            cwd=checkout,
+            env=environment,
+            capture_output=True,
+            timeout=arguments.timeout,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return True
+    finally:
+        shutil.copy2(ROOT / mutant.path, target)
+    return done.returncode != 0
+
+
+def difference(mutant: Mutant) -> str:
+    """The change as a unified difference."""
+    before = (ROOT / mutant.path).read_text(encoding="utf-8").splitlines()
+    named = str(mutant.path)
+    lines = difflib.unified_diff(before, mutant.text.splitlines(), named, named, "", "", 1, "")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Arguments)))

@@ -22,6 +22,7 @@ from cadalign.estimation.results import Results
 from cadalign.estimation.search import (
     JointProblem,
     find_minima,
+    joint_mistake,
     widened_by_noise,
 )
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
@@ -148,6 +149,7 @@ def _align_all(
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
+    mistake = None if ransac is None else joint_mistake(problem, minima[0], ransac)
     masks = None
     if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.depth import fit_depths
@@ -156,7 +158,8 @@ def _align_all(
         masks = fit_masks(model, prior, views, fit_depths(model, prior, views, minima))
         minima = masks.minima
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
-    found = found_in_minima(model, problem, widened_by_noise(problem, minima), stats)
+    likely = widened_by_noise(problem, minima)
+    found = found_in_minima(model, problem, likely, stats, mistake=mistake)
     return result_of(found) if masks is None else masks.noted_in(result_of(found))
 
 

@@ -198,9 +198,16 @@ def result_of(found: Found) -> Result:
 
 
 def found_in_minima(
-    model: Model | ShapeModel, problem: JointProblem, minima: Sequence[Minimum], stats: FitStats
+    model: Model | ShapeModel,
+    problem: JointProblem,
+    minima: Sequence[Minimum],
+    stats: FitStats,
+    *,
+    mistake: str | None = None,
 ) -> Found:
     """The likely estimates of minima, the likeliest first, with widened deviations of the shape.
+
+    ``mistake`` is a warning about one in the data.
 
     Raises
     ------
@@ -235,7 +242,9 @@ def found_in_minima(
         likely,
         _inliers(prior, views, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
-        warnings=warnings_of(
+        warnings=(mistake,)
+        if mistake is not None
+        else warnings_of(
             minimum.evidence,
             minimum.state,
             minimum.cost,

@@ -19,13 +19,14 @@ from cadalign.solvers.joint.search import search_joint
 from cadalign.solvers.joint.starts import ViewRays, rays_in
 from cadalign.solvers.optimal import optimal_batch
 
+OUTLIER_COST = 5.0
+"""Cost of a keypoint that is left out, beyond the square of its threshold."""
 _INLIER_RATIO = 0.5
 _LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
 _REFINED = 8
 _ROUNDS = 5
 _KEPT = 4  # minima of the robust search that are settled on their inliers
 _LEAST_INLIERS = 3
-_OUTLIER_COST = 5.0  # beyond the square of its threshold
 
 
 class JointConsensus(NamedTuple):
@@ -73,7 +74,7 @@ def robust_minima(
 
     Each of the starts is refined under a robust loss, then on its inliers alone until these don't
     change. A keypoint that is left out costs as much as one at its threshold, and the logarithm
-    that one more keypoint would add.
+    that one more keypoint would add (`OUTLIER_COST`).
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def _settle(
         if not minima.states:
             break
         state = minima.states[0]
-        left_out = threshold[~inliers] ** 2 + _OUTLIER_COST
+        left_out = threshold[~inliers] ** 2 + OUTLIER_COST
         score = float(minima.scores[0]) + float(left_out.sum())
         if best is None or score < best.score:
             best = JointConsensus(inliers, some, state, float(minima.costs[0]), score)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import NoConsensusError
 from cadalign.estimation.joint_robust import (
+    OUTLIER_COST,
     JointConsensus,
     robust_minima,
     robust_starts,
@@ -20,8 +23,15 @@ from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
-from cadalign.estimation.robust import Support, area_of, check_support
 from cadalign.estimation.starts import Start, Starts, starts_of
+from cadalign.estimation.support import (
+    Explained,
+    Mistake,
+    Support,
+    area_of,
+    check_support,
+    find_mistake,
+)
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -34,6 +44,7 @@ _MOST_PER_FOCAL_OF_SEVERAL = 3
 _ITERATIONS = 100  # about a lens that is linearised anew
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
 
+_FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
 _NOISES = np.geomspace(0.1, 100.0, 10)  # [px]
 _USUAL, _USUAL_LOG_SIGMA = 2.0, 1.5  # [px], prior: few keypoints fit any noise by the shape
 _NOISE_ROUNDS = 3  # of a search with the noise of the last
@@ -73,6 +84,26 @@ class JointProblem(NamedTuple):
             noise=self.noise,
         )
         return everything._replace(shape=shape)
+
+    def without(self, mistake: Mistake) -> JointProblem:
+        """The problem with a mistake in the model or in the keypoints of all views undone."""
+        components = tuple(
+            shape._replace(mean=_undone(mistake, shape.mean), modes=_undone(mistake, shape.modes))
+            for shape in self.prior.components
+        )
+        views = [
+            replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
+            for each in self.views
+        ]
+        return self._replace(prior=replace(self.prior, components=components), views=views)
+
+
+def _undone(mistake: Mistake, points: FloatArray) -> FloatArray:
+    """Points (..., m, 3) without a mistake; the last two stay the box's least and greatest."""
+    undone = mistake.undo_3d(points)
+    if mistake.mirrored:
+        undone[..., -2:, 0] = undone[..., :-3:-1, 0].copy()
+    return undone
 
 
 class Minimum(NamedTuple):
@@ -189,14 +220,7 @@ def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
     limits = _thresholds(best.evidence, best.lenses, 1.0)
     errors = whitened_lengths(best.evidence, best.state) / limits
-    areas = np.array(
-        [
-            area_of(cast(FloatArray, view.points_2d), view.camera, max_reproj_error)
-            if len(view.keypoint_ids)
-            else 1.0
-            for view in views
-        ]
-    )
+    areas = _areas(views, max_reproj_error)
     free = int(best.evidence.scales.free.sum())
     size = 3 + min(free, _MOST_FREE) // 2 + (problem.lenses.count > 0)
     supports = []
@@ -212,6 +236,50 @@ def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float
         left_out = len(best.inliers) - len(errors)
         score = float((errors**2).sum() + left_out * max_reproj_error**2)
         check_support(supports, size, max_reproj_error=max_reproj_error, score=score, where="views")
+
+
+def _areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
+    """Areas [px^2] over which the outliers of each view are scattered; 1 without keypoints."""
+    return np.array(
+        [
+            area_of(cast(FloatArray, view.points_2d), view.camera, max_reproj_error)
+            if len(view.keypoint_ids)
+            else 1.0
+            for view in views
+        ]
+    )
+
+
+def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions) -> str | None:
+    """Name the mistake without which the keypoints agree better, where many are rejected.
+
+    See `find_mistake`.
+    """
+    if best.inliers.mean() > _FEW_REJECTED:
+        return None
+
+    def explain(mistake: Mistake) -> Explained | None:
+        unknown = [None] * len(problem.views)  # starts are of the data as given
+        try:
+            minima, _, _ = _find_minima(problem.without(mistake), unknown, ransac)
+        except NoConsensusError:
+            return None
+        return _explained(problem, minima[0], ransac) if minima else None
+
+    return find_mistake(_explained(problem, best, ransac), len(best.inliers), explain)
+
+
+def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
+    """What a minimum explains: an outlier lies anywhere, whatever its threshold is."""
+    rejected, error = ~minimum.inliers, ransac.max_reproj_error
+    evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)
+    squares = _thresholds(evidence, minimum.lenses, error)[rejected] ** 2
+    areas = _areas(problem.views, error)[evidence.sightings.image[rejected]]
+    anywhere = 2 * np.log(areas * squares / (2 * math.pi * error**2))
+    score = minimum.score + float((anywhere - squares - OUTLIER_COST).sum())
+    in_rig = minimum.state.poses[evidence.rig.pose[0], :9].reshape(3, 3)
+    in_camera = evidence.rig.cam_from_rig[0, :9].reshape(3, 3) @ in_rig
+    return Explained(score, int(minimum.inliers.sum()), -float(in_camera[1, 1]))
 
 
 def _thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> FloatArray:

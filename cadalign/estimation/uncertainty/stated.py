@@ -25,6 +25,7 @@ from cadalign.estimation.uncertainty.summary import (
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
+    from cadalign.estimation.consensus import RobustSearch
     from cadalign.estimation.uncertainty.evidence import AnyBasis
 
 
@@ -50,8 +51,12 @@ class Stated:
 
 @dataclass(frozen=True, eq=False)
 class KeypointStatistics(FittedKeypoints):
-    """Statements about an exact or stretched model's keypoints in one view."""
+    """Statements about an exact or stretched model's keypoints in one view.
 
+    ``search`` is how inliers were searched for, where they were.
+    """
+
+    search: RobustSearch | None = None
     points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
 
     @cached_property
@@ -80,7 +85,10 @@ class KeypointStatistics(FittedKeypoints):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about a misfit, and about what the keypoints do not determine."""
+        """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
+        mistake = self._mistake()
+        if mistake is not None:  # nothing else can be said of the alignment
+            return (mistake,)
         if self.covariance is None:
             return ()
         kept, options = self.points_3d[self.inliers], self.options
@@ -93,6 +101,13 @@ class KeypointStatistics(FittedKeypoints):
             scale_prior_sigma=options.scale_prior_sigma,
             doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
         )
+
+    def _mistake(self) -> str | None:
+        if self.search is None:
+            return None
+        from cadalign.estimation.consensus import mistake_in  # with the kernels of the search
+
+        return mistake_in(self.search, self.search.explained(self.alignment, self.residuals))
 
     def _contradictions(self) -> tuple[str, ...]:
         """Warnings about a misfit, or about a constraint that cannot be tested."""

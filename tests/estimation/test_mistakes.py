@@ -1,0 +1,235 @@
+"""Mirrored models, flipped photos and swapped coordinates are named by robust estimates."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.problems import with_outliers
+
+from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
+from cadalign.errors import CadalignError, NoConsensusError
+from cadalign.estimation.support import Explained, Mistake, find_mistake
+
+CENTRED = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+OFF_CENTRE = Camera(640, 480, 935.0, 935.0, 190.0, 330.0)
+CHAIR = np.array(  # feet, corners of the seat, top of the back, arms
+    [(x, -0.4, z) for x in (-0.22, 0.22) for z in (-0.24, 0.21)]
+    + [(x, 0.0, z) for x in (-0.25, 0.25) for z in (-0.26, 0.24)]
+    + [(x, 0.42, -0.31) for x in (-0.23, 0.23)]
+    + [(x, 0.15, z) for x in (-0.27, 0.27) for z in (-0.2, 0.12)]
+)
+NAMES = {
+    "mirrored": "the model is mirrored",
+    "swapped": "u and v are swapped",
+    "flipped": "the photo is flipped",
+    "upside down": "v counts from the bottom",
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Keypoints of an upright object in a photo."""
+
+    points_3d: np.ndarray
+    points_2d: np.ndarray
+    camera: Camera
+
+    def mistaken(self, mistake: str) -> Seen:
+        model, pixels = self.points_3d, self.points_2d.copy()
+        if mistake == "mirrored":
+            model = model * [-1, 1, 1]
+        elif mistake == "swapped":
+            pixels = pixels[:, ::-1].copy()
+        elif mistake == "flipped":
+            pixels[:, 0] = self.camera.width - 1 - pixels[:, 0]
+        elif mistake == "upside down":
+            pixels[:, 1] = self.camera.height - 1 - pixels[:, 1]
+        return Seen(model, pixels, self.camera)
+
+    def fit(self) -> Result:
+        return fit(self.points_3d, self.points_2d, self.camera, ransac=RansacOptions())
+
+    def complaint(self) -> str:
+        """What the fit says beside uncertainties: a warning, an error, or nothing."""
+        try:
+            found = self.fit()
+        except CadalignError as error:
+            return str(error)
+        return "; ".join(text for text in found.warnings if "known only" not in text)
+
+
+def photo(points: np.ndarray, rng: np.random.Generator, camera: Camera) -> np.ndarray:
+    """Pixels of an upright object's points from a random side, with 1 px of noise."""
+    while True:
+        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(-10, 50))
+        flat = np.cos(elevation)
+        backward = np.array([flat * np.sin(azimuth), np.sin(elevation), flat * np.cos(azimuth)])
+        right = np.cross([0, 1, 0], backward) / flat
+        rotation = np.array([right, np.cross(right, backward), -backward])
+        in_camera = points @ rotation.T + [0, 0, rng.uniform(2, 4)]
+        if in_camera[:, 2].min() > 0.3:
+            return camera.project(in_camera) + rng.normal(0, 1, (len(points), 2))
+
+
+def seen(
+    seed: int, points: np.ndarray = CHAIR, *, count: int | None = None, camera: Camera = CENTRED
+) -> Seen:
+    """Some keypoints of a stretched object."""
+    rng = np.random.default_rng(seed)
+    count = count or int(rng.integers(7, min(len(points), 16) + 1))
+    some = points[rng.choice(len(points), min(count, len(points)), replace=False)]
+    scale = np.exp([0.0, *rng.normal(0, 0.25, 2)])
+    return Seen(some, photo(some * scale, rng, camera), camera)
+
+
+def spoiled(problem: Seen, seed: int) -> Seen:
+    """The problem with 30 % outliers."""
+    rng = np.random.default_rng([seed, 1])
+    count = len(problem.points_2d)
+    wrong = rng.choice(count, round(0.3 * count), replace=False)
+    pixels = with_outliers(problem.points_2d, wrong, rng)
+    return Seen(problem.points_3d, pixels, problem.camera)
+
+
+def warning_of(problem: Seen) -> str:
+    """The mistake that is named, if any."""
+    complaint = problem.complaint()
+    return complaint if any(name in complaint for name in NAMES.values()) else ""
+
+
+@pytest.mark.parametrize("mistake", NAMES)
+def test_no_mistake_stays_unnoticed(mistake: str) -> None:
+    complaints = [seen(seed).mistaken(mistake).complaint() for seed in range(60)]
+    assert all(complaints)
+    first = [text.partition("(or")[0] for text in complaints]
+    assert np.mean([NAMES[mistake] in text for text in first]) > 0.8
+
+
+@pytest.mark.parametrize("mistake", NAMES)
+def test_principal_point_tells_flips_and_mirrored_models_apart(mistake: str) -> None:
+    complaint = seen(3, count=12, camera=OFF_CENTRE).mistaken(mistake).complaint()
+    assert complaint.startswith(NAMES[mistake])
+
+
+def test_the_warning_tells_what_was_rejected_and_what_would_agree() -> None:
+    problem = seen(0, count=12).mistaken("mirrored")
+    found = problem.fit()
+    rejected = 12 - int(found.inliers.sum())
+    assert found.warnings[0].startswith("the model is mirrored or the photo is flipped")
+    assert found.warnings[0].endswith(
+        "corrected, 12 of 12 keypoints agree; "
+        f"as given, {rejected} ({100 * rejected / 12:.0f} %) are rejected"
+    )
+    assert found.warnings == Result.from_json(found.to_json()).warnings
+
+
+def test_right_keypoints_raise_no_alarm() -> None:
+    assert not any(warning_of(seen(seed)) for seed in range(100))
+
+
+def test_outliers_raise_no_alarm() -> None:
+    for seed in range(100):
+        problem = spoiled(seen(seed, count=8 + seed % 5), seed)
+        assert not problem.complaint()
+
+
+def test_outliers_beside_a_mistake_hide_it_not() -> None:
+    for seed in range(20):
+        problem = spoiled(seen(seed, count=12), seed).mistaken("swapped")
+        assert NAMES["swapped"] in problem.complaint()
+
+
+def test_a_refusal_names_the_mistake() -> None:
+    refused = []
+    for seed in range(60):
+        try:
+            seen(seed).mistaken("swapped").fit()
+        except NoConsensusError as error:
+            refused.append(error)
+    named = [error for error in refused if NAMES["swapped"] in str(error)]
+    assert len(named) > 0.8 * len(refused) > 0
+    assert named[0].what.startswith("no alignment is supported")
+
+
+@pytest.mark.parametrize("mistake", ["mirrored", "swapped"])
+def test_several_views_share_the_check(mistake: str) -> None:
+    named = refused = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        views = []
+        for _ in range(2):
+            pixels = photo(CHAIR * [1.0, 1.1, 0.9], rng, CENTRED)
+            wrong = Seen(CHAIR, pixels, CENTRED).mistaken(mistake)
+            views.append(View(CENTRED, wrong.points_2d))
+        try:
+            found = align(Model(points_3d=wrong.points_3d), views, ransac=RansacOptions())
+        except NoConsensusError:
+            refused += 1
+            continue
+        named += NAMES[mistake] in found.warnings[0]
+    assert named > 0
+    assert named + refused == 10
+
+
+def test_views_of_a_learned_or_similar_shape_share_it() -> None:
+    rng = np.random.default_rng(5)
+    model = CHAIR + rng.normal(0, 0.005, CHAIR.shape)
+    right = Seen(model, photo(CHAIR, rng, CENTRED), CENTRED)
+    options = RansacOptions(max_reproj_error=8.0)
+    for problem, wanted in ((right.mistaken("swapped"), True), (spoiled(right, 0), False)):
+        view = View(CENTRED, problem.points_2d)
+        found = align(Model(points_3d=model, shape_sigma=0.005), view, ransac=options)
+        assert (NAMES["swapped"] in " ".join(found.warnings)) == wanted
+
+
+def test_what_explains_no_more_keypoints_is_no_mistake() -> None:
+    asked: list[Mistake] = []
+
+    def explain(score: float, inliers: int) -> str | None:
+        asked.clear()
+
+        def answer(mistake: Mistake) -> Explained:
+            asked.append(mistake)
+            return Explained(score, inliers, 1.0)
+
+        return find_mistake(Explained(100.0, 9, 1.0), 12, answer)
+
+    assert explain(50.0, 9) is None
+    assert explain(101.0, 10) is None
+    assert len(asked) == 2
+    assert explain(50.0, 10) is not None
+    assert find_mistake(Explained(100.0, 9, 1.0), 12, lambda mistake: None) is None
+
+
+def test_a_mistake_made_twice_is_undone() -> None:
+    pixels = np.random.default_rng(0).uniform(0, 400, (5, 2))
+    mistake = Mistake("", mirrored=True, flipped=(True, True))
+    np.testing.assert_allclose(mistake.undo_3d(mistake.undo_3d(CHAIR)), CHAIR)
+    twice = mistake.undo_2d(mistake.undo_2d(pixels, CENTRED), CENTRED)
+    np.testing.assert_allclose(twice, pixels)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("category", ["chair", "bottle", "airplane", "mug"])
+def test_real_keypoints(category: str) -> None:
+    folder = os.environ.get("CADALIGN_DATA")
+    if not folder:
+        pytest.skip("CADALIGN_DATA is not set")
+    annotations = Path(folder) / "keypointnet" / "annotations" / f"{category}.json"
+    models = [
+        np.array([keypoint["xyz"] for keypoint in model["keypoints"]])
+        for model in json.loads(annotations.read_text(encoding="utf-8"))
+    ]
+    models = [points for points in models if len(points) >= 9]
+    problems = [seen(seed, models[7 * seed % len(models)]) for seed in range(150)]
+    for mistake in NAMES:
+        silent = [not problem.mistaken(mistake).complaint() for problem in problems]
+        assert np.mean(silent) <= 0.02
+    enough = [(seed, each) for seed, each in enumerate(problems) if len(each.points_2d) > 7]
+    alarms = [warning_of(spoiled(each, seed)) for seed, each in enough]
+    assert np.mean([bool(alarm) for alarm in alarms]) <= 0.01

@@ -235,6 +235,13 @@ def found_in_minima(
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
     likely = _one_of_equals(likely, symmetry, held)
+    warnings = warnings_of(
+        minimum.evidence,
+        minimum.state,
+        minimum.cost,
+        inflation=inflation,
+        degrees_of_freedom=prior.degrees_of_freedom,
+    )
     return Found(
         model,
         prior,
@@ -242,15 +249,7 @@ def found_in_minima(
         likely,
         _inliers(prior, views, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
-        warnings=(mistake,)
-        if mistake is not None
-        else warnings_of(
-            minimum.evidence,
-            minimum.state,
-            minimum.cost,
-            inflation=inflation,
-            degrees_of_freedom=prior.degrees_of_freedom,
-        ),
+        warnings=warnings if mistake is None else (mistake,),
         evidence=summaries_of(minimum.evidence, minimum.state, likely[0].cameras),
         basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,

@@ -37,6 +37,8 @@ from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, View
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
+_SOLUTIONS = 2.3  # valid ones of 4 points, in the mean
+_CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
 _SIGMAS = 3.0  # that the threshold of inliers is taken to be where the noise is not known
 _STRETCH_SIGMA = 1.0  # of log scales, by which alignments are compared: outliers invite extremes
 
@@ -99,6 +101,8 @@ class RobustSearch:
             max_reproj_error=self.ransac.max_reproj_error,
             score=best.score,
             where="points_2d",
+            solutions=_SOLUTIONS,
+            chance=_CHANCE,
         )
 
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:

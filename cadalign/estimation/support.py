@@ -11,9 +11,8 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
+from cadalign.solvers.minimal import MAX_SOLUTIONS
 
-_CHANCE = 0.2  # bound on the expected number of models with as much support by chance
-_SOLUTIONS = 2.3  # valid ones of 4 points, in the mean
 _LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
 _LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
@@ -142,18 +141,21 @@ def check_support(
     max_reproj_error: float,
     score: float,
     where: str,
+    solutions: float = MAX_SOLUTIONS,
+    chance: float = 0.1,
 ) -> None:
     """Refuse an estimate whose poses have no more support together than chance gives.
 
-    ``size`` keypoints determine a pose; ``score`` is the truncated sum of squares [px^2].
+    ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
+    of squares [px^2]. ``chance`` bounds the expected number of models with as much support.
 
     Raises
     ------
     NoConsensusError
         It carries the score.
     """
-    logarithm = sum(min(0.0, _log_expected_by_chance(each, size)) for each in supports)
-    if np.isfinite(score) and logarithm <= math.log(_CHANCE):
+    logarithm = sum(min(0.0, _log_expected_by_chance(each, size, solutions)) for each in supports)
+    if np.isfinite(score) and logarithm <= math.log(chance):
         return
     inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
     raise NoConsensusError(
@@ -166,7 +168,7 @@ def check_support(
     )
 
 
-def _log_expected_by_chance(support: Support, size: int) -> float:
+def _log_expected_by_chance(support: Support, size: int, solutions: float) -> float:
     """Log of the expected number of models as well supported among keypoints scattered at random.
 
     Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
@@ -180,7 +182,7 @@ def _log_expected_by_chance(support: Support, size: int) -> float:
         return math.inf
     radii = np.maximum(np.sort(errors), _LEAST_ERROR)
     logarithms = [
-        math.log(_SOLUTIONS * (count - size))
+        math.log(solutions * (count - size))
         + _log_choose(count, k)
         + _log_choose(k, size)
         + (k - size) * min(0.0, math.log(math.pi * radii[k - 1] ** 2 / area))
